@@ -489,9 +489,8 @@ fn forbidden(text: &str) -> Vec<(usize, &'static str)> {
     for (at, line) in prose(text).lines().enumerate() {
         let line = line.to_lowercase();
         for phrase in FORBIDDEN {
-            let begins = |(at, _): (usize, &str)| {
-                !line[..at].ends_with(|c: char| c.is_alphanumeric() || c == '-' || c == '_')
-            };
+            let begins =
+                |(at, _): (usize, &str)| !line[..at].ends_with(|c: char| c.is_alphanumeric() || c == '-' || c == '_');
             if line.match_indices(phrase).any(begins) {
                 found.push((at + 1, phrase));
             }
@@ -510,6 +509,41 @@ fn documents_use_the_terms_of_the_field() {
         troubles.extend(found.into_iter().map(|(line, phrase)| format!("{doc}:{line}: \"{phrase}\"")));
     }
     report(troubles, "Use the term of the field: CONTRIBUTING.md, \"Language\".");
+}
+
+/// What a heading is linked by, as GitHub and `xtask site` have it.
+fn slug(heading: &str) -> String {
+    let words = heading.trim_start_matches('#').trim().to_lowercase();
+    words.chars().filter(|c| c.is_alphanumeric() || " -_".contains(*c)).collect::<String>().replace(' ', "-")
+}
+
+/// Targets of a document's links, outside of fenced blocks.
+fn links(text: &str) -> Vec<String> {
+    // Odd parts are inside fences.
+    let outside: String = text.split("\n```").step_by(2).collect();
+    outside.split("](").skip(1).filter_map(|rest| rest.split_once(')')).map(|(target, _)| target.to_owned()).collect()
+}
+
+#[test]
+fn links_lead_to_pages_and_headings() {
+    assert_eq!(slug("## `capture.json`, version 1"), "capturejson-version-1");
+    let mut troubles = Vec::new();
+    for doc in documents().into_iter().chain(files("studies/records", "md")) {
+        let folder = root().join(&doc).parent().expect("a file has a folder").to_owned();
+        for target in links(&read(&doc)).into_iter().filter(|t| !t.contains("://")) {
+            let (path, heading) = target.split_once('#').unwrap_or((&target, ""));
+            let file = if path.is_empty() { root().join(&doc) } else { folder.join(path) };
+            let headings = || {
+                let text = std::fs::read_to_string(&file).unwrap_or_default();
+                let found: BTreeSet<String> = text.lines().filter(|l| l.starts_with('#')).map(slug).collect();
+                found
+            };
+            if !file.exists() || !heading.is_empty() && !headings().contains(heading) {
+                troubles.push(format!("{doc}: the link {target} leads nowhere"));
+            }
+        }
+    }
+    report(troubles, "Write the path and the heading as they are now.");
 }
 
 #[test]
@@ -535,7 +569,6 @@ fn paths_in_documents_exist() {
     let mut troubles = Vec::new();
     for doc in documents() {
         let text = read(&doc);
-        let folder = Path::new(&doc).parent().unwrap_or(Path::new(""));
         for token in tokens(&text) {
             let pattern = token.contains(['*', '{', '%', '$', '…']);
             if ROOTS.iter().any(|r| token.starts_with(r)) && !pattern && !PENDING.contains(&token) {
@@ -544,14 +577,6 @@ fn paths_in_documents_exist() {
                 if !root().join(path).exists() {
                     troubles.push(format!("{doc}: there is no {path}"));
                 }
-            }
-        }
-        for (at, _) in text.match_indices("](") {
-            let target = text[at + 2..].split(')').next().unwrap_or("");
-            let path = target.split('#').next().unwrap_or("");
-            let foreign = path.is_empty() || path.contains("://") || PENDING.contains(&path);
-            if !foreign && !root().join(folder).join(path).exists() {
-                troubles.push(format!("{doc}: the link to {path} leads nowhere"));
             }
         }
     }

@@ -167,7 +167,11 @@ fn the_reference_is_what_the_recipe_does() {
 fn every_table_is_on_one_page() {
     for page in &PAGES {
         for table in page.tables {
-            assert!(Recipe::knobs().iter().any(|k| k.table == *table), "{} names {table}, which does not exist", page.file);
+            assert!(
+                Recipe::knobs().iter().any(|k| k.table == *table),
+                "{} names {table}, which does not exist",
+                page.file
+            );
         }
     }
 }
