@@ -696,7 +696,7 @@ fn asks_which_model(line: &str, variant: &str, name: &str) -> bool {
 /// A new motion model is its own files and its entries: nobody else may ask which one it is. Capabilities answer what
 /// others need to know.
 #[test]
-fn nobody_asks_which_motion_model_it_is() {
+fn motion_models_are_named_only_in_their_modules() {
     let models = models();
     assert!(models.len() >= 9, "the list of models is not read: {models:?}");
     assert!(asks_which_model("if r.motion == \"still\" {", "Still", "still"));
@@ -731,7 +731,7 @@ const DIALECT_NAMES: [(&str, &str); 1] =
 /// A new dialect is its own file and its entry in the list: nobody else may name one. Its properties answer what others
 /// need to know.
 #[test]
-fn nobody_names_a_file_dialect() {
+fn dialects_are_named_only_in_their_modules() {
     let list = read(DIALECT_LIST);
     let (_, list) = list.split_once("pub const DIALECTS").expect("the list has this name");
     // `: &[Dialect] = &[ply::DIALECT, ...];`
