@@ -150,7 +150,7 @@ impl Work {
         not_empty(&source.scene, &self.order.source)?;
         source.scene.without_head("a playback file")?;
         let run = source.run.as_ref().ok_or_else(|| {
-            Error::input("is no run: compressing needs the pictures that a scene was trained on")
+            Error::input("not a run: compression needs the images that a scene was trained on")
                 .at(self.order.source.display())
                 .remedy("Give a run folder, or make a plain file with `splat4d bake`.")
         })?;

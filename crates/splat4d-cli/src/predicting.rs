@@ -279,7 +279,7 @@ impl Work {
             run.capture().and_then(|c| c.canonicalize().ok()) == self.run.capture().and_then(|c| c.canonicalize().ok());
         let scene = read_scene(&run.scene_file()?)?;
         if !same || scene.clip[1] <= self.clock.until {
-            return Err(Error::input("the oracle is no run of the same capture that saw more of it")
+            return Err(Error::input("invalid oracle: expected a run of the same capture that saw more of it")
                 .at(path.display())
                 .remedy("Train it on the same capture with the same recipe, without --observe"));
         }

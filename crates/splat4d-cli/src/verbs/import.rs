@@ -103,22 +103,22 @@ pub(crate) struct Args {
 }
 
 fn apart(text: &str) -> Result<([String; 2], f64), String> {
-    let wrong = || format!("\"{text}\" is no distance of two cameras: write left,right=2.4");
+    let wrong = || format!("invalid distance of two cameras \"{text}\": write left,right=2.4");
     let (pair, metres) = text.rsplit_once('=').ok_or_else(wrong)?;
     let (a, b) = pair.split_once(',').ok_or_else(wrong)?;
     let metres: f64 = metres.trim().parse().map_err(|_| wrong())?;
     if !metres.is_finite() || metres <= 0.0 {
-        return Err(format!("{metres} m is no distance"));
+        return Err(format!("invalid distance {metres} m: expected more than 0"));
     }
     Ok(([a, b].map(|n| n.trim().to_owned()), metres))
 }
 
 fn height(text: &str) -> Result<(String, f64), String> {
-    let wrong = || format!("\"{text}\" is no height of a camera: write left=1.6");
+    let wrong = || format!("invalid height of a camera \"{text}\": write left=1.6");
     let (name, metres) = text.rsplit_once('=').ok_or_else(wrong)?;
     let metres: f64 = metres.trim().parse().map_err(|_| wrong())?;
     if !metres.is_finite() || metres <= 0.0 {
-        return Err(format!("{metres} m is no height"));
+        return Err(format!("invalid height {metres} m"));
     }
     Ok((name.trim().to_owned(), metres))
 }

@@ -61,7 +61,10 @@ impl Selection {
         }
         for second in [self.from, self.to].into_iter().flatten() {
             if !second.is_finite() || second < 0.0 {
-                return bad(format!("{second} is no second of a video"), "Give seconds from its beginning, 3.2 or so.");
+                return bad(
+                    format!("invalid second of a video: {second}"),
+                    "Give seconds from its beginning, 3.2 or so.",
+                );
             }
         }
         if let (Some(from), Some(to)) = (self.from, self.to)

@@ -35,7 +35,7 @@ impl FromStr for HoldOut {
             }
             Some(("every", n)) => match n.parse() {
                 Ok(n) if n >= 2 => Ok(Self::Every(n)),
-                _ => Err(bad(format!("every={n} is no whole number of at least 2"))),
+                _ => Err(bad(format!("invalid every={n}: expected a whole number of at least 2"))),
             },
             _ => Err(bad(format!("\"{text}\" is not understood"))),
         }

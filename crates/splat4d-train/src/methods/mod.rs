@@ -358,7 +358,7 @@ pub fn program(motion: &str) -> Result<Box<dyn Program>> {
         return Ok(make());
     }
     if BUILT_IN.contains(&motion) {
-        return Err(Error::input(format!("`{motion}` is no motion of its own: it wraps another"))
+        return Err(Error::input(format!("`{motion}` cannot be chosen: it wraps another motion model"))
             .remedy("Name the motion to be filtered, and add --set filter=geodesic"));
     }
     Err(Error::input(format!("there is no motion model `{motion}`"))

@@ -152,7 +152,7 @@ impl Chunked {
     pub fn open(run: &Path) -> Result<Self> {
         let path = run.join(FOLDER).join(PLAN);
         let plan: ChunkPlan = serde_json::from_str(&read_text(&path)?)
-            .map_err(|e| Error::input(format!("it is no plan of chunks: {e}")).at(path.display()))?;
+            .map_err(|e| Error::input(format!("invalid plan of chunks: {e}")).at(path.display()))?;
         plan.check().map_err(|e| e.at(path.display()))?;
         let file = run.join("recipe.toml");
         let recipe = Recipe::from_toml(&read_text(&file)?).map_err(|e| e.at(file.display()))?;
