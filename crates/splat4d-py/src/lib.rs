@@ -61,13 +61,13 @@ mod _native {
         m.add("__version__", env!("CARGO_PKG_VERSION"))
     }
 
-    /// The command with these words, the first its name; its exit code.
+    /// Runs the command with these words, the first its name; returns its exit code.
     #[pyfunction]
     fn main(py: Python<'_>, words: Vec<OsString>) -> u8 {
         py.detach(|| splat4d_cli::main_from(words))
     }
 
-    /// One verb of the command with its options, quietly: `command("bake", "runs/knight", "-o", "knight.s4d")`.
+    /// Runs one command with its options, quietly: `command("bake", "runs/knight", "-o", "knight.s4d")`.
     #[pyfunction]
     #[pyo3(signature = (*words))]
     fn command(py: Python<'_>, words: Vec<PathBuf>) -> PyResult<()> {
