@@ -1,5 +1,5 @@
-//! Studies that vary what methods leave open, on made-up motion, and on runs and captures of one's own. A program of the
-//! workspace that is not shipped: `cargo run --release -p splat4d-studies -- e00`.
+//! Studies of open choices of the methods, on synthetic motion and on your own runs and captures. Not shipped: `cargo
+//! run --release -p splat4d-studies -- e00`.
 //!
 //! # Code map
 //!

@@ -1,8 +1,7 @@
-//! The `splat4d` command: posed, moving captures become trained, measured and rendered 4D scenes on a plain CPU.
+//! The `splat4d` command: trains, measures, renders, compresses and plays dynamic 3D scenes.
 //!
-//! Each verb is a file in `verbs`. Only the shells print, parse arguments or exit: 0 done, 1 failed, 2 bad input. A library
-//! for the sake of the workspace's studies and of the Python package, which share the console, run folders and measurements:
-//! no published interface.
+//! Each command is a file in `verbs`. Exit codes: 0 done, 1 failed, 2 bad input. This is a library only because the
+//! studies and the Python package share its console, run folders and measurements; its interface is not public.
 //!
 //! # Code map
 //!

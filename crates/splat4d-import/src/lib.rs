@@ -1,5 +1,5 @@
-//! Makes captures of videos: frames with their times, a clock that all cameras share, poses from pictures alone, and a folder that
-//! training takes.
+//! Makes captures from videos: frames with timestamps, synchronisation, poses from images alone, and a folder that
+//! training reads.
 //!
 //! # Code map
 //!

@@ -1,5 +1,6 @@
-//! The extension module of the Python package `splat4d` (docs/python.md): scenes as NumPy arrays, captures, training, and the
-//! command itself. Python's lock is given up while anything long works; errors become `splat4d.Error` with their own text.
+//! The extension module of the Python package `splat4d` (docs/python.md): scenes as NumPy arrays, captures, training,
+//! and the command. The interpreter lock is released during long work; errors become `splat4d.Error` with their own
+//! text.
 //!
 //! # Code map
 //!

@@ -1,4 +1,4 @@
-//! Learns moving Gaussian scenes from posed captures: capture → initial Gaussians → stages of training → evaluation.
+//! Trains dynamic Gaussian scenes from posed captures: capture → initial Gaussians → stages of training → evaluation.
 //!
 //! ```
 //! use splat4d_train::prelude::*;

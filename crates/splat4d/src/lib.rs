@@ -1,6 +1,6 @@
-//! Moving 3D Gaussian scenes: tables, motion models and a differentiable renderer.
+//! Dynamic 3D Gaussian scenes: tables, motion models and a differentiable renderer.
 //!
-//! From the bytes of a file to a picture at a time:
+//! From the bytes of a file to a rendered image:
 //!
 //! ```
 //! use splat4d::prelude::*;
@@ -17,10 +17,10 @@
 //! # }
 //! ```
 //!
-//! The chain behind it is `motion.at → render`, and in training on through `loss → render.vjp → motion.backward`. A motion
-//! model answers one question (which [`scene::Splats`] at time t), the renderer never sees time, a motion model never sees
-//! a pixel. [`layers::Evaluation`] asks many such questions together and takes gradients back; [`render::Backend`] is
-//! whatever draws; [`play::Player`] plays long scenes within a budget of memory.
+//! The chain behind it is `motion.at → render`, and in training also `loss → render.vjp → motion.backward`. A motion
+//! model maps a time to [`scene::Splats`]; the renderer never sees time, a motion model never sees a pixel.
+//! [`layers::Evaluation`] evaluates a scene at many times at once and backpropagates; [`render::Backend`] is the
+//! interface of renderers; [`play::Player`] plays long scenes within a memory budget.
 //!
 //! This crate reads bytes, not paths; it knows no loss, no optimiser and no data set (those are in `splat4d-train`).
 //!

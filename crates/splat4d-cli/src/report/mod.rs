@@ -1,6 +1,6 @@
-//! `report.html`: one page that opens without a server and tells how a run went: figures, held-out views beside their
-//! truth and error, curves, scores by camera and time, timings, memory, findings, the recipe and how to do it again.
-//! It is made from the run folder's files alone; what is missing there is missing in the page.
+//! `report.html`: one page that opens without a server: scores, held-out views with truth and error, curves, scores by
+//! camera and time, timings, memory, findings, the recipe and the command that repeats the run. It is made from the run
+//! folder's files; missing files are missing in the page.
 
 pub mod chart;
 pub(crate) mod compress;

@@ -1,5 +1,5 @@
-//! Where Gaussians start: the capture's points, those of its depth maps, the visual hull of the masks, or of what moves, at several moments, or random
-//! points in the volume that the cameras share.
+//! Initial Gaussians: from the capture's points or depth maps, the visual hulls of masks or of dynamic regions at
+//! several times, or random points in the cameras' common volume.
 
 mod depth;
 pub(crate) mod fill;

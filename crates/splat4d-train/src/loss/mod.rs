@@ -1,4 +1,4 @@
-//! Losses that training minimises: the picture loss and the regularisers, each with its gradient.
+//! Losses that training minimises: the image loss and the regularisers, each with its gradient.
 //!
 //! Every function returns its value and writes or adds its gradient; none keeps state that a result depends on.
 

@@ -1,4 +1,4 @@
-//! How motion models are learnt: a [`Program`] a model, which makes the list of [`Stage`]s that the trainer runs.
+//! How motion models are learned: one [`Program`] per model, which makes the list of [`Stage`]s that the trainer runs.
 //!
 //! `splat4d::motion::x` holds a model's mathematics, `methods::x` its stages, rates, losses and what it needs of a capture.
 

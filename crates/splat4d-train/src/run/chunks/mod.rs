@@ -1,10 +1,10 @@
-//! Long takes in chunks: what stands still is learnt once, what moves chunk by chunk, each a run folder of its own, so that
-//! memory does not grow with the take, and any number of workers on one folder may share the work.
+//! Long captures in chunks: the static part is trained once, the dynamic part chunk by chunk, each in its own run
+//! folder. Memory does not grow with the capture, and any number of workers on one folder can share the work.
 //!
-//! Order: the shared layer; then even chunks, which know nothing of each other; then odd ones, which start from both neighbours
-//! and are tied to them where they overlap. A chunk is a function of the capture, the recipe and the files before it, so that
-//! who does which and when changes nothing. Source: methods of overlapping chunks in 4DGaussians' and STG's practice (50 to 60
-//! frames); the cross-fade and the order are ours.
+//! Order: the shared layer; then even chunks, independent of each other; then odd ones, which start from both
+//! neighbours and are tied to them in the overlap. A chunk is a function of the capture, the recipe and the files
+//! before it, so the schedule of workers changes nothing. Source: overlapping chunks in the practice of 4DGaussians and
+//! STG (50 to 60 frames); the cross-fade and the order are ours.
 
 mod budget;
 mod join;

@@ -1,4 +1,4 @@
-//! SOG version 2 (PlayCanvas), read: Gaussians as lossless WebP pictures, in a zip file or in a folder.
+//! SOG version 2 (PlayCanvas), read: Gaussians as lossless WebP images, in a zip file or in a folder.
 //!
 //! `meta.json` has `version` 2, `count` and for each group the picture's `files` and a range or a codebook. Pixel i of a
 //! picture belongs to Gaussian i. means_l, means_u: low and high bytes of 16 bits between mins and maxs of
