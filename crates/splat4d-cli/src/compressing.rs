@@ -427,7 +427,7 @@ fn say(told: &Compressed, size: [usize; 2], console: &Console) {
     let line = |name: &str, side: &Side| {
         let number = |value: Option<f64>, digits: usize| value.map_or("-".into(), |v| format!("{v:.digits$}"));
         format!(
-            "{name}: {} Gaussians, {} ({} as floats), PSNR {} dB, where things move {} dB, SSIM {}, {:.0} frames/s at \
+            "{name}: {} Gaussians, {} ({} as floats), PSNR {} dB, dynamic regions {} dB, SSIM {}, {:.0} frames/s at \
              {}x{}",
             files::grouped(side.gaussians),
             files::human_bytes(side.bytes),

@@ -85,7 +85,7 @@ fn cards(out: &mut String, run: &Run) {
         ("main", "PSNR", 2, "dB", "PSNR, held-out views"),
         ("", "PSNR-aligned", 2, "dB", "PSNR, held-out cameras aligned"),
         ("", "PSNR-cc", 2, "dB", "PSNR, each camera's colours corrected"),
-        ("main", "PSNR-dynamic", 2, "dB", "PSNR where things move"),
+        ("main", "PSNR-dynamic", 2, "dB", "PSNR of dynamic regions"),
         ("", "PSNR-foreground", 2, "dB", "PSNR of the foreground"),
         ("", "SSIM", 4, "", "SSIM"),
         ("", "MS-SSIM", 4, "", "MS-SSIM"),
@@ -99,7 +99,7 @@ fn cards(out: &mut String, run: &Run) {
         }
     }
     if let (Some(ours), Some(still)) = (run.score("PSNR-dynamic"), run.baseline("PSNR-dynamic")) {
-        card("main", format!("{:+.2}", ours - still), "dB", "where things move, over a still scene");
+        card("main", format!("{:+.2}", ours - still), "dB", "dynamic regions, over a static scene");
     }
     if let Some(n) = run.number("gaussians").or(run.metrics.last().map(|m| m.gaussians)) {
         card("", grouped(n as usize), "", "Gaussians");
