@@ -230,7 +230,7 @@ const ROOTS: [&str; 6] = ["crates/", "docs/", "examples/", "studies/", "xtask/",
 const PENDING: [&str; 0] = [];
 
 /// Flags of other programs that documents show.
-const FOREIGN_FLAGS: [&str; 11] = [
+const FOREIGN_FLAGS: [&str; 12] = [
     "--release",
     "--workspace",
     "--all",
@@ -242,6 +242,7 @@ const FOREIGN_FLAGS: [&str; 11] = [
     "--locked",
     "--bench",
     "--strict",
+    "--no-build-isolation",
 ];
 
 fn root() -> PathBuf {
@@ -508,7 +509,33 @@ fn documents_use_the_terms_of_the_field() {
         let found = forbidden(&read(&doc));
         troubles.extend(found.into_iter().map(|(line, phrase)| format!("{doc}:{line}: \"{phrase}\"")));
     }
+    for path in sources() {
+        let text = read(&path);
+        let found = forbidden(&spoken(&path, &text));
+        troubles.extend(found.into_iter().map(|(line, phrase)| format!("{path}:{line}: \"{phrase}\"")));
+    }
     report(troubles, "Use the term of the field: CONTRIBUTING.md, \"Language\".");
+}
+
+/// What outsiders read of a source file, at its lines: documentation of crates and modules, and the command's help.
+fn spoken(path: &str, text: &str) -> String {
+    let module = ["/lib.rs", "/mod.rs", "/main.rs"].iter().any(|name| path.ends_with(name));
+    let command = path.starts_with("crates/splat4d-cli/src/");
+    let lines: Vec<&str> = text.lines().collect();
+    let mut help = false;
+    let mut out = String::new();
+    for (at, line) in lines.iter().enumerate() {
+        help |= command && line.starts_with("const EXAMPLES");
+        // A comment of an argument stands above its attribute.
+        let below = lines[at..].iter().find(|l| !l.trim().starts_with("///"));
+        let argument = command && below.is_some_and(|l| ["#[arg", "#[command"].iter().any(|a| l.trim().starts_with(a)));
+        if module && line.starts_with("//!") || argument && line.trim().starts_with("///") || help {
+            out += line;
+        }
+        help &= !line.ends_with("\";");
+        out.push('\n');
+    }
+    out
 }
 
 /// What a heading is linked by, as GitHub and `xtask site` have it.

@@ -83,7 +83,7 @@ pub struct Measure {
     /// Weights (safetensors) for LPIPS; without them it is not computed
     #[arg(long, value_name = "FILE", help_heading = "What is measured")]
     pub lpips_weights: Option<PathBuf>,
-    /// What draws the views.
+    /// Device that renders the views.
     #[arg(skip)]
     pub device: Device,
 }

@@ -39,20 +39,20 @@ const SAME_RATE: f64 = 0.01;
 const EXAMPLES: &str = "\
 Examples:
   splat4d train examples/knight                     default recipe, into runs/knight
-  splat4d train my-take -o runs/first --minutes 10  as many steps as fit into ten minutes
+  splat4d train my-take -o runs/first --minutes 10  finish within ten minutes
   splat4d train my-take --quality draft             a first look, after minutes
   splat4d train my-take --view                      watch it learn in the browser
-  splat4d train my-take --motion still              one scene for all times: a calibration check
+  splat4d train my-take --motion still              a static scene: checks the calibration
   splat4d train my-take --downscale 4 --set iterations=1000 --set sh_degree=0
   splat4d train my-take --hold-out camera=0,10      measure on these cameras
-  splat4d train my-take --observe 0.8               keep the last fifth of the take for `predict`
-  splat4d train concert -o runs/concert --chunk-frames 60        a long take, chunk by chunk
+  splat4d train my-take --observe 0.8               keep the last fifth for `predict`
+  splat4d train concert -o runs/concert --chunk-frames 60    a long capture in chunks
   splat4d train my-take --device auto               on a GPU, if there is one
-  splat4d train --resume runs/first                 continue exactly where it stopped
+  splat4d train --resume runs/first                 continue exactly
 
-A capture is a folder with one of these: capture.json (write it by hand for your own rig), transforms_train.json
-(D-NeRF, Blender), transforms.json (Nerfstudio), sparse/ (COLMAP), train_meta.json (PanopticSports) or
-poses_bounds.npy (N3DV). `splat4d info CAPTURE` checks one. `--help-knobs` lists every knob of the recipe.";
+A capture is a folder with one of these: capture.json (write it for your own rig), transforms_train.json (D-NeRF, \
+Blender), transforms.json (Nerfstudio), sparse/ (COLMAP), train_meta.json (PanopticSports), dataset.json (HyperNeRF) or \
+poses_bounds.npy (N3DV). `splat4d info CAPTURE` checks one. `--help-knobs` lists all settings.";
 
 /// The knobs that most runs are told by, for `--help`.
 const IMPORTANT: [&str; 12] = [
@@ -70,90 +70,91 @@ const IMPORTANT: [&str; 12] = [
     "loss.dssim",
 ];
 
-/// Train a scene from a capture, then measure it, film it and write a report
+/// Train a scene from a capture, measure it, film it and write a report
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, after_long_help = long_help())]
 pub struct Args {
     /// The capture: a folder, or its marker file
     #[arg(value_name = "CAPTURE", required_unless_present_any = ["resume", "source", "help_knobs"])]
     capture: Option<PathBuf>,
-    /// Where the run is written [default: runs/NAME, or runs/NAME-2 ... if that is taken]
+    /// Output folder [default: runs/NAME, or runs/NAME-2 ... if it exists]
     #[arg(short, long, value_name = "RUN", short_alias = 'm', alias = "model_path", alias = "model-path")]
     output: Option<PathBuf>,
-    /// Continue this run exactly where its newest checkpoint is
+    /// Continue this run from its newest checkpoint
     #[arg(long, value_name = "RUN", conflicts_with_all = ["capture", "output", "motion", "minutes", "quality", "recipe", "set",
         "downscale", "hold_out", "images", "poses", "observe", "chunk_frames", "overlap", "chunk", "image_memory", "memory_limit", "seed", "source", "iterations", "force"])]
     resume: Option<PathBuf>,
-    /// Replace the run in the -o folder: the files that splat4d wrote there, once the new run has taken its first steps
+    /// Replace the run in the -o folder (only files that splat4d wrote) once the new run has begun
     #[arg(long)]
     force: bool,
-    /// How Gaussians move: auto (chosen by the capture), still, spacetime, deform-mlp, hexplane, tracked, native4d,
-    /// control or ssm [default: auto, or the recipe's]
+    /// Motion model: auto (chosen by the capture), still, spacetime, deform-mlp, hexplane, tracked, native4d, control
+    /// or ssm [default: auto, or the recipe's]
     #[arg(long, value_name = "MODEL", help_heading = "What is learned")]
     motion: Option<String>,
-    /// Be done in M minutes, from reading the capture to the report: steps are fitted, and fitted anew while it goes; the
-    /// recipe says what they became
+    /// Finish within M minutes, evaluation and report included. The step count is planned and re-planned to fit, and
+    /// recorded in the recipe
     #[arg(long, value_name = "M", value_parser = minutes, help_heading = "What is learned")]
     minutes: Option<f64>,
-    /// How much it may take: draft (half-size pictures, 2,500 steps), standard (the default: 7,000 steps) or best (20,000
-    /// steps, 60,000 Gaussians). Says first how long that takes here. Knobs that are set win over it, --minutes over its steps
+    /// draft (half-size images, 2,500 steps), standard (the default: 7,000 steps) or best (20,000 steps, 60,000
+    /// Gaussians). Prints the expected time first. Settings have priority over it, and --minutes over its steps
     #[arg(long, value_name = "QUALITY", help_heading = "What is learned")]
     quality: Option<Quality>,
-    /// Start from this recipe (TOML); a run's own recipe.toml repeats it
+    /// Start from this recipe (TOML); a run's recipe.toml repeats that run
     #[arg(long, value_name = "FILE", help_heading = "What is learned")]
     recipe: Option<PathBuf>,
-    /// List the knobs of the recipe: all, or those of a table or with a word in their name
+    /// List all settings, or those of a table or with a word in their name
     #[arg(long, value_name = "TOPIC", num_args = 0..=1, default_missing_value = "", help_heading = "What is learned")]
     help_knobs: Option<String>,
-    /// Set a knob of the recipe; may be repeated
+    /// Change a setting, repeatable
     #[arg(long, value_name = "KEY=VALUE", help_heading = "What is learned")]
     set: Vec<String>,
     /// Seed of every random choice
     #[arg(long, value_name = "N", help_heading = "What is learned")]
     seed: Option<u64>,
-    /// Reduce pictures by k: the mean of k x k boxes
+    /// Reduce images by k: the mean of k x k boxes
     #[arg(long, value_name = "K", short_alias = 'r', alias = "resolution", help_heading = "What is read")]
     downscale: Option<usize>,
     /// Views kept from training: camera=0,10 or every=8 or none [default: the data set's convention]
     #[arg(long, value_name = "RULE", help_heading = "What is read")]
     hold_out: Option<String>,
-    /// Folder of images in place of the one that the capture names, such as images_4
+    /// Folder of images instead of the capture's, such as images_4
     #[arg(long, value_name = "NAME", help_heading = "What is read")]
     images: Option<String>,
-    /// Convention in which poses are written where it is not the layout's: opencv or opengl (camera axes), inverse, transposed
-    /// or xyzw (quaternions), or several joined by +
+    /// Convention of poses if it differs from the layout's: opencv or opengl (camera axes), inverse, transposed or xyzw
+    /// (quaternions), or several joined by +
     #[arg(long, value_name = "CONVENTION", help_heading = "What is read")]
     poses: Option<String>,
-    /// Train on the first SHARE of the clip only; what comes later scores `predict` and is not looked at [default: 1]
+    /// Train on the first SHARE of the clip only; later frames score `predict` [default: 1]
     #[arg(long, value_name = "SHARE", help_heading = "What is read")]
     observe: Option<f64>,
-    /// Learn a longer take in chunks of N frames [default: 60 where fixed cameras film more than 300 frames]
+    /// Train longer captures in chunks of N frames [default: 60 if fixed cameras have more than 300 frames]
     #[arg(long, value_name = "N", help_heading = "Long takes")]
     chunk_frames: Option<usize>,
     /// Frames that neighbouring chunks share, an even number [default: 16]
     #[arg(long, value_name = "N", help_heading = "Long takes")]
     overlap: Option<usize>,
-    /// Do one part and end: shared, then even chunks by their number, then odd ones; or all, beside other workers on the same
-    /// RUN. What is done already is not done again; `splat4d join RUN` ends the run
+    /// Train one part and end: shared, then even chunks by number, then odd ones; or all, in parallel with other
+    /// workers on the same RUN. Finished parts are skipped; `splat4d join RUN` ends the run
     #[arg(long, value_name = "PART", help_heading = "Long takes", requires = "output", conflicts_with = "force")]
     chunk: Option<Wanted>,
-    /// Memory for decoded pictures [default: 1GiB]
+    /// Memory for decoded images [default: 1GiB]
     #[arg(long, value_name = "SIZE", value_parser = parse_bytes, help_heading = "What is read")]
     image_memory: Option<u64>,
-    /// Most memory that training may take: a long take is cut into as short chunks of as few Gaussians as that asks for
+    /// Memory limit of training: long captures get shorter chunks with fewer Gaussians
     #[arg(long, value_name = "SIZE", value_parser = parse_bytes, help_heading = "What is read")]
     memory_limit: Option<u64>,
-    /// What trains; what a GPU cannot of a recipe is done by the CPU. Not part of the recipe: a run may go on on another device
+    /// Device to train on. The CPU runs whatever the GPU does not support. Not part of the recipe: a run can be resumed
+    /// on another device
     #[arg(long, value_enum, default_value = "cpu", help_heading = "What computes")]
     device: Device,
     #[command(flatten)]
     measure: finish::Measure,
-    /// Show the scene in the browser while it learns, and on a terminal afterwards too, until Ctrl-C
+    /// Show the scene in the browser during training, and on a terminal afterwards until Ctrl-C
     #[arg(long, help_heading = "Where it is served")]
     view: bool,
     #[command(flatten)]
     place: Place,
-    /// Only train and bake: no evaluation, film or report
+    /// Only train and bake; skip evaluation, film and report
     #[arg(long, help_heading = "What is measured")]
     no_eval: bool,
 
