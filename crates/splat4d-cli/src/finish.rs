@@ -81,7 +81,7 @@ pub(crate) fn steps(capture: &Capture, recipe: &Recipe, only_playback: bool) -> 
 #[derive(Debug, Default, clap::Args)]
 pub struct Measure {
     /// Weights (safetensors) for LPIPS; without them it is not computed
-    #[arg(long, value_name = "FILE", help_heading = "What is measured")]
+    #[arg(long, value_name = "FILE", help_heading = "Evaluation")]
     pub lpips_weights: Option<PathBuf>,
     /// Device that renders the views.
     #[arg(skip)]

@@ -17,13 +17,13 @@ const LOOK: Duration = Duration::from_millis(50);
 #[derive(Clone, Debug, Default, clap::Args)]
 pub(crate) struct Place {
     /// Port of the page; 0: any free one [default: 4440, or a free one after it]
-    #[arg(long, value_name = "N", help_heading = "Where it is served")]
+    #[arg(long, value_name = "N", help_heading = "Serving")]
     pub port: Option<u16>,
     /// Serve at this name or address, also to other machines [default: this machine only]
-    #[arg(long, value_name = "NAME", help_heading = "Where it is served")]
+    #[arg(long, value_name = "NAME", help_heading = "Serving")]
     pub host: Option<String>,
     /// Print the address and open no browser
-    #[arg(long, help_heading = "Where it is served")]
+    #[arg(long, help_heading = "Serving")]
     pub no_open: bool,
     /// Read the player from this folder, for its development
     #[arg(long, value_name = "DIR", hide = true)]

@@ -395,7 +395,7 @@ fn again(out: &mut String, run: &Run) {
     if let Some(recipe) = &run.recipe {
         let _ = write!(
             out,
-            "<h2>Recipe</h2>\n<details><summary>all knobs</summary><pre>{}</pre></details>\n",
+            "<h2>Recipe</h2>\n<details><summary>all settings</summary><pre>{}</pre></details>\n",
             escape(recipe)
         );
     }

@@ -75,7 +75,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "WxH", value_parser = parse_size)]
     size: Option<[usize; 2]>,
     /// Device that renders during fine-tuning; the CPU does the rest
-    #[arg(long, value_enum, default_value = "cpu", help_heading = "What computes")]
+    #[arg(long, value_enum, default_value = "cpu", help_heading = "Device")]
     device: Device,
     #[command(flatten)]
     measure: finish::Measure,

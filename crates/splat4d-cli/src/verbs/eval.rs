@@ -88,18 +88,18 @@ pub(crate) struct Args {
     #[arg(long)]
     no_film: bool,
     /// Measure these views, scores only [default: test]
-    #[arg(long, value_enum, conflicts_with = "baseline", help_heading = "What is measured")]
+    #[arg(long, value_enum, conflicts_with = "baseline", help_heading = "Evaluation")]
     split: Option<Split>,
     /// Background of transparent pixels, scores only [default: the run's]
-    #[arg(long, value_enum, conflicts_with = "baseline", help_heading = "What is measured")]
+    #[arg(long, value_enum, conflicts_with = "baseline", help_heading = "Evaluation")]
     background: Option<Background>,
     /// Compare the run's training cameras with the ground truth of this capture, and only that: absolute and relative
     /// trajectory error after a similarity, and time offsets
     #[arg(long, value_name = "CAPTURE", conflicts_with_all = ["baseline", "split", "background"],
-          help_heading = "What is measured")]
+          help_heading = "Evaluation")]
     truth: Option<PathBuf>,
     /// Device that renders the views; the CPU computes the metrics
-    #[arg(long, value_enum, default_value = "cpu", help_heading = "What computes")]
+    #[arg(long, value_enum, default_value = "cpu", help_heading = "Device")]
     device: Device,
     #[command(flatten)]
     measure: finish::Measure,

@@ -83,20 +83,20 @@ pub(crate) struct Args {
     #[arg(long, value_name = "N", value_parser = fps, help_heading = "Time")]
     fps: Option<f64>,
     /// Channel to render
-    #[arg(long, value_enum, default_value = "color", help_heading = "Picture")]
+    #[arg(long, value_enum, default_value = "color", help_heading = "Image")]
     channel: Channel,
     /// Colour behind the scene, 0 to 1 [default: the scene's, or the camera file's]
-    #[arg(long, value_name = "R,G,B", value_parser = color, help_heading = "Picture")]
+    #[arg(long, value_name = "R,G,B", value_parser = color, help_heading = "Image")]
     background: Option<Color>,
     /// Also write the raw values. With --camera: P.npy [h,w,3], P.alpha.npy [h,w] and P.depth.npy [h,w] (Σ zαT), not
     /// clamped, and those of another --channel as P.CHANNEL.npy. Of a film: the channel's as numbered files in P
-    #[arg(long, value_name = "P", help_heading = "Picture")]
+    #[arg(long, value_name = "P", help_heading = "Image")]
     raw: Option<PathBuf>,
     /// Replace numbered files that splat4d wrote to the folder, even if there are more
     #[arg(long, conflicts_with = "camera")]
     force: bool,
     /// Format of the raw values
-    #[arg(long, value_enum, default_value = "npy", requires = "raw", help_heading = "Picture")]
+    #[arg(long, value_enum, default_value = "npy", requires = "raw", help_heading = "Image")]
     raw_format: RawFormat,
 
     /// Device that renders

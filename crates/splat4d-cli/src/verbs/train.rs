@@ -89,73 +89,73 @@ pub struct Args {
     force: bool,
     /// Motion model: auto (chosen by the capture), still, spacetime, deform-mlp, hexplane, tracked, native4d, control
     /// or ssm [default: auto, or the recipe's]
-    #[arg(long, value_name = "MODEL", help_heading = "What is learned")]
+    #[arg(long, value_name = "MODEL", help_heading = "Training")]
     motion: Option<String>,
     /// Finish within M minutes, evaluation and report included. The step count is planned and re-planned to fit, and
     /// recorded in the recipe
-    #[arg(long, value_name = "M", value_parser = minutes, help_heading = "What is learned")]
+    #[arg(long, value_name = "M", value_parser = minutes, help_heading = "Training")]
     minutes: Option<f64>,
     /// draft (half-size images, 2,500 steps), standard (the default: 7,000 steps) or best (20,000 steps, 60,000
     /// Gaussians). Prints the expected time first. Settings have priority over it, and --minutes over its steps
-    #[arg(long, value_name = "QUALITY", help_heading = "What is learned")]
+    #[arg(long, value_name = "QUALITY", help_heading = "Training")]
     quality: Option<Quality>,
     /// Start from this recipe (TOML); a run's recipe.toml repeats that run
-    #[arg(long, value_name = "FILE", help_heading = "What is learned")]
+    #[arg(long, value_name = "FILE", help_heading = "Training")]
     recipe: Option<PathBuf>,
     /// List all settings, or those of a table or with a word in their name
-    #[arg(long, value_name = "TOPIC", num_args = 0..=1, default_missing_value = "", help_heading = "What is learned")]
+    #[arg(long, value_name = "TOPIC", num_args = 0..=1, default_missing_value = "", help_heading = "Training")]
     help_knobs: Option<String>,
     /// Change a setting, repeatable
-    #[arg(long, value_name = "KEY=VALUE", help_heading = "What is learned")]
+    #[arg(long, value_name = "KEY=VALUE", help_heading = "Training")]
     set: Vec<String>,
     /// Seed of every random choice
-    #[arg(long, value_name = "N", help_heading = "What is learned")]
+    #[arg(long, value_name = "N", help_heading = "Training")]
     seed: Option<u64>,
     /// Reduce images by k: the mean of k x k boxes
-    #[arg(long, value_name = "K", short_alias = 'r', alias = "resolution", help_heading = "What is read")]
+    #[arg(long, value_name = "K", short_alias = 'r', alias = "resolution", help_heading = "Input")]
     downscale: Option<usize>,
     /// Views kept from training: camera=0,10 or every=8 or none [default: the data set's convention]
-    #[arg(long, value_name = "RULE", help_heading = "What is read")]
+    #[arg(long, value_name = "RULE", help_heading = "Input")]
     hold_out: Option<String>,
     /// Folder of images instead of the capture's, such as images_4
-    #[arg(long, value_name = "NAME", help_heading = "What is read")]
+    #[arg(long, value_name = "NAME", help_heading = "Input")]
     images: Option<String>,
     /// Convention of poses if it differs from the layout's: opencv or opengl (camera axes), inverse, transposed or xyzw
     /// (quaternions), or several joined by +
-    #[arg(long, value_name = "CONVENTION", help_heading = "What is read")]
+    #[arg(long, value_name = "CONVENTION", help_heading = "Input")]
     poses: Option<String>,
     /// Train on the first SHARE of the clip only; later frames score `predict` [default: 1]
-    #[arg(long, value_name = "SHARE", help_heading = "What is read")]
+    #[arg(long, value_name = "SHARE", help_heading = "Input")]
     observe: Option<f64>,
     /// Train longer captures in chunks of N frames [default: 60 if fixed cameras have more than 300 frames]
-    #[arg(long, value_name = "N", help_heading = "Long takes")]
+    #[arg(long, value_name = "N", help_heading = "Long captures")]
     chunk_frames: Option<usize>,
     /// Frames that neighbouring chunks share, an even number [default: 16]
-    #[arg(long, value_name = "N", help_heading = "Long takes")]
+    #[arg(long, value_name = "N", help_heading = "Long captures")]
     overlap: Option<usize>,
     /// Train one part and end: shared, then even chunks by number, then odd ones; or all, in parallel with other
     /// workers on the same RUN. Finished parts are skipped; `splat4d join RUN` ends the run
-    #[arg(long, value_name = "PART", help_heading = "Long takes", requires = "output", conflicts_with = "force")]
+    #[arg(long, value_name = "PART", help_heading = "Long captures", requires = "output", conflicts_with = "force")]
     chunk: Option<Wanted>,
     /// Memory for decoded images [default: 1GiB]
-    #[arg(long, value_name = "SIZE", value_parser = parse_bytes, help_heading = "What is read")]
+    #[arg(long, value_name = "SIZE", value_parser = parse_bytes, help_heading = "Input")]
     image_memory: Option<u64>,
     /// Memory limit of training: long captures get shorter chunks with fewer Gaussians
-    #[arg(long, value_name = "SIZE", value_parser = parse_bytes, help_heading = "What is read")]
+    #[arg(long, value_name = "SIZE", value_parser = parse_bytes, help_heading = "Input")]
     memory_limit: Option<u64>,
     /// Device to train on. The CPU runs whatever the GPU does not support. Not part of the recipe: a run can be resumed
     /// on another device
-    #[arg(long, value_enum, default_value = "cpu", help_heading = "What computes")]
+    #[arg(long, value_enum, default_value = "cpu", help_heading = "Device")]
     device: Device,
     #[command(flatten)]
     measure: finish::Measure,
     /// Show the scene in the browser during training, and on a terminal afterwards until Ctrl-C
-    #[arg(long, help_heading = "Where it is served")]
+    #[arg(long, help_heading = "Serving")]
     view: bool,
     #[command(flatten)]
     place: Place,
     /// Only train and bake; skip evaluation, film and report
-    #[arg(long, help_heading = "What is measured")]
+    #[arg(long, help_heading = "Evaluation")]
     no_eval: bool,
 
     // What users of other systems type.
@@ -544,9 +544,7 @@ fn long_help() -> String {
         .iter()
         .map(|key| line(knobs.iter().find(|k| k.key() == *key).expect("IMPORTANT names knobs of the recipe")))
         .collect();
-    format!(
-        "{EXAMPLES}\n\nKnobs of the recipe (--set KEY=VALUE, or a TOML file for --recipe; --help-knobs: all):\n{lines}"
-    )
+    format!("{EXAMPLES}\n\nSettings (--set KEY=VALUE, or a TOML file for --recipe; --help-knobs: all):\n{lines}")
 }
 
 /// Every knob, those of a table, or those with the topic in their name. Errors: there is none.
@@ -568,7 +566,7 @@ fn knob_list(topic: &str) -> Result<String, Error> {
         let mut tables: Vec<&str> = knobs.iter().map(|k| k.table).collect();
         tables.dedup();
         let near = nearest(topic, &tables).map_or_else(String::new, |n| format!("Did you mean `{n}`? "));
-        return Err(Error::input(format!("no knob is called after `{topic}`"))
+        return Err(Error::input(format!("no setting or table has `{topic}` in its name"))
             .at("--help-knobs")
             .remedy(format!("{near}Tables are: {}", tables.join(", "))));
     }
