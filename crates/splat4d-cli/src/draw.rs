@@ -212,7 +212,7 @@ impl<'a> Painter<'a> {
         if let Some(error) = device::draw(&mut self.backend, &shot, &mut self.image)
             && let Some(console) = self.console
         {
-            console.warn(&format!("drawing on the CPU: {}", error.cause()));
+            console.warn(&format!("rendering on the CPU: {}", error.cause()));
         }
     }
 
@@ -241,7 +241,7 @@ impl<'a> Painter<'a> {
         if let Some(error) = device::draw(&mut self.backend, &shot, &mut self.image)
             && let Some(console) = self.console
         {
-            console.warn(&format!("drawing on the CPU: {}", error.cause()));
+            console.warn(&format!("rendering on the CPU: {}", error.cause()));
         }
         self.field = flow::divided(&self.image.extra);
     }

@@ -232,7 +232,7 @@ pub fn scores(run: &Path, scene: &Scene<f32>, measure: &Measure, console: &Conso
     if capture.held.is_empty() {
         console.warn(
             "no view was held out, so that quality on new views cannot be measured. Hold out a camera (--hold-out \
-             camera=0) or every 8th picture (--hold-out every=8).",
+             camera=0) or every 8th image (--hold-out every=8).",
         );
     }
     Ok(evaluation)

@@ -151,7 +151,7 @@ fn place(args: &Args, source: &Path, console: &Console) -> Result<PathBuf> {
         let mut name = source.file_name().unwrap_or(OsStr::new("run")).to_owned();
         name.push("-compressed");
         let dir = run_folder::free_folder(&source.with_file_name(name));
-        console.say(&format!("the result goes to {}", dir.display()));
+        console.say(&format!("the result is written to {}", dir.display()));
         return Ok(dir);
     };
     Ok(dir.clone())

@@ -72,7 +72,7 @@ pub(crate) struct Args {
     /// Replace a sequence that splat4d wrote to the folder, even a longer one
     #[arg(long, requires = "frames")]
     force: bool,
-    /// Frames per second of a sequence that is read [30], or of --frames [the scene's]
+    /// Frames per second of a sequence that is read (30), or of --frames (the scene's)
     #[arg(long, value_name = "N")]
     fps: Option<f64>,
     /// First second of --frames
@@ -310,7 +310,7 @@ pub(crate) fn write(args: &Args, mut source: Source, console: &Console) -> anyho
         None => {
             let start = scene.clip[0];
             console.warn(&format!(
-                "{} holds one moment: {start} s, the clip's start, is taken. Choose with --time, or use {}.",
+                "{} holds one time: {start} s, the clip's start. Choose another with --time, or use {}.",
                 target.name(),
                 either(&[&["--frames"], &written(|d| d.moves)[..]].concat())
             ));

@@ -288,7 +288,7 @@ fn page(path: &Path, args: &Args, console: &Console) -> anyhow::Result<()> {
     console.say(&format!("a page of {}", files::human_bytes(html.len() as u64)));
     console.written(out);
     if args.link.is_some() {
-        console.say("put both on a web server: browsers do not let a page from a disk read a file beside it");
+        console.say("put both on a web server: browsers do not let a page from disk read another file");
     }
     Ok(())
 }

@@ -196,7 +196,7 @@ fn told(report: &Report, looked: Option<&(Looked, PathBuf)>, console: &Console) 
     let guessed: Vec<&str> = report.cameras.iter().filter(guess).map(|c| c.name.as_str()).collect();
     if !guessed.is_empty() {
         console.warn(&format!(
-            "the clocks of these cameras are guessed from how much moves, and nothing confirms it: {} (tell them in {})",
+            "the time offsets of these cameras are guessed from the amount of motion and not confirmed: {} (correct them in {})",
             guessed.join(", "),
             corrections::FILE
         ));

@@ -478,7 +478,7 @@ fn place(
         } else {
             String::new()
         };
-        console.say(&format!("{} is taken{hint}: this run goes to {}", wanted.display(), run.display()));
+        console.say(&format!("{} exists{hint}: this run is written to {}", wanted.display(), run.display()));
     }
     Ok(asked.begin(&run, args.force, TRAIN)?)
 }
