@@ -562,8 +562,7 @@ fn links_lead_to_pages_and_headings() {
             let file = if path.is_empty() { root().join(&doc) } else { folder.join(path) };
             let headings = || {
                 let text = std::fs::read_to_string(&file).unwrap_or_default();
-                let found: BTreeSet<String> = text.lines().filter(|l| l.starts_with('#')).map(slug).collect();
-                found
+                text.lines().filter(|l| l.starts_with('#')).map(slug).collect::<BTreeSet<String>>()
             };
             if !file.exists() || !heading.is_empty() && !headings().contains(heading) {
                 troubles.push(format!("{doc}: the link {target} leads nowhere"));
