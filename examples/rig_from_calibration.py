@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
-"""Turns a rig's calibration and its frames into a capture.json that splat4d reads.
+"""Makes a capture.json for splat4d from a rig's calibration and frames.
 
 The calibration is a JSON file {"fps": 60, "cameras": [{"name", "width", "height", "fx", "fy", "cx", "cy",
 "world_to_camera"}, ...]} with OpenCV axes (x right, y down, z forward) and row-major 4x4 poses. Frames lie in
-OUTPUT/images/NAME/000000.jpg and so on; where they do not exist yet, the ffmpeg commands that extract them from
-VIDEOS/NAME.mp4 are printed: run them, then run this script again.
+OUTPUT/images/NAME/000000.jpg and so on. If they do not exist yet, the script prints the ffmpeg commands that extract them
+from VIDEOS/NAME.mp4: run them, then run this script again.
 
     rig_from_calibration.py cameras.json OUTPUT --videos videos/
 
-Needs nothing but Python.
+Needs only Python.
 """
 
 import argparse

@@ -1,6 +1,6 @@
 #!/bin/sh
-# A long take on a Slurm cluster: one array job a wave, each waiting for the one before. The folders are on a file system that
-# all nodes see. Run it again after whatever went wrong: what is done is not done twice.
+# A long capture on a Slurm cluster: one array job per wave, each waiting for the previous one. The folders are on a file system
+# that all nodes share. Run it again after any failure: finished chunks are skipped.
 #
 #   sh slurm.sh CAPTURE RUN [options of `splat4d train`]
 #   SBATCH_OPTIONS="--cpus-per-task=16 --mem=8G --time=4:00:00" sh slurm.sh ...
@@ -10,11 +10,11 @@ shift 2
 splat4d=${SPLAT4D:-splat4d}
 options=${SBATCH_OPTIONS:---cpus-per-task=1}
 
-# The shared layer here: it says how many chunks there are, which the arrays must know when they are sent.
+# The shared layer first: it determines the number of chunks, which the arrays need at submission.
 "$splat4d" train "$capture" -o "$run" --chunk shared "$@"
 last=$(python3 -c 'import json, sys; print(len(json.load(open(sys.argv[1]))["cuts"]))' "$run/chunks/plan.json")
 
-# wave FIRST [more of sbatch]: chunks FIRST, FIRST + 2 ...; says the job's number. Requeued where its node dies.
+# wave FIRST [more of sbatch]: chunks FIRST, FIRST + 2 ...; prints the job's number. Requeued if its node dies.
 wave() {
     first=$1
     shift

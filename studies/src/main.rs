@@ -1,5 +1,17 @@
-//! Studies that vary what methods leave open, on made-up motion, and on runs and captures of one's own. A program of the
-//! workspace that is not shipped: `cargo run --release -p splat4d-studies -- e00`.
+//! Studies of open choices of the methods, on synthetic motion and on your own runs and captures. Not shipped: `cargo
+//! run --release -p splat4d-studies -- e00`.
+//!
+//! # Code map
+//!
+//! A module imports only modules above it; `xtask/tests/tidy.rs` checks the order.
+//!
+//! | module | content |
+//! |---|---|
+//! | `cells.rs`, `study.rs`, `tables.rs` | cells that are computed once, tables, curves |
+//! | `deformation.rs`, `lifting.rs` | synthetic motion with known truth |
+//! | `made/` | synthetic captures, each hard for one reason |
+//! | `e00.rs`, `e01.rs`, `e02.rs`, `e03.rs`, `models.rs` | the studies; `e02/` is the ablation of the filter |
+//! | `suite/` | the recipe on a list of captures (docs/suite.md) |
 
 mod cells;
 mod deformation;

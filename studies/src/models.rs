@@ -207,7 +207,7 @@ fn markdown(cells: &[Cell], args: &Args) -> String {
     let mut out = format!(
         "Trained for {} minutes a cell on pictures reduced by {}, on this machine's CPU. PSNR, SSIM and flicker (mean \
          difference between the change from frame to frame and the truth's, in 1/255) are means over the held-out views, \
-         `moving` is PSNR where things move. `scene` is the learnt state in 32-bit floats, `file` the playback file. \
+         `moving` is PSNR of dynamic regions. `scene` is the learnt state in 32-bit floats, `file` the playback file. \
          Frames a second: the learnt state, end to end, 800x800.\n",
         args.minutes, args.downscale
     );

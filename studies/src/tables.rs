@@ -14,7 +14,7 @@ pub(crate) fn markdown(findings: &Findings, grid: &Grid) -> String {
         let _ = write!(
             out,
             "\n{} Gaussians, {} as 32-bit floats; fine-tuning takes {} steps. PSNR is that of the held-out views, \
-             `moving` is where things move. Frames a second are the CPU's, end to end (blending alone), times those of \
+             `moving` is that of dynamic regions. Frames a second are the CPU's, end to end (blending alone), times those of \
              the source, which were measured in turns with them.\n",
             grouped(source.side.gaussians),
             human_bytes(source.side.float_bytes),
@@ -163,7 +163,7 @@ pub(crate) fn plots(findings: &Findings, grid: &Grid) -> Vec<(&'static str, Stri
         ["filter", "fine-tuned"].iter().enumerate().map(|(i, name)| curve(name, |s| s.psnr, &keys, i)).collect();
     let all: [(&str, Vec<Series>, &str, &str); 3] = [
         ("prune", by_share(|s| s.psnr), "% removed", "dB"),
-        ("prune-moving", by_share(|s| s.psnr_dynamic), "% removed", "dB where things move"),
+        ("prune-moving", by_share(|s| s.psnr_dynamic), "% removed", "dB, dynamic regions"),
         ("interval", by_interval, "frames between keys", "dB"),
     ];
     all.into_iter().filter_map(|(name, series, x, unit)| Some((name, chart::file(&series, x, unit)?))).collect()

@@ -1,4 +1,12 @@
 //! The project's own chores: `cargo run --release -p xtask -- CHORE`.
+//!
+//! # Code map
+//!
+//! | module | content |
+//! |---|---|
+//! | `capture.rs`, `scene.rs`, `raster.rs` and others | render the bundled capture with a small renderer of their own |
+//! | `site.rs`, `python_api.rs` | the static site; the Python API as its page |
+//! | `fuzz.rs`, `chaos/` | damaged inputs for every reader; kills, full disks and second processes for every command that writes |
 
 mod camera;
 mod capture;

@@ -7,18 +7,20 @@ use pulldown_cmark::{Event, Options, Parser, Tag, TagEnd, html};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// Documents of the root that become pages; the first is the front page. All of docs/ become pages too.
+/// Folders all of whose documents become pages.
+const PAGES: [&str; 2] = ["docs", "studies/records"];
+/// Documents of the root that become pages; the first is the front page.
 const ROOT: [&str; 6] =
     ["README.md", "ARCHITECTURE.md", "CONVENTIONS.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md"];
 /// The menu: page and name.
 const MENU: [(&str, &str); 8] = [
     ("index.html", "splat4d"),
     ("gallery/index.html", "Play"),
-    ("docs/verbs.html", "Verbs"),
+    ("docs/README.html", "Documentation"),
+    ("docs/verbs.html", "Commands"),
+    ("docs/recipe.html", "Settings"),
     ("docs/python.html", "Python"),
     ("docs/player.html", "Player"),
-    ("docs/models.html", "Models"),
-    ("docs/capture-format.html", "Captures"),
     ("api/index.html", "API"),
 ];
 /// Crates with pages of their own, and what each is for.
@@ -61,7 +63,9 @@ pub(crate) fn command(arguments: &[String]) -> Result<()> {
     }
     write_file(&out.join(MARK), b"A site that xtask made; it replaces this folder as a whole.\n")?;
     let mut documents: Vec<PathBuf> = ROOT.iter().map(PathBuf::from).collect();
-    documents.extend(list(&root.join("docs"), "md")?.into_iter().map(|name| Path::new("docs").join(name)));
+    for folder in PAGES {
+        documents.extend(list(&root.join(folder), "md")?.into_iter().map(|name| Path::new(folder).join(name)));
+    }
     for document in &documents {
         let text = std::fs::read_to_string(root.join(document)).with_context(|| document.display().to_string())?;
         write_file(&out.join(page_of(document)), page(&text, document, &documents).as_bytes())?;

@@ -198,7 +198,9 @@ impl Kitchen<'_> {
         };
         let mut baked = bakery.bake(cut, &mut |done, total| console.phase("baking", done, total))?;
         if scene.layers.iter().any(|l| l.masks.is_some()) {
-            console.warn("the scene's masks are not baked along: whom they leave out is drawn. Its own .s4d has them.");
+            console.warn(
+                "the scene's masks are not baked: Gaussians that they leave out are rendered. Its own .s4d has them.",
+            );
         }
         let antialias = self.source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.appearance.antialias);
         let (stage, named) = (self.source.stage(self.views), distinct(self.views));

@@ -129,7 +129,7 @@ pub(crate) fn pose(value: &Value) -> Result<Se3> {
     let shear = pose.orthogonality_error();
     if shear > MAX_SHEAR {
         return Err(Error::input(format!(
-            "\"world_to_camera\" is no rigid motion (its rotation is off by {shear:.3})"
+            "invalid \"world_to_camera\": not a rigid motion (its rotation is off by {shear:.3})"
         ))
         .remedy("Remove scale and shear from the matrix and write at least four decimals."));
     }

@@ -150,7 +150,7 @@ impl Work {
         not_empty(&source.scene, &self.order.source)?;
         source.scene.without_head("a playback file")?;
         let run = source.run.as_ref().ok_or_else(|| {
-            Error::input("is no run: compressing needs the pictures that a scene was trained on")
+            Error::input("not a run: compression needs the images that a scene was trained on")
                 .at(self.order.source.display())
                 .remedy("Give a run folder, or make a plain file with `splat4d bake`.")
         })?;
@@ -427,7 +427,7 @@ fn say(told: &Compressed, size: [usize; 2], console: &Console) {
     let line = |name: &str, side: &Side| {
         let number = |value: Option<f64>, digits: usize| value.map_or("-".into(), |v| format!("{v:.digits$}"));
         format!(
-            "{name}: {} Gaussians, {} ({} as floats), PSNR {} dB, where things move {} dB, SSIM {}, {:.0} frames/s at \
+            "{name}: {} Gaussians, {} ({} as floats), PSNR {} dB, dynamic regions {} dB, SSIM {}, {:.0} frames/s at \
              {}x{}",
             files::grouped(side.gaussians),
             files::human_bytes(side.bytes),

@@ -7,11 +7,11 @@ use splat4d::render::{RenderConfig, Tables, Wanted};
 /// Device that renders.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum Device {
-    /// The GPU if there is one, else the CPU
+    /// A GPU if there is one, otherwise the CPU
     Auto,
     /// The CPU
     Cpu,
-    /// Any Vulkan, Metal or Direct3D 12 driver, even one that computes on the CPU
+    /// Any Vulkan, Metal or Direct3D 12 driver, including software drivers
     Gpu,
 }
 

@@ -21,23 +21,23 @@ use splat4d_train::labels::best;
 pub enum Channel {
     /// Colour over the background
     Color,
-    /// How opaque: white where something is
+    /// Opacity: white is opaque
     Alpha,
     /// Expected depth: near is bright
     Depth,
-    /// Where pixels go by the next frame of the scene, for this camera: the direction as hue, the length as strength
+    /// Motion of pixels to the next frame for this camera: direction as hue, length as saturation
     Flow,
-    /// Velocity in the world: x, y, z as red, green, blue about grey
+    /// Velocity in the world: x, y, z as red, green, blue around grey
     Velocity,
     /// Normals in the camera's axes: right, up, towards the camera as red, green, blue
     Normal,
-    /// The likeliest label, a colour each
+    /// The most probable label, one colour per label
     Label,
-    /// Feature channels: the first three as red, green, blue about grey
+    /// Feature channels: the first three as red, green, blue around grey
     Feature,
-    /// Seconds of the clip in which what is seen is there: long is bright
+    /// Seconds of the clip in which the visible surface exists: long is bright
     Life,
-    /// Standard deviation of the place of what is seen that the training pictures leave open: unsure is bright
+    /// Standard deviation of positions that the training images leave open: uncertain is bright
     Uncertainty,
 }
 
@@ -212,7 +212,7 @@ impl<'a> Painter<'a> {
         if let Some(error) = device::draw(&mut self.backend, &shot, &mut self.image)
             && let Some(console) = self.console
         {
-            console.warn(&format!("drawing on the CPU: {}", error.cause()));
+            console.warn(&format!("rendering on the CPU: {}", error.cause()));
         }
     }
 
@@ -241,7 +241,7 @@ impl<'a> Painter<'a> {
         if let Some(error) = device::draw(&mut self.backend, &shot, &mut self.image)
             && let Some(console) = self.console
         {
-            console.warn(&format!("drawing on the CPU: {}", error.cause()));
+            console.warn(&format!("rendering on the CPU: {}", error.cause()));
         }
         self.field = flow::divided(&self.image.extra);
     }

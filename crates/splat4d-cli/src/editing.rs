@@ -208,7 +208,7 @@ fn mean_psnr(scene: &Scene<f32>, data: &Dataset, frames: &[usize]) -> Result<f64
 pub(crate) fn read(path: &Path) -> Result<Edits> {
     toml::from_str(&files::read_text(path)?).map_err(|e| {
         let line = e.span().map_or(String::new(), |s| format!(" (byte {})", s.start));
-        Error::input(format!("are no edits{line}: {}", e.message()))
+        Error::input(format!("invalid list of edits{line}: {}", e.message()))
             .at(path.display())
             .remedy("docs/edit.md tells all steps.")
     })

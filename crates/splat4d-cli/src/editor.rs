@@ -72,7 +72,7 @@ impl Eye {
         let sized = (1..=MOST_SIDE).contains(&self.width) && (1..=MOST_SIDE).contains(&self.height);
         let length: f64 = self.quat.iter().map(|x| x * x).sum();
         if !(numbers.copied().all(f64::is_finite) && sized && length > 0.0 && self.fx > 0.0 && self.fy > 0.0) {
-            return Err(Error::input("the view is no camera").remedy("Load the page again"));
+            return Err(Error::input("invalid view: expected a camera").remedy("Load the page again"));
         }
         let rotation = quat::to_rotation(quat::normalize(self.quat).0);
         let world_from_cam = Se3 { rotation, translation: self.position };

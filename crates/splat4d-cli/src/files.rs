@@ -85,9 +85,10 @@ pub(crate) fn parse_bytes(text: &str) -> Result<u64, String> {
         "m" | "mb" | "mib" => 2,
         "g" | "gb" | "gib" => 3,
         "t" | "tb" | "tib" => 4,
-        _ => return Err(format!("`{unit}` is no unit of memory; write for instance 512MiB or 1.5GiB")),
+        _ => return Err(format!("unknown unit of memory `{unit}`; write for instance 512MiB or 1.5GiB")),
     };
-    let value: f64 = number.parse().map_err(|_| format!("`{text}` is no size; write for instance 512MiB or 1.5GiB"))?;
+    let value: f64 =
+        number.parse().map_err(|_| format!("invalid size `{text}`; write for instance 512MiB or 1.5GiB"))?;
     let bytes = value * 1024f64.powi(power);
     if bytes < 1.0 || bytes > 2f64.powi(50) {
         return Err(format!("`{text}` is not between 1 byte and 1024 TiB"));

@@ -81,9 +81,9 @@ pub(crate) fn steps(capture: &Capture, recipe: &Recipe, only_playback: bool) -> 
 #[derive(Debug, Default, clap::Args)]
 pub struct Measure {
     /// Weights (safetensors) for LPIPS; without them it is not computed
-    #[arg(long, value_name = "FILE", help_heading = "What is measured")]
+    #[arg(long, value_name = "FILE", help_heading = "Evaluation")]
     pub lpips_weights: Option<PathBuf>,
-    /// What draws the views.
+    /// Device that renders the views.
     #[arg(skip)]
     pub device: Device,
 }
@@ -232,7 +232,7 @@ pub fn scores(run: &Path, scene: &Scene<f32>, measure: &Measure, console: &Conso
     if capture.held.is_empty() {
         console.warn(
             "no view was held out, so that quality on new views cannot be measured. Hold out a camera (--hold-out \
-             camera=0) or every 8th picture (--hold-out every=8).",
+             camera=0) or every 8th image (--hold-out every=8).",
         );
     }
     Ok(evaluation)
@@ -457,7 +457,7 @@ fn flow(run: &Path, scene: &Scene<f32>, capture: &Capture, recipe: &Recipe, cons
         100.0 * e.within[0]
     );
     if let (Some(moving), Some(length)) = (e.moving, e.length) {
-        let _ = write!(words, "; where things move {moving:.3} px of {length:.2}");
+        let _ = write!(words, "; in dynamic regions {moving:.3} px of {length:.2}");
     }
     console.say(&words);
     let entry = json!({
@@ -486,7 +486,7 @@ fn in_words(score: impl Fn(&str) -> Option<f64>) -> String {
         ("PSNR", "PSNR", 2, " dB"),
         ("PSNR-aligned", "aligned", 2, " dB"),
         ("PSNR-cc", "colour-corrected", 2, " dB"),
-        ("PSNR-dynamic", "where things move", 2, " dB"),
+        ("PSNR-dynamic", "dynamic regions", 2, " dB"),
         ("PSNR-dynamic-aligned", "there aligned", 2, " dB"),
         ("PSNR-foreground", "foreground", 2, " dB"),
         ("SSIM", "SSIM", 4, ""),
@@ -517,7 +517,7 @@ fn say_scores(run: &Run, console: &Console) {
         console.say(&format!("held-out views: {words}"));
     }
     if let (Some(ours), Some(still)) = (run.score("PSNR-dynamic"), run.baseline("PSNR-dynamic")) {
-        console.say(&format!("where things move: {:+.2} dB over a still scene ({still:.2} dB)", ours - still));
+        console.say(&format!("dynamic regions: {:+.2} dB over a static scene ({still:.2} dB)", ours - still));
     }
     if let Some(results) = &run.results {
         let still = run.all_results.get(EvalOptions::STILL);

@@ -1,8 +1,26 @@
-//! The `splat4d` command: posed, moving captures become trained, measured and rendered 4D scenes on a plain CPU.
+//! The `splat4d` command: trains, measures, renders, compresses and plays dynamic 3D scenes.
 //!
-//! Each verb is a file in `verbs`. Only the shells print, parse arguments or exit: 0 done, 1 failed, 2 bad input. A library
-//! for the sake of the workspace's studies and of the Python package, which share the console, run folders and measurements:
-//! no published interface.
+//! Each command is a file in `verbs`. Exit codes: 0 done, 1 failed, 2 bad input. This is a library only because the
+//! studies and the Python package share its console, run folders and measurements; its interface is not public.
+//!
+//! # Code map
+//!
+//! A module imports only modules above it; `xtask/tests/tidy.rs` checks the order.
+//!
+//! | module | content |
+//! |---|---|
+//! | `console.rs`, `run_folder.rs`, `camera_file.rs`, `video.rs` | output, run folders, camera files, films |
+//! | `paths/` | orbits, data-set cameras and key-framed camera paths |
+//! | `source.rs`, `source/` | scenes of other programs that are folders or archives |
+//! | `raw.rs`, `asked.rs` | channel values as files; files of queried points and their results |
+//! | `measure.rs`, `measure/` | how scenes and files play, for `compress`, the studies and `bench --playback` |
+//! | `baking.rs`, `baking/` | the playback file at the end of a run |
+//! | `report/`, `report/compress/` | `report.html`, drawn without a library |
+//! | `film.rs` | the playback file of a long capture, which grows during training |
+//! | `labelling.rs`, `chunked.rs`, `compressing.rs`, `predicting.rs`, `predicting/`, `editing.rs`, `editor.rs` | the work of `label`, `train --chunk` and `join`, `compress`, `predict`, `edit`, `view --edit` |
+//! | `verbs/`, `verbs/info/` | one file per command |
+//! | `verbs/bench/` | pinned scenes, stages, training steps, growth, GPU stages, other programs (`studies/beside/with_gsplat.py`); each time with its lower bound |
+//! | `bin/` | `s4d`, the command's second name: a launcher |
 
 #![allow(missing_docs)] // nobody outside the workspace reads it
 
@@ -51,23 +69,23 @@ const BAD_INPUT: u8 = 2;
 
 const EXAMPLES: &str = "\
 Examples:
-  splat4d import videos/ -o my-take        videos of one scene become a capture: clocks, poses, points
+  splat4d import videos/ -o my-take        videos of one scene become a capture
   splat4d train examples/knight            train, measure, report and film the bundled capture
-  splat4d train my-take --minutes 10       fit the steps of training into ten minutes
-  splat4d train --resume runs/my-take      continue exactly where a run stopped
-  splat4d eval runs/knight --baseline      measure again, next to a scene that stands still
+  splat4d train my-take --minutes 10       finish within ten minutes
+  splat4d train --resume runs/my-take      continue a run exactly
+  splat4d eval runs/knight --baseline      compare with a static scene
   splat4d render runs/knight -o turn.mp4   film an orbit through space and time
-  splat4d localise runs/knight photo.jpg   from where and when was it taken?
-  splat4d bake runs/knight -o knight.s4d           one small, seekable file for players
-  splat4d compress runs/knight             the same many times smaller and faster, and measured
+  splat4d localise runs/knight photo.jpg   pose and time of an image
+  splat4d bake runs/knight -o knight.s4d   one small, seekable file for the player
+  splat4d compress runs/knight             a smaller file, measured before and after
   splat4d view runs/knight                 play it in the browser
   splat4d export runs/knight -o now.ply --time 0.5
   splat4d export runs/knight --html -o knight.html
-  splat4d convert scene.sog scene.spz      between the formats of other programs
-  splat4d edit runs/knight edits.toml -o clean.safetensors   select, clean, recolour, move, merge, drag
-  splat4d label runs/take                  what each Gaussian is part of, from masks
-  splat4d info my-take                     what is in a capture, run or file; is it healthy?
-  splat4d bench                            how fast this machine draws and trains
+  splat4d convert scene.sog scene.spz      between formats of other programs
+  splat4d edit runs/knight edits.toml -o clean.safetensors
+  splat4d label runs/take                  labels of Gaussians, from masks
+  splat4d info my-take                     contents and findings of a capture, run or file
+  splat4d bench                            speed of this machine
 
 Exit codes: 0 done, 1 failed or interrupted, 2 bad input.";
 
@@ -78,7 +96,7 @@ const VERSION: &str = concat!(
      (the Python package splats4d is another program, whose command has the same name)"
 );
 
-/// 4D Gaussian splatting on a plain CPU: a posed, moving capture becomes a scene to look at from anywhere, at any time.
+/// 4D Gaussian splatting on any CPU or GPU: train, measure, compress and play dynamic 3D scenes.
 #[derive(Debug, Parser)]
 #[command(name = "splat4d", version, long_version = VERSION, after_help = EXAMPLES, max_term_width = 110)]
 struct Cli {
@@ -91,16 +109,16 @@ struct Cli {
 /// Options of every verb.
 #[derive(Debug, clap::Args)]
 pub struct Globals {
-    /// Print events and results for machines: one JSON object a line
+    /// Print one JSON object per line (docs/events.md)
     #[arg(long, global = true)]
     json: bool,
-    /// Say more
+    /// Print more
     #[arg(short, long, global = true, conflicts_with = "quiet")]
     verbose: bool,
-    /// Say only warnings and errors
+    /// Print only warnings and errors
     #[arg(short, long, global = true)]
     quiet: bool,
-    /// Threads to work with [default: all cores]; the result does not depend on it
+    /// Number of threads [default: all cores]; the result does not depend on it
     #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     threads: Option<u16>,
 }

@@ -279,7 +279,7 @@ impl Work {
             run.capture().and_then(|c| c.canonicalize().ok()) == self.run.capture().and_then(|c| c.canonicalize().ok());
         let scene = read_scene(&run.scene_file()?)?;
         if !same || scene.clip[1] <= self.clock.until {
-            return Err(Error::input("the oracle is no run of the same capture that saw more of it")
+            return Err(Error::input("invalid oracle: expected a run of the same capture that saw more of it")
                 .at(path.display())
                 .remedy("Train it on the same capture with the same recipe, without --observe"));
         }
@@ -298,7 +298,7 @@ impl Work {
 /// The figures in the terminal.
 fn say(told: &Told, console: &Console) {
     let number = |x: Option<f64>, digits: usize| x.map_or("–".to_owned(), |x| format!("{x:.digits$}"));
-    console.say("model          PSNR  where things move   skill over freeze  over velocity");
+    console.say("model          PSNR  dynamic regions     skill over freeze  over velocity");
     for m in told.models.iter().chain(&told.assimilated).chain(&told.oracle) {
         console.say(&format!(
             "{:<13}{:>6}{:>12} dB{:>18}{:>17}   fitted in {}",

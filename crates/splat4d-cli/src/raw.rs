@@ -9,11 +9,11 @@ use std::io::Cursor;
 /// A format of arrays of numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum RawFormat {
-    /// NumPy float32, [h,w,C], or [h,w] of one number
+    /// NumPy float32, [h,w,C], or [h,w] for one value
     Npy,
-    /// Middlebury .flo: of flow alone; unknown pixels are 1e10
+    /// Middlebury .flo, for flow only; unknown pixels are 1e10
     Flo,
-    /// OpenEXR, 32-bit floats, a channel a number: R G B, A, Z, U V, X Y Z, F00 F01 ..., or the channel's name
+    /// OpenEXR, 32-bit floats: R G B, A, Z, U V, X Y Z, F00 F01 ..., or the channel's name
     Exr,
 }
 

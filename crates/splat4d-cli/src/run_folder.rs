@@ -242,7 +242,7 @@ impl Run {
         let file = self.path.join("cameras.json");
         if file.is_file() {
             return views_in(&file)?.ok_or_else(|| {
-                Error::input("is no list of cameras as splat4d writes it")
+                Error::input("expected a list of cameras as splat4d writes it")
                     .at(file.display())
                     .remedy("Delete it: the cameras are then read from the capture.")
             });

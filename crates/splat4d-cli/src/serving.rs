@@ -16,16 +16,16 @@ const LOOK: Duration = Duration::from_millis(50);
 /// Where to serve.
 #[derive(Clone, Debug, Default, clap::Args)]
 pub(crate) struct Place {
-    /// The page's port; 0: any free one [default: 4440, or a free one after it]
-    #[arg(long, value_name = "N", help_heading = "Where it is served")]
+    /// Port of the page; 0: any free one [default: 4440, or a free one after it]
+    #[arg(long, value_name = "N", help_heading = "Serving")]
     pub port: Option<u16>,
-    /// Serve at this name or address of the machine; others can then look too [default: this machine only]
-    #[arg(long, value_name = "NAME", help_heading = "Where it is served")]
+    /// Serve at this name or address, also to other machines [default: this machine only]
+    #[arg(long, value_name = "NAME", help_heading = "Serving")]
     pub host: Option<String>,
-    /// Only print the address; open no browser
-    #[arg(long, help_heading = "Where it is served")]
+    /// Print the address and open no browser
+    #[arg(long, help_heading = "Serving")]
     pub no_open: bool,
-    /// Take the player from this folder, for whoever works on it
+    /// Read the player from this folder, for its development
     #[arg(long, value_name = "DIR", hide = true)]
     pub player_folder: Option<PathBuf>,
 }

@@ -164,7 +164,7 @@ fn open_sequence(path: &Path, fps: f64) -> Result<Source> {
         let bytes = files::read(file)?;
         let own = dialect_of(file, &bytes).filter(|d| !d.moves);
         let Some(own) = own.filter(|d| kind.is_none_or(|k: Dialect| k.up == d.up)) else {
-            return Err(Error::input("is no frame of a sequence like the others")
+            return Err(Error::input("invalid frame of a sequence: it differs from the others")
                 .at(file.display())
                 .remedy(format!("Frames are {} files of one kind.", either(&sequence::endings()))));
         };

@@ -32,7 +32,7 @@ impl Actions {
             return Err(bad(format!("{} columns of actions are too many: {MAX_COLUMNS} are possible", names.len())));
         }
         if let Some(name) = names.iter().find(|n| n.is_empty() || n.parse::<f64>().is_ok()) {
-            return Err(bad(format!("\"{name}\" is no name of a column of actions")));
+            return Err(bad(format!("invalid column of actions \"{name}\"")));
         }
         if let Some(name) = names.iter().enumerate().find_map(|(i, n)| names[..i].contains(n).then_some(n)) {
             return Err(bad(format!("two columns of actions are called {name}")));
@@ -45,9 +45,9 @@ impl Actions {
             let cells: Vec<Option<f64>> =
                 line.split(',').map(|c| c.trim().parse().ok().filter(|x: &f64| x.is_finite())).collect();
             let numbers: Option<Vec<f64>> = cells.iter().copied().collect();
-            numbers
-                .filter(|n| n.len() == names.len())
-                .ok_or_else(|| bad(format!("line {} of the actions is no row of {} numbers", number + 1, names.len())))
+            numbers.filter(|n| n.len() == names.len()).ok_or_else(|| {
+                bad(format!("invalid line {} of the actions: expected a row of {} numbers", number + 1, names.len()))
+            })
         };
         let rows = lines.map(row).collect::<Result<_>>()?;
         Ok(Self { names, rows })

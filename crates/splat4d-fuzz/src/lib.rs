@@ -1,5 +1,5 @@
-//! Every reader of files, and of texts from outside, as a function of bytes. They promise an error for whatever they are given:
-//! never a panic, never a hang, and no allocation far beyond what they were given.
+//! Every reader of files, and of texts from outside, as a function of bytes. Readers return an error for any input: no
+//! panic, no hang, and no allocation far beyond the input's size.
 //!
 //! [`READERS`] is the one list: `cargo run --release -p xtask -- fuzz` mutates seeds of each on a stable toolchain, and
 //! `fuzz/` holds a `cargo fuzz` target of each.

@@ -1,7 +1,7 @@
 //! Runs every reader on mutated seeds, on a stable toolchain: `cargo run --release -p xtask -- fuzz`.
 //!
-//! Each reader runs in a process of its own with limited memory, so that an abort, an allocation beyond the limit or a hang costs
-//! that process and not the run. Input number i of a reader is a function of seed, reader and i: a failure is found again.
+//! Each reader runs in its own process with limited memory, so an abort, an allocation beyond the limit or a hang ends
+//! only that process. Input number i of a reader is a function of seed, reader and i, so failures are reproducible.
 
 use anyhow::{Context, Result, bail, ensure};
 use splat4d_fuzz::{Reader, mutate, readers};

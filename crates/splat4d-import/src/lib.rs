@@ -1,5 +1,22 @@
-//! Makes captures of videos: frames with their times, a clock that all cameras share, poses from pictures alone, and a folder that
-//! training takes.
+//! Makes captures from videos: frames with timestamps, synchronisation, poses from images alone, and a folder that
+//! training reads.
+//!
+//! # Code map
+//!
+//! A module imports only modules above it; `xtask/tests/tidy.rs` checks the order.
+//!
+//! | module | content |
+//! |---|---|
+//! | `board/` | square tags (AprilTag 36h11, ArUco): dark regions with four corners (`quads.rs`), their bits |
+//! | `calibration/` | calibrations of other programs: one file per dialect over one tree of YAML, XML, JSON and TOML (`tree.rs`), chosen by content; names of videos (`matching.rs`), intrinsics of another size (`shape.rs`) |
+//! | `video/` | images with timestamps: `ffmpeg` and `ffprobe` through pipes, folders of images, motion JPEG in AVI without a program; recordings in several files (`chapters.rs`), rate, lost and doubled frames (`clock.rs`) |
+//! | `sync/` | synchronisation: lags of pairs by sound, motion (a guess) and epipolar geometry, offsets of all by robust least squares (`graph.rs`) |
+//! | `sfm/`, `sfm/mapper/` | structure from motion: views (`pictures.rs`), tracks, two-view geometry, resection, locally optimised consensus (`sample.rs`), the mapper, exact positions by aligning windows (`overlay.rs`), bundle adjustment with lenses and time offsets, known cameras, up direction, walls and unit (`align.rs`) |
+//! | `corrections.rs` | `import.toml`: results per camera, corrected by hand and read again |
+//! | `write/` | images, masks, times and `capture.json`, continued after an interruption |
+//! | `shipped.rs` | frames of captures shipped as a video per camera with poses (Neural 3D Video) |
+//! | `take/` | the whole import: inputs, synchronisation, given calibrations, COLMAP, poses and time offsets in turn, unit and axes, delay of sound, cache, report |
+//! | `doctor/` | problems of a capture: one camera (`look.rs`, `alone.rs`), pairs of cameras (`between.rs`), time offsets and rolling shutters, the dynamic volume, the list of findings (`check.rs`) |
 
 pub mod board;
 pub mod calibration;

@@ -1,4 +1,4 @@
-"""A capture of pictures in memory: here a scene's own renders; anything with cameras and times will do."""
+"""A capture of images in memory; here renders of a scene, but any images with cameras and times work."""
 import sys
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""The Gaussians of a moment as NumPy arrays, as gsplat's rasterization takes them."""
+"""The Gaussians at one time as NumPy arrays, as gsplat's rasterization takes them."""
 import sys
 
 import numpy as np

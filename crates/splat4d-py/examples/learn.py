@@ -1,4 +1,4 @@
-"""Learns a capture, says how far it is, and measures views that training never saw."""
+"""Trains a capture with progress, and measures held-out views."""
 import sys
 
 import splat4d

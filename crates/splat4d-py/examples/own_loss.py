@@ -1,4 +1,4 @@
-"""A loss of your own beside the recipe's. With PyTorch: torch.from_numpy(picture), backward(), grad.numpy()."""
+"""A loss of your own, added to those of the recipe. With PyTorch: torch.from_numpy(picture), backward(), grad.numpy()."""
 import sys
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""A loss of PyTorch beside the recipe's (pip install torch)."""
+"""A PyTorch loss, added to those of the recipe (pip install torch)."""
 import sys
 
 import torch

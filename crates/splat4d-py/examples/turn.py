@@ -1,4 +1,4 @@
-"""A turn around a scene while it plays, as pictures."""
+"""An orbit around a playing scene, as images."""
 import sys
 from math import cos, sin, tau
 

@@ -41,7 +41,7 @@ pub(crate) fn numbers<'py, T: numpy::Element>(
     options.set_item("dtype", &wanted)?;
     let array = py.import("numpy")?.call_method("asarray", (value,), Some(&options)).map_err(|e| {
         let remedy = format!("Give an array or a list of numbers ({wanted})");
-        bad_input(format!("{what} is no array of numbers ({})", e.value(py)), &remedy)
+        bad_input(format!("{what}: expected an array of numbers ({})", e.value(py)), &remedy)
     })?;
     let array = array.cast_into::<PyArrayDyn<T>>().map_err(PyErr::from)?;
     Ok(array.readonly())

@@ -15,7 +15,7 @@ pub(crate) struct Camera(pub(crate) scene::Camera);
 
 #[pymethods]
 impl Camera {
-    /// fy: fx unless given; cx, cy: the middle; world_to_camera: 4x4, the identity.
+    /// Defaults: fy is fx; cx, cy the centre; world_to_camera (4x4) the identity.
     #[new]
     #[pyo3(signature = (width, height, fx, fy=None, cx=None, cy=None, world_to_camera=None, near=scene::Camera::NEAR))]
     #[allow(clippy::too_many_arguments)]

@@ -17,7 +17,7 @@ use std::sync::Arc;
 /// Memory for decoded pictures that were asked for lately.
 const STORE_BYTES: usize = 64 << 20;
 
-/// A posed, timed set of pictures in any layout that `splat4d info` reads.
+/// Images with poses and times, in any layout that `splat4d info` reads.
 #[pyclass(frozen, module = "splat4d")]
 pub(crate) struct Capture {
     /// Its folder or marker file.
@@ -65,7 +65,7 @@ impl Capture {
 
 #[pymethods]
 impl Capture {
-    /// `settings`: knobs of the recipe's table `capture`, such as `downscale=2` or `hold_out="camera=0"`.
+    /// `settings`: settings of the table `capture`, such as `downscale=2` or `hold_out="camera=0"`.
     #[new]
     #[pyo3(signature = (path, **settings))]
     fn new(py: Python<'_>, path: PathBuf, settings: Option<&Bound<'_, PyDict>>) -> PyResult<Self> {
@@ -78,12 +78,13 @@ impl Capture {
         Self::open(py, path, &recipe, None)
     }
 
-    /// A capture of pictures in memory. `images`: for each camera its frames [h, w, 3], float32 in [0, 1] or uint8 (a list, or
-    /// an array [T, h, w, 3]); `cameras`: a Camera each, or a list of one a frame; `times`: seconds, for all cameras or a
-    /// list for each; `points`: [N, 3], with `colors` [N, 3] in [0, 1]; `hold_out`: names of cameras kept to measure.
+    /// Makes a capture of images in memory. `images`: for each camera its frames [h, w, 3], float32 in [0, 1] or uint8
+    /// (a list, or an array [T, h, w, 3]); `cameras`: one Camera each, or a list with one per frame; `times`: seconds,
+    /// for all cameras or a list for each; `points`: [N, 3], with `colors` [N, 3] in [0, 1]; `hold_out`: names of
+    /// held-out cameras.
     ///
-    /// Pictures are kept as lossless files in `folder`, so that runs can be resumed; without one in a temporary folder that
-    /// goes with the capture.
+    /// Images are stored as lossless files in `folder`, so that runs can be resumed; without one, in a temporary folder
+    /// that is deleted with the capture.
     #[classmethod]
     #[pyo3(signature = (images, cameras, times=None, points=None, *, colors=None, names=None, fps=None, up=None,
                         hold_out=None, folder=None))]
@@ -154,7 +155,7 @@ impl Capture {
         self.capture.warnings.clone()
     }
 
-    /// The initial cloud: positions [N, 3] float64 and colours [N, 3] float32 in [0, 1]; None: there is none.
+    /// The initial points: positions [N, 3] float64 and colours [N, 3] float32 in [0, 1], or None.
     #[getter]
     fn points(&self, py: Python<'_>) -> PyResult<Option<(Py<PyAny>, Py<PyAny>)>> {
         let Some(cloud) = &self.capture.points else { return Ok(None) };
@@ -162,7 +163,7 @@ impl Capture {
         Ok(Some((shaped(py, flat, &[cloud.points.len(), 3])?, rows(py, cloud.colors.clone())?)))
     }
 
-    /// Pictures in all.
+    /// Number of images.
     fn __len__(&self) -> usize {
         self.capture.frames.len()
     }
@@ -187,12 +188,12 @@ impl Capture {
         })
     }
 
-    /// Picture i as training sees it, [h, w, 3] float32 from 0 to 1: undistorted, reduced, on the background.
+    /// Image i as in training, [h, w, 3] float32 from 0 to 1: undistorted, reduced, on the background.
     fn image<'py>(&self, py: Python<'py>, i: isize) -> PyResult<Bound<'py, PyAny>> {
         picture(py, self.load(py, i)?.color)
     }
 
-    /// The foreground mask of picture i, [h, w] float32 from 0 to 1; None: it has none.
+    /// The foreground mask of image i, [h, w] float32 from 0 to 1, or None.
     fn mask(&self, py: Python<'_>, i: isize) -> PyResult<Option<Py<PyAny>>> {
         self.load(py, i)?.mask.map(|m| plane(py, m)).transpose()
     }
@@ -203,7 +204,7 @@ impl Capture {
     }
 }
 
-/// One picture of a capture.
+/// One image of a capture.
 #[pyclass(frozen, get_all, module = "splat4d")]
 pub(crate) struct Frame {
     /// Its place in the capture.

@@ -74,7 +74,7 @@ fn write_all(py: Python<'_>, arrays: &Arrays<'_, '_>, folder: &Path, written: &m
     if let Some(bad) =
         names.iter().find(|n| n.is_empty() || n.contains(['/', '\\', '%', '\0']) || *n == "." || *n == "..")
     {
-        return Err(bad_input(format!("\"{bad}\" is no name of a camera"), "Use letters, digits and dashes"));
+        return Err(bad_input(format!("invalid name of a camera: \"{bad}\""), "Use letters, digits and dashes"));
     }
     let mut entries = Vec::new();
     for (c, name) in names.iter().enumerate() {
@@ -118,8 +118,7 @@ impl Filmed<'_, '_> {
         }
         let what = format!("cameras[{}]", self.number);
         let one = |camera: &Bound<'_, PyAny>| {
-            let wrong =
-                || bad_input(format!("{what} holds something that is no Camera"), "Give splat4d.Camera objects");
+            let wrong = || bad_input(format!("{what}: expected Camera objects"), "Give splat4d.Camera objects");
             camera.extract::<Camera>().map_err(|_| wrong())
         };
         items(self.cameras, &what)?.iter().map(one).collect()

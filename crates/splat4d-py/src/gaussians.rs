@@ -8,7 +8,7 @@ use splat4d::scene::Time;
 use splat4d_cli::source::Source;
 use std::sync::Arc;
 
-/// The Gaussians alive at one moment as NumPy arrays, activated: what gsplat's `rasterization` takes.
+/// The Gaussians alive at one time as NumPy arrays, activated, as gsplat's `rasterization` takes them.
 #[pyclass(frozen, module = "splat4d")]
 pub(crate) struct Gaussians {
     /// Second of the scene.
@@ -23,7 +23,7 @@ pub(crate) struct Gaussians {
     /// [N, 3] standard deviations, scene units.
     #[pyo3(get)]
     scales: Py<PyAny>,
-    /// [N] in (0, 1), life applied.
+    /// [N] in (0, 1), lifespan applied.
     #[pyo3(get)]
     opacities: Py<PyAny>,
     count: usize,
@@ -56,7 +56,7 @@ impl Gaussians {
 
 #[pymethods]
 impl Gaussians {
-    /// [N, K, 3] spherical harmonics, float32; gathered when first asked for.
+    /// [N, K, 3] spherical harmonics, float32; gathered on first access.
     #[getter]
     fn sh(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
         let made = self.sh.get_or_try_init(py, || {

@@ -1,5 +1,18 @@
-//! The extension module of the Python package `splat4d` (docs/python.md): scenes as NumPy arrays, captures, training, and the
-//! command itself. Python's lock is given up while anything long works; errors become `splat4d.Error` with their own text.
+//! The extension module of the Python package `splat4d` (docs/python.md): scenes as NumPy arrays, captures, training,
+//! and the command. The interpreter lock is released during long work; errors become `splat4d.Error` with their own
+//! text.
+//!
+//! # Code map
+//!
+//! A module imports only modules above it; `xtask/tests/tidy.rs` checks the order.
+//!
+//! | module | content |
+//! |---|---|
+//! | `errors.rs`, `arrays.rs`, `plain.rs`, `settings.rs` | errors, NumPy in and out, plain values, settings by name |
+//! | `camera.rs`, `gaussians.rs`, `scene.rs` | cameras, Gaussians at a time, scenes |
+//! | `from_arrays.rs` | images in memory become a capture on disk |
+//! | `metrics.rs`, `loss.rs` | metrics; losses written in Python |
+//! | `run.rs`, `capture.rs`, `train.rs` | runs, captures, training |
 
 mod arrays;
 mod camera;
@@ -49,13 +62,13 @@ mod _native {
         m.add("__version__", env!("CARGO_PKG_VERSION"))
     }
 
-    /// The command with these words, the first its name; its exit code.
+    /// Runs the command with these words, the first its name; returns its exit code.
     #[pyfunction]
     fn main(py: Python<'_>, words: Vec<OsString>) -> u8 {
         py.detach(|| splat4d_cli::main_from(words))
     }
 
-    /// One verb of the command with its options, quietly: `command("bake", "runs/knight", "-o", "knight.s4d")`.
+    /// Runs one command with its options, quietly: `command("bake", "runs/knight", "-o", "knight.s4d")`.
     #[pyfunction]
     #[pyo3(signature = (*words))]
     fn command(py: Python<'_>, words: Vec<PathBuf>) -> PyResult<()> {

@@ -30,7 +30,7 @@ impl Raised {
     }
 }
 
-/// The view that a loss looks at.
+/// The view of a loss.
 #[pyclass(frozen, get_all, module = "splat4d")]
 pub(crate) struct View {
     /// Second of the scene.
@@ -107,7 +107,7 @@ impl Asked {
     }
 }
 
-/// The recipe's picture loss, (1 − λ)·L1 + λ·(1 − SSIM) with λ = `lambda_dssim`, of two pictures [h, w, 3]: its value, and its
+/// The image loss of training, (1 − λ)·L1 + λ·(1 − SSIM) with λ = `lambda_dssim`, of two images [h, w, 3]: value, and
 /// gradient to `render` [h, w, 3].
 #[pyfunction]
 #[pyo3(signature = (render, truth, lambda_dssim=0.2))]

@@ -5,8 +5,8 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use splat4d_train::eval::{Score, ViewContext, score_view};
 
-/// PSNR (dB), SSIM, MS-SSIM and D-SSIM of two pictures [h, w, 3] as `splat4d eval` computes them; what is not defined for
-/// pictures of this size is left out.
+/// PSNR (dB), SSIM, MS-SSIM and D-SSIM of two images [h, w, 3] as in `splat4d eval`; metrics that are undefined for
+/// images of this size are left out.
 #[pyfunction]
 pub(crate) fn metrics<'py>(
     py: Python<'py>,

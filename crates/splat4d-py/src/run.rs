@@ -39,7 +39,7 @@ impl Run {
         Ok(run_folder::Run::open(&self.path).or_raise()?.iteration())
     }
 
-    /// The scene: the learnt one, or that of the newest checkpoint.
+    /// The scene: the trained one, or that of the newest checkpoint.
     fn scene(&self, py: Python<'_>) -> PyResult<Scene> {
         Scene::open(py, self.path.clone())
     }
@@ -50,15 +50,15 @@ impl Run {
         plain(py, &run_folder::Run::open(&self.path).or_raise()?.info)
     }
 
-    /// Means over the held-out views, as `results.json` has them; None: it was not measured.
+    /// Means over the held-out views, as in `results.json`, or None if not measured.
     #[getter]
     fn results(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
         let results = run_folder::Run::open(&self.path).or_raise()?.results;
         plain(py, &results.unwrap_or(Value::Null))
     }
 
-    /// Draws the held-out views, compares them with their pictures, writes `results.json`, `per_view.json` and the
-    /// pictures, and returns the means.
+    /// Renders the held-out views, compares them with their images, writes `results.json`, `per_view.json` and the
+    /// renders, and returns the means.
     fn evaluate(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
         let measured = py.detach(|| {
             let run = run_folder::Run::open(&self.path)?;

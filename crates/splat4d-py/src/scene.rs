@@ -102,11 +102,12 @@ impl Scene {
         Gaussians::at(py, &self.source, t)
     }
 
-    /// A picture at second t: `color` [h, w, 3] over the background, `alpha` [h, w], or expected `depth` [h, w] along the
-    /// camera's z in scene units, NaN where nothing is; or one of what `splat4d render --channel` shows as raw numbers, NaN
-    /// where nothing has any: `flow` [h, w, 2] in pixels to the scene's next frame, `velocity` [h, w, 3] in scene units a
-    /// second, unit `normal` [h, w, 3] in camera axes, number of the `label` [h, w] (-1: none), `feature` [h, w, C], `life` [h, w] in seconds,
-    /// `uncertainty` [h, w] in scene units (of a run; drawn on the CPU as all of these). float32. `device`: `cpu`, `gpu` or `auto`.
+    /// Renders at second t: `color` [h, w, 3] over the background, `alpha` [h, w], or expected `depth` [h, w] along the
+    /// camera's z in scene units; or, as in `splat4d render --channel`, `flow` [h, w, 2] in pixels to the scene's next
+    /// frame, `velocity` [h, w, 3] in scene units per second, unit `normal` [h, w, 3] in camera axes, number of the
+    /// `label` [h, w] (-1: none), `feature` [h, w, C], `life` [h, w] in seconds, `uncertainty` [h, w] in scene units
+    /// (of a run). float32, NaN where empty. `device`: `cpu`, `gpu` or `auto`, for colour, alpha and depth; the CPU
+    /// renders the others.
     #[pyo3(signature = (camera, t, *, channel="color", background=None, device="cpu"))]
     fn render<'py>(
         &self,
@@ -163,7 +164,7 @@ impl Scene {
         }
     }
 
-    /// Where every n-th Gaussian goes: at the times given, or else at the scene's frames.
+    /// Paths of every n-th Gaussian, at the given times or at the scene's frames.
     #[pyo3(signature = (every=1, times=None))]
     fn tracks(&self, py: Python<'_>, every: usize, times: Option<&Bound<'_, PyAny>>) -> PyResult<Tracks> {
         if every == 0 {
@@ -195,8 +196,8 @@ impl Scene {
         py.detach(|| splat4d_cli::call(&words)).or_raise()
     }
 
-    /// Writes a file that its ending names: .html (player and scene as one page), .ply (the moment t in the scene's own
-    /// axes), or what `splat4d convert` writes.
+    /// Writes a file in the format of its extension: .html (player and scene as one page), .ply (at time t, in the
+    /// scene's axes), or a format of `splat4d convert`.
     #[pyo3(signature = (path, t=None))]
     fn export(&self, py: Python<'_>, path: PathBuf, t: Option<f64>) -> PyResult<()> {
         t.map(time).transpose()?;
@@ -212,7 +213,7 @@ impl Scene {
         py.detach(|| splat4d_cli::call(&words)).or_raise()
     }
 
-    /// Gaussians in all, alive or not.
+    /// Number of Gaussians, alive or not.
     fn __len__(&self) -> usize {
         self.source.scene.len()
     }
@@ -223,7 +224,7 @@ impl Scene {
     }
 }
 
-/// Where some Gaussians are over time.
+/// Paths of Gaussians over time.
 #[pyclass(frozen, module = "splat4d")]
 pub(crate) struct Tracks {
     /// [T] seconds.
@@ -235,7 +236,7 @@ pub(crate) struct Tracks {
     /// [M] the layer of each.
     #[pyo3(get)]
     layers: Py<PyAny>,
-    /// [M] its row there.
+    /// [M] the row of each in its layer.
     #[pyo3(get)]
     rows: Py<PyAny>,
 }

@@ -18,13 +18,13 @@ use splat4d_train::run::{self, Outcome, Stopwatch, TrainOptions, open_capture};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// Learns a scene of a capture (a Capture, or its path) into the folder `out` [runs/NAME] and returns the run.
+/// Trains a scene of a capture (a Capture, or its path) into the folder `out` [runs/NAME] and returns the run.
 ///
-/// `settings` are the recipe's knobs (docs/recipe.md): `iterations=300`, `downscale=2`, `motion="spacetime"`; a table's knob
-/// is written with two underscores, `densify__max_cap=20000`. Without `motion` one is chosen that suits the capture.
-/// `progress` is called with every event, a dict as `splat4d --json` prints them. `loss(picture, truth, view)` gets arrays
-/// [h, w, 3] and returns (value, gradient), which are added to the recipe's losses. Ctrl-C, or an exception in either
-/// function, stops with a checkpoint; `resume` goes on from there.
+/// `settings` are those of docs/recipe.md: `iterations=300`, `downscale=2`, `motion="spacetime"`; a setting of a table
+/// has two underscores, `densify__max_cap=20000`. Without `motion`, the capture decides. `progress` is called with
+/// every event, a dict as in docs/events.md. `loss(picture, truth, view)` gets arrays [h, w, 3] (half of the size in
+/// the first 40 % of the steps) and returns (value, gradient), which are added to the recipe's losses. Ctrl-C, or an
+/// exception in either function, stops with a checkpoint; `resume` continues from there.
 #[pyfunction]
 #[pyo3(signature = (capture, out=None, *, progress=None, loss=None, minutes=None, quality=None, device="cpu", **settings))]
 #[allow(clippy::too_many_arguments)]
@@ -82,7 +82,7 @@ pub(crate) fn train(
     })
 }
 
-/// Goes on with the run in a folder, exactly where its newest checkpoint is. A run that began with a `loss` needs it again.
+/// Continues the run in a folder from its newest checkpoint. A run that started with a `loss` needs it again.
 #[pyfunction]
 #[pyo3(signature = (run, *, progress=None, loss=None, device="cpu"))]
 pub(crate) fn resume(

@@ -112,7 +112,7 @@ class Errors(InFolder):
         refuses("names", [[picture]], times=[0.0], names=["a", "b"])
         refuses("no name", [[picture]], times=[0.0], names=["../a"])
         refuses("2 poses for 1 images", [[picture]], [[camera, camera]], times=[0.0])
-        refuses("no Camera", [[picture]], [["camera"]], times=[0.0])
+        refuses("expected Camera objects", [[picture]], [["camera"]], times=[0.0])
         refuses(r"images\[1\]\[0\]", [[picture], [picture + 2]], [camera, camera], times=[0.0])
         self.assertEqual(list(self.folder.rglob("*")), [], "nothing of it is left")
         before = set(pathlib.Path("/tmp").glob("tmp*")) if pathlib.Path("/tmp").is_dir() else set()

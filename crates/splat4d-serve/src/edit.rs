@@ -115,7 +115,7 @@ pub(crate) async fn answer(scene: &Scene, editing: &Editing, request: &Parts, bo
         Either::Second(Ok(bytes)) => bytes,
     };
     let Ok(asked) = serde_json::from_slice::<Value>(&asked) else {
-        return text(StatusCode::BAD_REQUEST, "this is no JSON");
+        return text(StatusCode::BAD_REQUEST, "invalid JSON");
     };
     let place = editing.places.clone().acquire_owned().await.expect("it is never closed");
     let (sender, told) = oneshot::channel();

@@ -1,9 +1,9 @@
 //! The local web server of splat4d, and the browser's player that it carries.
 //!
-//! It serves one named thing, a `.s4d` file or bytes in memory, to a page of its own: fixed routes, no folder, so
-//! that nothing else can be reached. It binds loopback unless told, and because every page in the user's browser can
-//! reach loopback too, it also checks `Host` (a foreign name that resolves to this machine) and `Origin` (a foreign
-//! page). While a run trains it costs one quiet thread with bounds on everything a client can make it hold.
+//! It serves one thing, a `.s4d` file or bytes in memory, to its own page: fixed routes, no folder, so nothing else can
+//! be reached. It binds loopback by default. Every page in the user's browser can reach loopback too, so it also checks
+//! `Host` (a foreign name that resolves to this machine) and `Origin` (a foreign page). During training it costs one
+//! thread with bounds on everything that a client can make it hold.
 //!
 //! | route | what |
 //! |---|---|
@@ -11,9 +11,9 @@
 //! | `/player/NAME` (also `/NAME`) | modules, shaders |
 //! | `/scene.s4d` | the scene, by range; `?v=N` names a live version: another one is 410, never a mixture |
 //! | `/config.json` | what the page shows: `{title, scene, live, …}` of [`Config::about`] |
-//! | `/events` | news of a live run as server-sent events; see [`News`] |
-//! | `/metrics.json` | the same news so far, in one piece |
-//! | `POST /edit` | only with [`Config::editing`]: what a page with the token wants of a list of edits |
+//! | `/events` | events of a live run as server-sent events; see [`News`] |
+//! | `/metrics.json` | the same events so far, in one piece |
+//! | `POST /edit` | only with [`Config::editing`]: requests of a page with the token for a list of edits |
 //!
 //! ```no_run
 //! # fn main() -> splat4d::Result<()> {
@@ -25,6 +25,21 @@
 //! # Ok(())
 //! # }
 //! ```
+//!
+//! # Code map
+//!
+//! A module imports only modules above it; `xtask/tests/tidy.rs` checks the order.
+//!
+//! | module | content |
+//! |---|---|
+//! | `write_timeout.rs`, `body.rs`, `range.rs`, `reply.rs` | timeouts, request bodies, byte ranges, responses |
+//! | `guard.rs` | who may send requests |
+//! | `scene.rs` | the one thing served: a file by range, or bytes that a live run replaces |
+//! | `edit.rs` | the one guarded request that accepts input: edits, with a token |
+//! | `assets.rs`, `page.rs` | the player's files; player and scene as one static page |
+//! | `events.rs` | events of a live run: one bounded log |
+//! | `answer.rs`, `server.rs` | routes and headers; start, stop, accept: one thread, bounded memory |
+//! | `../player/` | the browser player: plain ES modules. A frame is rendered at the time of its order and active set: `schedule.js` requests them from `sort.worker.js` ahead of the clock by the measured latency and drops those of a clock that jumped; WebGPU culls and sorts within the frame. `stream.js` states which times are complete; the others hold the last frame |
 
 mod answer;
 mod assets;

@@ -209,7 +209,7 @@ fn listen(host: &str, port: Option<u16>) -> Result<TcpListener> {
     let bare = host.trim_matches(['[', ']']);
     let address = (bare, first).to_socket_addrs().ok().and_then(|mut all| all.next());
     let Some(mut address) = address else {
-        return Err(Error::input("is no name or address of this machine")
+        return Err(Error::input("not a name or address of this machine")
             .at(host)
             .remedy("Use --host with an address of this machine, or leave it out to serve this machine only."));
     };
@@ -266,7 +266,7 @@ fn origin(url: &str) -> Result<String> {
     if ["http", "https"].contains(&scheme) && !authority.is_empty() && plain && clean {
         return Ok(format!("{scheme}://{authority}"));
     }
-    Err(Error::input("is no address of a web server").at(url).remedy("Write for instance https://example.org/a.s4d."))
+    Err(Error::input("invalid address of a web server").at(url).remedy("Write for instance https://example.org/a.s4d."))
 }
 
 async fn accept(listener: TcpListener, shared: Arc<Shared>, mut stopped: watch::Receiver<bool>) {

@@ -1,5 +1,5 @@
-//! A picture loss of your own. Pixels carry labels that some other program made; a term compares them with a column that
-//! every Gaussian learns, so that after training the Gaussians know what they belong to.
+//! An image loss of your own. Pixels have labels of another program; a term compares them with a learned column of the
+//! Gaussians, so that after training every Gaussian has a label.
 //!
 //! `cargo run --release -p splat4d-train --example own_loss`
 

@@ -1,5 +1,5 @@
-//! Trains a made-up moving scene in seconds, without a file: pictures of known Gaussians are drawn by the renderer, and a
-//! new scene learns to show the same.
+//! Trains a synthetic dynamic scene in seconds, without a file: the renderer makes images of known Gaussians, and a new scene
+//! learns to reproduce them.
 //!
 //! `cargo run --release -p splat4d-train --example train_tiny [OUT.safetensors]`
 

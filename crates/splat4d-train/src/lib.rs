@@ -1,4 +1,4 @@
-//! Learns moving Gaussian scenes from posed captures: capture → initial Gaussians → stages of training → evaluation.
+//! Trains dynamic Gaussian scenes from posed captures: capture → initial Gaussians → stages of training → evaluation.
 //!
 //! ```
 //! use splat4d_train::prelude::*;
@@ -20,6 +20,37 @@
 //! ```
 //!
 //! The trainer only emits [`event::Event`]s; progress bars, logs and viewers listen.
+//!
+//! # Code map
+//!
+//! A module imports only modules above it; `xtask/tests/tidy.rs` checks the order.
+//!
+//! | module | content |
+//! |---|---|
+//! | `settings.rs`, `settings/` | `settings!`: typed settings with defaults, ranges, units and documentation, declared next to what they set |
+//! | `recipe.rs`, `recipe/` | all settings of a run; TOML, `--set`, old names without tables |
+//! | `event.rs` | events that the trainer emits |
+//! | `files.rs`, `path_text.rs` | opens regular files only; paths that are not UTF-8 as text |
+//! | `output/` | files and folders that commands write: atomic writes (`write.rs`), one owner per folder by lock and heartbeat (`owner.rs`), the list of our files (`list.rs`), what a command may find and `--force` (`folder.rs`), separation from inputs (`place.rs`), runs without a list (`legacy.rs`) |
+//! | `keypoints/` | SIFT keypoints and the image filters that they need |
+//! | `capture/` | layouts read into one `Capture`, chosen by `layout.rs`; file lookup (`lookup.rs`), masks, findings (`account.rs`), pose conventions (`convention.rs`), depth, flow and tracks, photos or videos without times (`sequence.rs`), a model next to other poses (`beside.rs`), the image store with a byte budget, captures far from the origin (`offset.rs`), panoramas |
+//! | `capture/foreign/`, `capture/colmap/`, `capture/transforms/`, `capture/evidence/` | exports of Metashape, RealityScan, Polycam, Record3D; unregistered COLMAP images and 4DGaussians' multipleview; frames and times of `transforms*.json`; whether poses can be right |
+//! | `vision/` | computer vision on posed images: temporal medians (`view.rs`), matching along epipolar lines, triangulation, plane sweep, scale, dense flow |
+//! | `sampler.rs` | frames of a step, a pure function of seed, stage and step |
+//! | `optim/` | Adam, sparse over the active set, sixteen rows at a time; position noise of MCMC |
+//! | `loss/` | L1 + D-SSIM in one fused pass, contracts of losses (`terms.rs`), and every regulariser once, for any model: rigidity, rotation, isometry, ARAP, elastic, velocity, jerk, planes, tracking |
+//! | `loss/image/`, `loss/transport/` | image losses as a list of `ImageTerm`s; transport losses with and without a filter |
+//! | `learner.rs`, `learner/` | `Learner`: scene, moments, statistics, and what cameras learn (exposure, poses, focal lengths, time offsets), which change together or not at all |
+//! | `upkeep/` | maintenance between steps, one operation per file: ADC with splits in time, MCMC, relocation, guided sampling, pruning, merging, nodes, opacity reset, Morton order, the split into static and dynamic layers |
+//! | `upkeep/worth/` | importance of every Gaussian in space and time, key masks |
+//! | `methods/`, `methods/control/` | how each motion model is learned: one list of `Program`s, each with its `Stage`s; the automatic choice (`auto.rs`), the filter around any model, losses on nodes |
+//! | `init/` | first Gaussians: points, depth maps and their velocities, points added along surfaces (`fill.rs`), visual hulls, random points in the common volume |
+//! | `step/` | one step: the fixed chain (`chain.rs`), channels for losses, pixel weights (`emphasis.rs`), image losses, the engines on CPU and device (`engine.rs`, `resident.rs`), the trainer, the search of time offsets (`clocks.rs`), the schedule (`pace.rs`) |
+//! | `run/` | the run on disk: open, start and resume, from checkpoint to checkpoint, rollback, points and flow found in images, checks of priors, memory estimate, `--minutes`, identity, metrics |
+//! | `run/chunks/` | long captures in chunks: budget, plan, shared layer, training of a chunk, ties to neighbours, join |
+//! | `blended.rs`, `labels.rs`, `features.rs` | values of Gaussians as images blend them; labels from masks by expectation-maximisation; feature channels by conjugate gradients |
+//! | `eval/` | metrics, colour matrices of cameras, LPIPS, errors of tracks and flow, alignment of held-out cameras, trajectory errors, localisation, floaters, `results.json` and `per_view.json` |
+//! | `compress/`, `compress/quantise/` | settings, rounds of pruning, settings for a size; fine-tuning through the file's quantisation (straight-through) |
 
 mod blended;
 pub mod capture;

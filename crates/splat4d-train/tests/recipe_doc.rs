@@ -1,14 +1,74 @@
-//! `docs/recipe.md` is written by this test from the recipe itself, so that the document cannot lag behind the code.
+//! This test writes `docs/recipe*.md` from the recipe itself, so the reference cannot lag behind the code.
 
 use splat4d_train::recipe::Recipe;
 use splat4d_train::settings::{Knob, Range, When};
 use std::path::Path;
 
-const HEAD: &str = "\
-# The recipe
+/// A page of the reference: its file in docs/, its title, and the tables that it holds; an empty list: all others.
+struct Page {
+    file: &'static str,
+    head: &'static str,
+    tables: &'static [&'static str],
+}
 
-Every knob of a run, its default and its meaning. Set one with `--set TABLE.NAME=VALUE` (may be repeated), or write a TOML
-file for `--recipe FILE`:
+/// Pages stay below 250 lines. Tables that no page names are on the first one.
+const PAGES: [Page; 3] = [
+    Page { file: "recipe.md", head: HEAD, tables: &[] },
+    Page {
+        file: "recipe-models.md",
+        head: "# Settings of motion models\n\nSettings of single motion models, of the temporal filter and of the transport \
+               losses. How to set them, and all other settings: [recipe.md](recipe.md). Which model to choose: \
+               [models.md](models.md).\n\nThis file is generated: `UPDATE_GOLDEN=1 cargo test -p splat4d-train --test \
+               recipe_doc`.\n",
+        tables: &[
+            "spacetime",
+            "deform",
+            "hexplane",
+            "tracked",
+            "native4d",
+            "control",
+            "nodes",
+            "ssm",
+            "filter",
+            "transport",
+        ],
+    },
+    Page {
+        file: "recipe-density.md",
+        head: "# Settings of density control\n\nHow Gaussians are added, moved and removed during training. How to set them, \
+               and all other settings: [recipe.md](recipe.md).\n\nThis file is generated: `UPDATE_GOLDEN=1 cargo test -p \
+               splat4d-train --test recipe_doc`.\n",
+        tables: &[
+            "densify",
+            "adc",
+            "opacity_reset",
+            "mcmc",
+            "relocate",
+            "guided",
+            "floaters",
+            "prune",
+            "merge",
+            "split",
+        ],
+    },
+];
+
+const HEAD: &str = "\
+# Settings
+
+All settings of a run, with default and meaning. The size of the scene and its file follows mainly from `densify.max_cap`, the time from
+`run.iterations` and `capture.downscale`. `densify.max_cap = 0` derives the number of Gaussians from the capture: one for 350 pixels of
+distinct views, at most 45 per step and what fits the memory, at least 30,000. `train` prints the number and the reason.
+
+| page | tables |
+|---|---|
+| this page | run, capture, initial Gaussians, appearance, rates, refinement of cameras, lifespan, losses, chunks |
+| [recipe-models.md](recipe-models.md) | motion models, temporal filter, transport losses |
+| [recipe-density.md](recipe-density.md) | densification, pruning, merging, floaters, static layer |
+
+## Change a setting
+
+On the command line, `--set TABLE.NAME=VALUE` (repeatable). Or in a TOML file for `--recipe FILE`:
 
 ```toml
 [run]
@@ -18,14 +78,18 @@ iterations = 3000
 max_cap = 60000
 ```
 
-Recipes had no tables once: the names of then, in the last column, still work alone (`--set max_cap=60000`, or
-`max_cap = 60000` at the top of the file). The effective recipe is saved with every run as `recipe.toml`; training again
-from that file repeats the run.
+- `splat4d train --help-knobs [TOPIC]` prints these tables.
+- The effective settings are stored with every run as `recipe.toml`. Training again from that file repeats the run.
+- Older names without a table, in the last column, also work (`--set max_cap=60000`, or `max_cap = 60000` at the top of the file).
+- A setting without effect (`mcmc.growth` if `densify.strategy` is adc) is refused by `--set` and warned about in a file. A value that
+  disables something disabled is warned about too.
+- Settings that count iterations and are 0 follow from `run.iterations`. Rates of positions are in units of the scene's extent (1.1 times the
+  largest distance of a training camera from the cameras' centroid), and times in units of the clip length. A recipe therefore carries over
+  between scenes of different scale and duration.
 
-A knob without effect in the recipe that it is set in (`mcmc.growth` where `densify.strategy` is adc) is refused by `--set`
-and warned about where it comes from a file; a value that switches off what is off anyhow is warned about too.
+## Choose quality or minutes
 
-`--quality` sets a few knobs at once; those that are typed win over it, and the recipe records what was in effect:
+`--quality` changes some settings at once. Settings on the command line have priority, and the recipe records what was in effect.
 
 | | `run.iterations` | `densify.count_scale` | `capture.downscale` |
 |---|---|---|---|
@@ -33,34 +97,34 @@ and warned about where it comes from a file; a value that switches off what is o
 | `standard` (the default) | 7,000 | 1 | the recipe's |
 | `best` | 20,000 | 2 | the recipe's |
 
-`--minutes M` wins over the steps of either. It covers the command from its start to the report: reading, initial points, a
-few timed steps (about 6 % of the time, more where a step takes a second), training, and measuring, filming and baking as far
-as they can be foretold.
-`run.iterations` are the steps that fit by the timed ones. They are the run's *schedule*: rates, densification, degrees of
-SH, pictures at half size and stages are stated in its steps. When the machine turns out to be slower or faster, the run is
-planned anew: `run.replans` gets a row [step, steps in all], and from that step on what is left of the schedule is spread
-evenly over the steps that are left. Where a step passes over several steps of the schedule, what was due at any of them is
-done once; where several steps share one, it is not repeated. So rates go on from where they were, down to the same end, and
-nothing that is past changes its meaning. A row is in the run's recipe.toml before it is used: a resumed run, and one that
-is trained from that recipe, have the same bits. A resumed run keeps to what was left of its minutes. No step ever stands
-for more than eight of the schedule, so that on a machine that stalls the time is missed and not the scene.
+`--minutes M` replaces the number of steps. M covers the whole command: reading, initial points, a few timed steps (about 6 % of the time,
+more if a step takes a second), training, evaluation, film, baking and report.
 
-Knobs that count iterations and are 0 follow from `run.iterations`. Rates of positions are in units of the scene's extent
-(1.1 times the largest distance of a training camera from the cameras' centroid), everything with time in it is per clip
-length: a recipe carries over from a scene of centimetres and seconds to one of metres and minutes.
+- `run.iterations` becomes the number of steps that fit by the timed ones. Rates, densification, SH degrees, half-size images and stages follow
+  this *schedule*.
+- If the machine becomes slower or faster, the run is planned again: `run.replans` gets a row [step, total steps], and the rest of the
+  schedule is spread evenly over the remaining steps. Operations that are due are done once, never repeated. One step never covers more
+  than eight steps of the schedule; a stalled machine then exceeds the time.
+- Each row is written to the run's recipe.toml before it is used. A resumed run, and a run trained from that recipe, have the same bits. A
+  resumed run keeps the remaining minutes.
 
 This file is generated: `UPDATE_GOLDEN=1 cargo test -p splat4d-train --test recipe_doc`.
 ";
 
-fn page() -> String {
-    let mut text = HEAD.to_owned();
+fn text(page: &Page) -> String {
+    let elsewhere = |table: &str| PAGES.iter().any(|p| p.tables.contains(&table));
+    let mut text = page.head.to_owned();
     let mut table = "";
     for knob in Recipe::knobs() {
+        let here = if page.tables.is_empty() { !elsewhere(knob.table) } else { page.tables.contains(&knob.table) };
+        if !here {
+            continue;
+        }
         if knob.table != table {
             table = knob.table;
             let needs = Recipe::needs(table).map_or_else(String::new, |n| format!(" In effect with {n}."));
             text += &format!(
-                "\n## `[{table}]`\n\n{}{needs}\n\n| knob | default | range, unit | meaning | alone |\n|---|---|---|---|---|\n",
+                "\n## `[{table}]`\n\n{}{needs}\n\n| setting | default | range, unit | meaning | older name |\n|---|---|---|---|---|\n",
                 Recipe::about(table)
             );
         }
@@ -71,7 +135,7 @@ fn page() -> String {
 
 fn row(k: &Knob) -> String {
     let default = if k.default == "\"\"" { "(empty)".to_owned() } else { format!("`{}`", k.default) };
-    // What nearly every number is need not be said of each.
+    // The range of nearly every number is not repeated.
     let range = if k.rule.range == Range::NotNegative { String::new() } else { k.rule.range.to_string() };
     let kind: Vec<&str> = [range.as_str(), k.rule.unit].into_iter().filter(|s| !s.is_empty()).collect();
     let alone = Recipe::flat_name(&k.key()).map_or_else(String::new, |name| format!("`{name}`"));
@@ -81,17 +145,34 @@ fn row(k: &Knob) -> String {
 }
 
 #[test]
-fn the_document_says_what_the_recipe_does() {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/recipe.md");
-    if std::env::var_os("UPDATE_GOLDEN").is_some() {
-        std::fs::write(&path, page()).expect("docs/recipe.md can be written");
+fn the_reference_is_what_the_recipe_does() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs");
+    for page in &PAGES {
+        let (path, text) = (folder.join(page.file), text(page));
+        if std::env::var_os("UPDATE_GOLDEN").is_some() {
+            std::fs::write(&path, &text).expect("docs/ can be written");
+        }
+        let found = std::fs::read_to_string(&path).unwrap_or_default();
+        let differs = text.lines().zip(found.lines()).find(|(new, old)| new != old).map(|(new, _)| new.to_owned());
+        assert!(
+            found == text,
+            "docs/{} is out of date (first difference: {}). Write it again with\n    \
+             UPDATE_GOLDEN=1 cargo test -p splat4d-train --test recipe_doc",
+            page.file,
+            differs.unwrap_or_else(|| "its length".into())
+        );
     }
-    let found = std::fs::read_to_string(&path).unwrap_or_default();
-    let differs = page().lines().zip(found.lines()).find(|(new, old)| new != old).map(|(new, _)| new.to_owned());
-    assert!(
-        found == page(),
-        "docs/recipe.md is out of date (first difference: {}). Write it again with\n    \
-         UPDATE_GOLDEN=1 cargo test -p splat4d-train --test recipe_doc",
-        differs.unwrap_or_else(|| "its length".into())
-    );
+}
+
+#[test]
+fn every_table_is_on_one_page() {
+    for page in &PAGES {
+        for table in page.tables {
+            assert!(
+                Recipe::knobs().iter().any(|k| k.table == *table),
+                "{} names {table}, which does not exist",
+                page.file
+            );
+        }
+    }
 }

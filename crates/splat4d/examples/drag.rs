@@ -1,8 +1,8 @@
-//! Drags the control nodes of a trained scene, as rigidly as possible, and draws it before and after into PPM pictures.
+//! Drags the control nodes of a trained scene, as rigidly as possible, and renders it before and after into PPM images.
 //!
 //! `cargo run --release -p splat4d --example drag SCENE.safetensors BEFORE.ppm AFTER.ppm [SECONDS]`. The lower half of the
-//! nodes is held, the topmost tenth goes sideways. Without arguments it drags a rod that it makes itself, so that it always
-//! runs. The scene keeps moving as it was trained; only its nodes are displaced.
+//! nodes is pinned, the topmost tenth moves sideways. Without arguments it drags a synthetic rod. The scene keeps its trained
+//! motion; only its nodes are displaced.
 
 use splat4d::format;
 use splat4d::layers::{Evaluation, Layer, Scene};

@@ -1,8 +1,8 @@
 //! Times the GPU renderer on random Gaussians with spherical harmonics of degree 3, at 1920x1080.
 //!
 //! `cargo run --release -p splat4d --features gpu --example gpu_speed [COUNT [WIDTHxHEIGHT [FRAMES]]]` prints the card,
-//! milliseconds of every stage, frames a second of the GPU's work alone and from tables in memory to a picture in
-//! memory, and how far the picture is from the CPU's. Works on a driver that computes on the CPU, too.
+//! milliseconds of every stage, frames per second of the GPU's work alone and from tables in memory to an image in
+//! memory, and the difference to the CPU's image. Works on software drivers too.
 
 use splat4d::gpu::{Adapters, Gpu, GpuRenderer, StageClock};
 use splat4d::math::{Rng, Se3, sym3};

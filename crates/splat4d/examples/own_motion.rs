@@ -1,8 +1,8 @@
 //! A motion model of your own: Gaussians that sway, μ(t) = μ + a·sin(2πt/T), with a learnable amplitude a each.
 //!
-//! `cargo run --release -p splat4d --example own_motion [FOLDER]` checks its gradient, draws it at several times and, if a
-//! folder is given, writes the pictures there. Nothing else has to know the model: layers, the renderer, densification
-//! and training only call the trait (`tests/own_motion.rs` of `splat4d-train` trains it, bakes it and plays the file).
+//! `cargo run --release -p splat4d --example own_motion [FOLDER]` checks its gradient, renders it at several times and, if a
+//! folder is given, writes the images there. Layers, the renderer, densification and training only call the trait, without
+//! knowing the model (`tests/own_motion.rs` of `splat4d-train` trains it, bakes it and plays the file).
 
 use splat4d::layers::{Evaluation, Layer, Scene};
 use splat4d::math::sh::rgb_to_dc;
@@ -16,7 +16,7 @@ use splat4d::scene::{Camera, GEOMETRY, Grads, Key, LifeKind, Params, SH, Space, 
 use std::f64::consts::TAU;
 use std::sync::Arc;
 
-/// Immutable, like every model: plain data and the keys of its tables. What it learns lies in the layer's parameters.
+/// Immutable, like every model: plain data and the keys of its tables. Learned values are in the layer's parameters.
 pub(crate) struct Sway {
     /// Seconds of one swing.
     period: f64,
@@ -62,7 +62,7 @@ impl<F: Real> Motion<F> for Sway {
         });
     }
 
-    /// The way back: adds to the gradients of both tables and returns dL/dt.
+    /// Backward pass: adds to the gradients of both tables and returns dL/dt.
     fn backward(
         &self,
         q: &At<'_, F>,

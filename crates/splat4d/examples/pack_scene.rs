@@ -1,8 +1,8 @@
-//! Packs a scene into a playback file, and says how small it became and what that cost.
+//! Packs a scene into a playback file, and prints its size and loss.
 //!
 //! `cargo run --release -p splat4d --example pack_scene [FILE [OUT.s4d [CAMERAS.json]]]`: FILE is a scene.safetensors whose
-//! layers move on straight lines, or a 3DGS .ply. Without one it packs 120,000 made-up moving Gaussians with spherical
-//! harmonics of degree 3. Nothing is pruned: the figures are those of the format alone.
+//! layers move linearly, or a 3DGS .ply. Without one it packs 120,000 synthetic moving Gaussians with spherical harmonics of
+//! degree 3. Nothing is pruned: the figures are those of the format alone.
 
 use serde_json::Value;
 use splat4d::format::playback::{self, Draft, Meta, NamedCamera, Node, Primitive, Viewpoint, WriteConfig};

@@ -1,7 +1,7 @@
-//! Draws a 3DGS .ply or a scene.safetensors at one time into a PPM picture.
+//! Renders a 3DGS .ply or a scene.safetensors at one time into a PPM image.
 //!
-//! `cargo run --release -p splat4d --example render_file FILE OUT.ppm [SECONDS]`. Without arguments it draws a small scene
-//! that it has just written to memory, so that it always runs.
+//! `cargo run --release -p splat4d --example render_file FILE OUT.ppm [SECONDS]`. Without arguments it renders a small scene
+//! from memory.
 
 use splat4d::format;
 use splat4d::layers::{Evaluation, Layer, Scene};

@@ -1,6 +1,6 @@
-//! Moving 3D Gaussian scenes: tables, motion models and a differentiable renderer.
+//! Dynamic 3D Gaussian scenes: tables, motion models and a differentiable renderer.
 //!
-//! From the bytes of a file to a picture at a time:
+//! From the bytes of a file to a rendered image:
 //!
 //! ```
 //! use splat4d::prelude::*;
@@ -17,12 +17,39 @@
 //! # }
 //! ```
 //!
-//! The chain behind it is `motion.at → render`, and in training on through `loss → render.vjp → motion.backward`. A motion
-//! model answers one question (which [`scene::Splats`] at time t), the renderer never sees time, a motion model never sees
-//! a pixel. [`layers::Evaluation`] asks many such questions together and takes gradients back; [`render::Backend`] is
-//! whatever draws; [`play::Player`] plays long scenes within a budget of memory.
+//! The chain behind it is `motion.at → render`, and in training also `loss → render.vjp → motion.backward`. A motion
+//! model maps a time to [`scene::Splats`]; the renderer never sees time, a motion model never sees a pixel.
+//! [`layers::Evaluation`] evaluates a scene at many times at once and backpropagates; [`render::Backend`] is the
+//! interface of renderers; [`play::Player`] plays long scenes within a memory budget.
 //!
 //! This crate reads bytes, not paths; it knows no loss, no optimiser and no data set (those are in `splat4d-train`).
+//!
+//! # Code map
+//!
+//! A module imports only modules above it; `xtask/tests/tidy.rs` checks the order.
+//!
+//! | module | content |
+//! |---|---|
+//! | `error.rs`, `text.rs` | the one error (what, where, what to do); text of files, made safe to print |
+//! | `wgsl.rs`, `simd.rs` | shader sources for the GPU renderer and the player; the one dispatch to instruction sets |
+//! | `math/` | quaternions, symmetric matrices, poses, twists, nearest rotations and neighbours, Wasserstein geometry of covariances (`spd.rs`), eigenvectors (`jacobi.rs`), similarities between sets of cameras (`align.rs`), spherical harmonics, counter-based random numbers, `Real` (f32 and f64) |
+//! | `scene/` | `Table`, `Params`, `Grads`, `RowEdit`, `Splats`, lifespans, cameras, planes, time; weights of a pixel head (`head.rs`), label logits (`labels.rs`), feature channels (`features.rs`) |
+//! | `nn/` | network parts, each with its backward under its forward: perceptrons over `gemm`, encodings, hash grids, feature planes, state-space scans, vector neurons, local frames |
+//! | `motion/` | the trait `Motion`; the list of models, from which `registry.rs` makes `Spec`, names and `build`; capabilities (`Capabilities`, `Polynomial`, `Phase`); one file per model, and `filtered` and `edited`, which wrap any of them; skinning to control nodes (`skin.rs`), dragging them (`arap.rs`), loops over sixteen rows (`lanes.rs`) |
+//! | `motion/deform/`, `motion/control/`, `motion/skin/`, `motion/ssm/`, `motion/native4d/`, `motion/filtered/`, `motion/edited/` | parts of the larger models |
+//! | `layers/` | `Layer` (model, then lifespan, then frame), `Scene` (sum of layers), `Evaluation` (the scene at several times: queries, results and backward pass); position in the world (`frame.rs`), cross-fades, one time as plain Gaussians (`freeze.rs`), `native4d` to `spacetime` (`convert.rs`), other axes (`rotate.rs`) |
+//! | `render/` | project, shade, bin, rasterize, each with its VJP; records of a bin (`gather.rs`), blending forward and backward (`blend.rs`); traits of renderers (`backend.rs`) and of devices that keep a scene's tables (`resident.rs`); pixel networks (`head.rs`); contribution, removal and sensitivity of each splat in one pass (`importance.rs`); the slow f64 definition (`oracle.rs`); lower bounds (`roofline.rs`) and pair counts (`count.rs`) |
+//! | `gpu/` | the same stages in WGSL (feature `gpu`), backward pass in `back.rs`, loss in `compare.rs` on images that `pictures.rs` keeps, kernel constants of a sweep in `tuning.rs`, lower bounds in `roofline.rs`; each kernel is tested against its CPU twin |
+//! | `gpu/resident/` | whole steps on tables that stay on the GPU: kernel parameters, ties of poses, camera colours, steps in flight and their repetition, films |
+//! | `device.rs`, `device/` | selects the rendering device and reports why; routes unsupported work to the CPU and falls back to it when the GPU fails; which layers a device keeps |
+//! | `flow.rs`, `flow/` | velocities, rendered velocity and 2D flow; tracks of Gaussians, queried points and their visibility, lifting of flow to 3D |
+//! | `channels.rs` | normals, labels, lifespans and uncertainty as rendered channels |
+//! | `format/` | readers and writers of bytes: `scene.safetensors`, .npy; in `mod.rs` the one list of dialects, each a file or folder with a line there; archives (`zip.rs`), fitted temporal opacity (`fade.rs`), formats that are only recognised (`foreign.rs`) |
+//! | `format/playback/` | `.s4d`: index, pages of quantised Gaussians, palette (docs/format.md) |
+//! | `format/ply/`, `format/spz/`, `format/sog/` | 3DGS, compressed and Spacetime .ply; .spz 2 to 4 with its axes; SOG, zipped or as files, streamed |
+//! | `bake/` | any motion model to linear segments in a tree of time spans, within a byte budget or an error, and the comparison with the model |
+//! | `play.rs`, `play/` | plays a scene or file on the CPU: active set, pages within a memory budget |
+//! | `edit/` | a list of steps: selections as text (`select.rs`), their evaluation over time (`look.rs`), effects on layers (`act.rs`), time windows and clocks (`clock.rs`), dragging (`drag.rs`) |
 
 pub mod bake;
 pub mod channels;

@@ -32,7 +32,7 @@ fn saved(value: Option<(f64, Option<f64>)>, base: Option<(f64, Option<f64>)>) ->
 pub(crate) fn markdown(study: &Study, variants: &[Variant], motion: &str) -> String {
     let mut out = format!(
         "# The temporal filter around `{motion}`\n\n{} steps, means over {} seed(s), ± half the spread. PSNR is that of \
-         the held-out views, `moving` is where things move; flicker in 1/255; flow: end-point error in pixels, over all \
+         the held-out views, `moving` is that of dynamic regions; flicker in 1/255; flow: end-point error in pixels, over all \
          pixels and where the truth moves. Minutes are those of training, on this machine.\n",
         study.steps, study.seeds
     );

@@ -1,4 +1,4 @@
-//! Captures that are made up: a small world of textured things, each hard for one reason, written with exact poses as
+//! Synthetic captures: a small world of textured objects, each hard for one reason, written with exact poses as
 //! `capture.json` folders. The same name gives the same bytes on every machine.
 
 mod scenes;

@@ -1,4 +1,4 @@
-//! `studies suite`: the recipe on captures of every kind, before and after a change of it.
+//! `studies suite`: the recipe on captures of every kind, before and after a change.
 
 mod list;
 mod page;

@@ -1,9 +1,9 @@
-//! Chaos: every verb that writes is killed, runs out of space, meets a second process, jumping clocks and folders that become
-//! read-only, and its result is compared with that of an undisturbed run.
+//! Chaos: every command that writes is killed, runs out of disk space, meets a second process, jumping clocks and
+//! read-only folders; its result is compared with that of an undisturbed run.
 //!
-//! A trial passes where the same command, called again after the disturbance, ends with the undisturbed files; where every
-//! call before that either did so too or said why not (exit code 1 or 2, one error, no panic); where what it reads and the
-//! user's own file in its folder are what they were; and where no temporary file stays.
+//! A trial passes if the same command, called again after the disturbance, ends with the undisturbed files; if every
+//! call before did so too or reported why not (exit code 1 or 2, one error, no panic); if inputs and the user's own
+//! file in the folder are unchanged; and if no temporary file remains.
 
 mod disturb;
 mod process;

@@ -1,4 +1,4 @@
-//! Where the camera goes and which moment of the scene it sees, frame by frame.
+//! Camera paths: pose and scene time of every frame.
 
 mod keys;
 mod orbit;

@@ -161,7 +161,7 @@ fn sides(out: &mut String, told: &Compressed) {
         ),
         ("Mbit/s", &|s| plain(1, s.mbit_per_s), None),
         ("PSNR, held-out views, dB", &|s| plain(2, s.psnr), gain(2, |s| s.psnr)),
-        ("PSNR where things move, dB", &|s| plain(2, s.psnr_dynamic), gain(2, |s| s.psnr_dynamic)),
+        ("PSNR of dynamic regions, dB", &|s| plain(2, s.psnr_dynamic), gain(2, |s| s.psnr_dynamic)),
         ("PSNR, training views, dB", &|s| plain(2, s.psnr_train), gain(2, |s| s.psnr_train)),
         ("SSIM", &|s| plain(4, s.ssim), gain(4, |s| s.ssim)),
         ("flicker, 1/255", &|s| plain(3, s.flicker), gain(3, |s| s.flicker)),

@@ -1,6 +1,6 @@
-//! `report.html`: one page that opens without a server and tells how a run went: figures, held-out views beside their
-//! truth and error, curves, scores by camera and time, timings, memory, findings, the recipe and how to do it again.
-//! It is made from the run folder's files alone; what is missing there is missing in the page.
+//! `report.html`: one page that opens without a server: scores, held-out views with truth and error, curves, scores by
+//! camera and time, timings, memory, findings, the recipe and the command that repeats the run. It is made from the run
+//! folder's files; missing files are missing in the page.
 
 pub mod chart;
 pub(crate) mod compress;
@@ -85,7 +85,7 @@ fn cards(out: &mut String, run: &Run) {
         ("main", "PSNR", 2, "dB", "PSNR, held-out views"),
         ("", "PSNR-aligned", 2, "dB", "PSNR, held-out cameras aligned"),
         ("", "PSNR-cc", 2, "dB", "PSNR, each camera's colours corrected"),
-        ("main", "PSNR-dynamic", 2, "dB", "PSNR where things move"),
+        ("main", "PSNR-dynamic", 2, "dB", "PSNR of dynamic regions"),
         ("", "PSNR-foreground", 2, "dB", "PSNR of the foreground"),
         ("", "SSIM", 4, "", "SSIM"),
         ("", "MS-SSIM", 4, "", "MS-SSIM"),
@@ -99,7 +99,7 @@ fn cards(out: &mut String, run: &Run) {
         }
     }
     if let (Some(ours), Some(still)) = (run.score("PSNR-dynamic"), run.baseline("PSNR-dynamic")) {
-        card("main", format!("{:+.2}", ours - still), "dB", "where things move, over a still scene");
+        card("main", format!("{:+.2}", ours - still), "dB", "dynamic regions, over a static scene");
     }
     if let Some(n) = run.number("gaussians").or(run.metrics.last().map(|m| m.gaussians)) {
         card("", grouped(n as usize), "", "Gaussians");
@@ -395,7 +395,7 @@ fn again(out: &mut String, run: &Run) {
     if let Some(recipe) = &run.recipe {
         let _ = write!(
             out,
-            "<h2>Recipe</h2>\n<details><summary>all knobs</summary><pre>{}</pre></details>\n",
+            "<h2>Recipe</h2>\n<details><summary>all settings</summary><pre>{}</pre></details>\n",
             escape(recipe)
         );
     }

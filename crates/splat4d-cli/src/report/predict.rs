@@ -45,7 +45,7 @@ pub(crate) struct ModelScores {
     pub psnr_dynamic: Option<f64>,
     pub psnr_by_horizon: Vec<Option<f64>>,
     pub psnr_dynamic_by_horizon: Vec<Option<f64>>,
-    /// 1 − mean squared error over that of the baseline, where things move (everywhere, for cameras that move).
+    /// 1 − mean squared error over that of the baseline, dynamic regions (everywhere, for cameras that move).
     pub skill_over_freeze: Option<f64>,
     pub skill_over_velocity: Option<f64>,
     /// Share of the views that are nearer to the truth than the baseline's.
@@ -103,7 +103,7 @@ fn page(run: &str, told: &Told, films: &[(String, PathBuf)]) -> String {
         &mut body,
         "By horizon",
         [
-            ("PSNR where things move, dB", curve(&|m| m.psnr_dynamic_by_horizon.clone(), "dB")),
+            ("PSNR of dynamic regions, dB", curve(&|m| m.psnr_dynamic_by_horizon.clone(), "dB")),
             ("PSNR, dB", curve(&|m| m.psnr_by_horizon.clone(), "dB")),
             ("Distance of known points from the truth, scene units", curve(&|m| errors(&m.track_error), "units")),
             ("Distance of nodes from the oracle's, scene units", curve(&|m| errors(&m.node_error), "units")),
@@ -135,7 +135,7 @@ fn table(out: &mut String, models: &[&ModelScores]) {
     let heads = [
         "model",
         "PSNR, dB",
-        "where things move, dB",
+        "dynamic regions, dB",
         "skill over freeze",
         "over velocity",
         "wins over freeze",

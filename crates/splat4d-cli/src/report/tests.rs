@@ -60,7 +60,7 @@ fn the_page_tells_everything_and_needs_nothing() {
         "+7.50",
         "cam01",
         "&lt;odd&gt;",
-        "all knobs",
+        "all settings",
         "avx2",
         "3:01",
         "30,000",

@@ -12,14 +12,14 @@ use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
 Examples:
-  splat4d bake runs/knight -o knight.s4d           everything in one small file that plays anywhere
-  splat4d bake runs/knight -o small.s4d --size 4MB      what moves is split as finely as that allows
+  splat4d bake runs/knight -o knight.s4d              one small file that plays anywhere
+  splat4d bake runs/knight -o small.s4d --size 4MB    motion is split as finely as that allows
   splat4d bake runs/knight -o tight.s4d --tolerance 0.1
-  splat4d bake runs/knight -o long.s4d --repeat 20        the take twenty times over, to try long takes
+  splat4d bake runs/knight -o long.s4d --repeat 20    repeat the clip twenty times
 
 `train` does this at its end: the file is RUN/scene.s4d.";
 
-/// Bake a scene into one seekable file for players
+/// Bake a scene into one seekable file for the player
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
@@ -29,26 +29,26 @@ pub(crate) struct Args {
     /// The file to write
     #[arg(short, long, value_name = "OUT.s4d")]
     output: PathBuf,
-    /// Most bytes of the file: motion is split into as many segments as fit, but no more than 40 dB against the model
-    /// need [default: the learned scene's bytes, and 1.5 MB for each second]
+    /// Size limit of the file: motion is split into as many segments as fit, up to 40 dB against the model [default:
+    /// the size of the learned scene, and 1.5 MB per second]
     #[arg(long, value_name = "SIZE", value_parser = parse_bytes)]
     size: Option<u64>,
-    /// Split whatever misses by more than so many pixels of the capture's cameras, whatever it costs
+    /// Split every segment that misses by more pixels of the capture's cameras, without a size limit
     #[arg(long, value_name = "PX", conflicts_with = "size")]
     tolerance: Option<f64>,
-    /// About how many seconds are fetched for a seek
+    /// Approximate seconds that a seek loads
     #[arg(long, value_name = "S", default_value_t = SEGMENT)]
     segment: f64,
-    /// Play the take N times over
+    /// Repeat the clip N times
     #[arg(long, value_name = "N", default_value_t = 1)]
     repeat: usize,
-    /// Most colours-by-direction in the file's palette
+    /// Largest number of palette entries (view-dependent colours)
     #[arg(long, value_name = "N", default_value_t = WriteConfig::default().palette)]
     palette: usize,
-    /// Leave the small picture out that is shown while the file loads
+    /// Leave out the poster image that is shown during loading
     #[arg(long)]
     no_poster: bool,
-    /// Write what was done and how good it is as JSON
+    /// Write settings and quality as JSON
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
 }

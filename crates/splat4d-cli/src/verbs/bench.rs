@@ -36,75 +36,71 @@ const THREADS: [usize; 2] = [1, 2];
 
 const EXAMPLES: &str = "\
 Examples:
-  splat4d bench                                   all scenes, one and two threads
+  splat4d bench                                     all scenes, one and two threads
   splat4d bench --scene T --scene U --threads 1
-  splat4d bench --scene S --playbot FOLDER        the folder of the robot's SOG files
-  splat4d bench --simd scalar --json              an array of rows for machines
+  splat4d bench --scene S --playbot FOLDER          the folder of the robot's SOG files
+  splat4d bench --simd scalar --json                an array of rows for machines
   splat4d bench --save today.json
-  splat4d bench --against today.json              ratios to an earlier result
-  splat4d bench --growth all --plots docs/images  steps with more Gaussians, pixels and frames; memory
-  splat4d bench --device gpu --save gpu.json      every stage of a GPU, scenes A, B and C
-  splat4d bench --device gpu --sweep --save sweep.json  the same with every value of the kernels' constants
-  splat4d bench --device gpu --beside others      the same training in other programs, docs/gpu.md
-  splat4d bench --playback runs/a runs/a-small    frames a second of runs and files, in turns
+  splat4d bench --against today.json                ratios to an earlier result
+  splat4d bench --growth all --plots docs/images    steps against Gaussians, pixels, frames
+  splat4d bench --device gpu --save gpu.json        every stage of a GPU, scenes A, B and C
+  splat4d bench --device gpu --sweep --save sweep.json    each kernel constant at each value
+  splat4d bench --device gpu --beside others        the same training in other programs
+  splat4d bench --playback runs/a runs/a-small      frames per second of runs and files
 
-Times are means over eight views of the best of several rounds. `lower bound` is the least time in which the stage's
-compulsory work could be done (blending at the speed of its arithmetic alone, bytes at the speed of memory, both
-measured first), and its share of the time it took. Playback is drawn from 24 of the first scene's own cameras over its clip
-with its vertical field of view, by all threads or --threads of them: end to end is looking up who is alive, motion, drawing and 8-bit
-colours; the best of five rounds counts, picture by picture, and all files take turns. Measure on an idle machine:
-docs/benchmarks.md.";
+Times are means over eight views of the best of several rounds. `lower bound` is the time of a stage's compulsory work \
+at the measured rates of arithmetic and memory. Playback renders from 24 of the first scene's cameras over its clip, \
+end to end; the best of five rounds counts. Measure on an idle machine: docs/benchmarks.md.";
 
-/// Measure how fast this machine draws and trains
+/// Measure how fast this machine renders and trains
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
-    /// Which scene; may be given more than once [default: T, U and S; of a GPU A, B and C]
+    /// Scene to measure, repeatable [default: T, U and S; on a GPU A, B and C]
     #[arg(long = "scene", value_name = "NAME", value_enum, ignore_case = true)]
     scenes: Vec<Name>,
-    /// What is measured: the CPU, or a GPU of any kind by its own clock, with the least that each stage could take by its
-    /// copies and its arithmetic
+    /// Device to measure: the CPU, or any GPU by its own clock, with the lower bound of each stage
     #[arg(long, value_enum, default_value = "cpu", conflicts_with_all = ["growth", "playback", "simd"])]
     device: Measured,
-    /// Measure a GPU with each constant of its kernels at each of its values, one after the other: what to set them to on this card
+    /// Measure a GPU with each kernel constant at each of its values
     #[arg(long)]
     sweep: bool,
-    /// Train still scenes instead as other programs can: writes what they need into this folder, and compares with the runs that they
-    /// left there, where losses agree
+    /// Train static scenes for a comparison with other programs: write their input into this folder, and compare with
+    /// their results in it if losses agree
     #[arg(long, value_name = "FOLDER", conflicts_with = "sweep")]
     beside: Option<PathBuf>,
     /// Folder with the SOG files of scene S
     #[arg(long, value_name = "FOLDER")]
     playbot: Option<PathBuf>,
-    /// The scene of T and U: a run, or a file that brings its cameras along [default: examples/knight.s4d]
+    /// Scene of T and U: a run, or a file that contains its cameras [default: examples/knight.s4d]
     #[arg(long, value_name = "FILE")]
     file: Option<PathBuf>,
-    /// Instructions to use; may be given more than once [default: the best of this machine]
+    /// SIMD level, repeatable [default: the best of this machine]
     #[arg(long, value_name = "LEVEL", value_enum)]
     simd: Vec<Level>,
-    /// Rounds of which the best counts
+    /// Rounds; the best counts
     #[arg(long, value_name = "N", default_value_t = ROUNDS, value_parser = rounds)]
     rounds: usize,
-    /// Measure how a training step grows instead; may be given more than once
+    /// Measure how a training step grows, repeatable
     #[arg(long, value_name = "AXIS", value_enum, conflicts_with = "scenes")]
     growth: Vec<Axis>,
-    /// Folder for pictures of the growth
+    /// Folder for plots of the growth
     #[arg(long, value_name = "FOLDER", requires = "growth")]
     plots: Option<PathBuf>,
-    /// Measure instead how these runs, scenes or .s4d files play, in turns
+    /// Measure how these runs, scenes or .s4d files play, in turns
     #[arg(long, value_name = "FILE|RUN", num_args = 1.., conflicts_with_all = ["scenes", "growth", "simd", "rounds",
         "against"])]
     playback: Vec<PathBuf>,
-    /// Size of the pictures of --playback [default: 800x800]
+    /// Image size of --playback [default: 800x800]
     #[arg(long, value_name = "WxH", value_parser = parse_size, requires = "playback")]
     size: Option<[usize; 2]>,
-    /// Print a table for Markdown pages
+    /// Print a Markdown table
     #[arg(long)]
     markdown: bool,
-    /// Write the rows as JSON, to compare with later
+    /// Write the rows as JSON for a later --against
     #[arg(long, value_name = "FILE")]
     save: Option<PathBuf>,
-    /// Tell the ratio to an earlier result
+    /// Print the ratio to an earlier result
     #[arg(long, value_name = "FILE")]
     against: Option<PathBuf>,
 }
@@ -114,7 +110,7 @@ pub(crate) struct Args {
 enum Measured {
     /// The CPU
     Cpu,
-    /// A GPU, even one whose driver computes on the CPU
+    /// A GPU, including software drivers
     Gpu,
 }
 
@@ -125,7 +121,7 @@ fn rounds(text: &str) -> std::result::Result<usize, String> {
 /// Instruction levels as the command line names them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum Level {
-    /// What every machine of this kind has
+    /// The baseline of this architecture
     Scalar,
     /// AVX2 with fused multiply-add
     Avx2,

@@ -13,69 +13,69 @@ use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
 Examples:
-  splat4d compress runs/knight                     pruned, filtered, quantised, fine-tuned: runs/knight-compressed
+  splat4d compress runs/knight                     pruned, masked, quantised, fine-tuned
   splat4d compress runs/knight --prune 0.8         keep a fifth of the Gaussians
-  splat4d compress runs/knight --max-mb 0.5        as good as half a megabyte can be
-  splat4d compress runs/knight --level 1           only quantised, and fine-tuned so that nobody sees it
+  splat4d compress runs/knight --max-mb 0.5        best quality within half a megabyte
+  splat4d compress runs/knight --level 1           only quantised and fine-tuned
   splat4d compress runs/knight --set rounds=3 --set temporal=width
-  splat4d compress --resume runs/knight-compressed continue exactly where it stopped
+  splat4d compress --resume runs/knight-compressed    continue exactly
 
-The result is a run: DIR/scene.s4d plays anywhere, DIR/report.html compares before and after, and view, render,
-eval, export and info take DIR like any other run. The original is not touched.";
+The result is a run: DIR/scene.s4d plays anywhere, DIR/report.html compares before and after. The original run is \
+unchanged. docs/compression.md explains the settings.";
 
 /// Default of `--guard`, dB: less is not seen in a moving picture.
 const GUARD: f64 = 0.5;
 
-/// Make a trained run smaller and faster to play: prune, filter, quantise, fine-tune; measured before and after
+/// Make a trained run smaller and faster to play: prune, mask, quantise, fine-tune; measured before and after
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, after_long_help = long_help())]
 pub(crate) struct Args {
-    /// The run; its capture must still be where it was
+    /// The run; its capture must still be at its place
     #[arg(value_name = "RUN", required_unless_present = "resume")]
     run: Option<PathBuf>,
-    /// Where the result is written [default: RUN-compressed, or RUN-compressed-2 ... if that is taken]
+    /// Output folder [default: RUN-compressed, or RUN-compressed-2 ... if it exists]
     #[arg(short, long, value_name = "DIR")]
     output: Option<PathBuf>,
-    /// Continue this compression exactly where its newest checkpoint is
+    /// Continue this compression from its newest checkpoint
     #[arg(long, value_name = "DIR", conflicts_with_all = ["run", "output", "level", "prune", "score", "max_mb",
         "fine_tune", "set", "force", "guard", "unpruned"])]
     resume: Option<PathBuf>,
-    /// Replace the run in the -o folder: the files that splat4d wrote there, once the new run has taken its first steps
+    /// Replace the run in the -o folder (only files that splat4d wrote) once the new run has begun
     #[arg(long)]
     force: bool,
-    /// 0: the plain file; 1: quantised and fine-tuned; 2: pruned and filtered too, coarser codes, a smaller palette
+    /// 0: the plain file; 1: quantised and fine-tuned; 2: also pruned and masked, coarser codes, a smaller palette
     #[arg(long, value_name = "0|1|2", default_value_t = 2, value_parser = clap::value_parser!(u8).range(0..=2))]
     level: u8,
     /// Share of the Gaussians to remove, 0 to 0.98
     #[arg(long, value_name = "SHARE", conflicts_with = "max_mb", value_parser = share)]
     prune: Option<f64>,
-    /// What Gaussians are ranked by: change, share, both, opacity, light-gaussian, pup or speedy [default: change]
+    /// Score of Gaussians: change, share, both, opacity, light-gaussian, pup or speedy [default: change]
     #[arg(long, value_name = "NAME")]
     score: Option<String>,
-    /// Coarsen and prune until the file has at most so many megabytes (10⁶ bytes)
+    /// Coarsen and prune until the file has at most this size in megabytes (10⁶ bytes)
     #[arg(long, value_name = "MB", value_parser = positive)]
     max_mb: Option<f64>,
-    /// Steps of fine-tuning in all [default: by level, a share of the run's own steps]
+    /// Total steps of fine-tuning [default: by level, a share of the run's steps]
     #[arg(long, value_name = "STEPS")]
     fine_tune: Option<usize>,
-    /// Most dB that training views may lose; beyond it half as much is pruned instead, at most twice (where --prune says how
-    /// much, it is only told). 0: no guard
+    /// Largest loss of training views in dB; beyond it half as much is pruned, at most twice (with --prune: only a
+    /// warning). 0: no guard
     #[arg(long, value_name = "DB", default_value_t = GUARD, value_parser = natural)]
     guard: f64,
-    /// Train the unpruned scene on for as many steps too, and compare with that: fair, and takes as long again
+    /// Also train the unpruned scene for as many steps and compare with it; takes as long again
     #[arg(long)]
     unpruned: bool,
-    /// Change a setting of the level; may be repeated
+    /// Change a setting of the level, repeatable
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    /// Only compress: no evaluation, no guard, no comparison, no report
+    /// Skip evaluation, guard, comparison and report
     #[arg(long)]
     no_eval: bool,
     /// Image size at which playback is timed [default: 800x800]
     #[arg(long, value_name = "WxH", value_parser = parse_size)]
     size: Option<[usize; 2]>,
-    /// What draws while it is tuned; the rest is done by the CPU
-    #[arg(long, value_enum, default_value = "cpu", help_heading = "What computes")]
+    /// Device that renders during fine-tuning; the CPU does the rest
+    #[arg(long, value_enum, default_value = "cpu", help_heading = "Device")]
     device: Device,
     #[command(flatten)]
     measure: finish::Measure,
@@ -151,7 +151,7 @@ fn place(args: &Args, source: &Path, console: &Console) -> Result<PathBuf> {
         let mut name = source.file_name().unwrap_or(OsStr::new("run")).to_owned();
         name.push("-compressed");
         let dir = run_folder::free_folder(&source.with_file_name(name));
-        console.say(&format!("the result goes to {}", dir.display()));
+        console.say(&format!("the result is written to {}", dir.display()));
         return Ok(dir);
     };
     Ok(dir.clone())

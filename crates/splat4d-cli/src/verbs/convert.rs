@@ -28,21 +28,21 @@ const FIRST: &str = "first frame";
 const EXAMPLES: &str = "\
 Examples:
   splat4d convert scene.ply scene.spz                 .spz, version 3; --spz-version 4 for the newest
-  splat4d convert scene.sog scene.ply --up y          y up instead of the format's own y down
+  splat4d convert scene.sog scene.ply --up y          y up instead of the format's y down
   splat4d convert scene.ply small.compressed.ply --sh 1
-  splat4d convert runs/knight knight.splatv           moving: splaTV and gsplat.js play it
-  splat4d convert runs/knight now.spz --time 0.5      one moment
+  splat4d convert runs/knight knight.splatv           dynamic: splaTV and gsplat.js play it
+  splat4d convert runs/knight now.spz --time 0.5      one time
   splat4d convert runs/knight 'frames/f_%04d.spz' --frames
-  splat4d convert frames/ all.safetensors --fps 25    numbered files become one moving scene
-  splat4d convert runs/field field.ply --world        positions of the map that the capture is in
+  splat4d convert frames/ all.safetensors --fps 25    numbered files become one dynamic scene
+  splat4d convert runs/field field.ply --world        positions in the capture's map
   splat4d convert lengths.ply scene.ply --linear scales --linear opacities";
 
 /// What stands under the help: examples, and the formats of the list.
 fn after_help() -> String {
     let read = DIALECTS.iter().filter(|d| !d.is_written()).map(|d| format!("{} ({})", d.name, d.ending));
     format!(
-        "{EXAMPLES}\n\nWritten: .s4d {} .safetensors.\nRead as well: {}, folders of SOG. docs/formats.md tells what each \
-         can hold and which axes it assumes.",
+        "{EXAMPLES}\n\nWritten: .s4d {} .safetensors.\nAlso read: {}, folders of SOG. docs/formats.md states what each \
+         format holds and which axes it assumes.",
         written(|_| true).join(" "),
         read.collect::<Vec<_>>().join(", ")
     )
@@ -53,26 +53,26 @@ fn written(which: impl Fn(&Dialect) -> bool) -> Vec<&'static str> {
     DIALECTS.iter().filter(|d| d.is_written() && which(d)).map(|d| d.ending).collect()
 }
 
-/// Convert between Gaussian file formats, and say what is lost
+/// Convert between Gaussian file formats, and report what is lost
 #[derive(Debug, clap::Args)]
 #[command(after_help = after_help())]
 pub(crate) struct Args {
     #[arg(value_name = "IN", help = format!("A run, scene, {} file, a SOG folder, or a folder of numbered files",
           either(&dialect::extensions(|_| true))))]
     input: PathBuf,
-    /// The file to write, known by its ending; with --frames a folder, or a pattern such as f_%04d.spz
+    /// The file to write; its extension selects the format. With --frames a folder, or a pattern such as f_%04d.spz
     #[arg(value_name = "OUT")]
     output: PathBuf,
-    /// One moment, seconds of the scene
+    /// One time, seconds of the scene
     #[arg(long, value_name = "T", allow_negative_numbers = true, conflicts_with = "frames")]
     time: Option<f64>,
-    /// One file a frame
+    /// One file per frame
     #[arg(long)]
     frames: bool,
-    /// Replace a sequence that splat4d wrote to the folder, also a longer one
+    /// Replace a sequence that splat4d wrote to the folder, even a longer one
     #[arg(long, requires = "frames")]
     force: bool,
-    /// Frames a second: of a sequence that is read (30), or of --frames (those of the scene)
+    /// Frames per second of a sequence that is read (30), or of --frames (the scene's)
     #[arg(long, value_name = "N")]
     fps: Option<f64>,
     /// First second of --frames
@@ -81,25 +81,25 @@ pub(crate) struct Args {
     /// Last second of --frames
     #[arg(long, value_name = "S", requires = "frames", allow_negative_numbers = true)]
     to: Option<f64>,
-    /// Turn the scene so that this axis is up [default: the format's custom]
+    /// Rotate the scene so that this axis is up [default: by the format]
     #[arg(long, value_name = "AXIS", value_enum, allow_hyphen_values = true)]
     up: Option<Up>,
     /// Highest degree of spherical harmonics to keep
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(0..=3))]
     sh: Option<u8>,
-    /// Leave out what a playback file says of where it comes from
+    /// Leave out the provenance of a playback file
     #[arg(long)]
     no_provenance: bool,
-    /// Refuse a file whose format cannot say when each Gaussian is seen, in place of fitting smooth fades
+    /// Refuse a format that cannot store lifespans exactly, instead of fitting them
     #[arg(long)]
     exact: bool,
-    /// Add the scene's offset: positions of the capture's world, in double precision (.ply)
+    /// Add the scene's offset: positions in the capture's world, in double precision (.ply)
     #[arg(long)]
     world: bool,
-    /// Read these values of the input as they are, not as logarithms or logits; may be repeated
+    /// Read these values of the input as they are, not as logarithms or logits, repeatable
     #[arg(long, value_name = "WHAT", value_enum)]
     linear: Vec<LinearValues>,
-    /// Version of .spz to write: 3 is read by most programs, 2 also by GaussianSplats3D and spz-js, 4 alone by PlayCanvas' engine
+    /// Version of .spz to write: 3 for most programs, 2 for GaussianSplats3D and spz-js, 4 for PlayCanvas' engine
     #[arg(long, value_name = "V", default_value_t = spz::DEFAULT_VERSION,
           value_parser = clap::value_parser!(u32).range(2..=4))]
     spz_version: u32,
@@ -310,7 +310,7 @@ pub(crate) fn write(args: &Args, mut source: Source, console: &Console) -> anyho
         None => {
             let start = scene.clip[0];
             console.warn(&format!(
-                "{} holds one moment: {start} s, the clip's start, is taken. Choose with --time, or use {}.",
+                "{} holds one time: {start} s, the clip's start. Choose another with --time, or use {}.",
                 target.name(),
                 either(&[&["--frames"], &written(|d| d.moves)[..]].concat())
             ));

@@ -17,30 +17,30 @@ const MOMENTS: usize = 5;
 const EXAMPLES: &str = "\
 Examples:
   splat4d edit runs/take edits.toml -o clean.safetensors     replay a list of edits
-  splat4d edit runs/take --count 'box(-1,-1,0, 1,1,2)'       how many would it be, and when? Nothing is done
+  splat4d edit runs/take --count 'box(-1,-1,0, 1,1,2)'       count; nothing is changed
   splat4d edit runs/take --delete 'sphere(0,0,3, 0.5)' -o take.s4d
   splat4d edit runs/take --crop 'box(-2,-2,0, 2,2,2)' --save edits.toml -o take.s4d
-  splat4d edit runs/take --floaters 0.5 -o clean.safetensors     what no view supports; tells PSNR before and after
-  splat4d edit runs/take --subject -o subject.s4d                by the capture's masks; --background for the rest
-  splat4d edit take.s4d --layer 'page 3' -o part.ply             one layer alone
+  splat4d edit runs/take --floaters 0.5 -o clean.safetensors    PSNR before and after
+  splat4d edit runs/take --subject -o subject.s4d            by the capture's masks
+  splat4d edit take.s4d --layer 'page 3' -o part.ply         one layer only
 
-A list may also recolour, move by key frames, retime, merge scenes and drag: docs/edit.md. Steps run in order, those of options
-behind those of the file. OUT is known by its ending, as `convert` has it, and only replaced when all went well.";
+A list can also recolour, move by key frames, retime, merge scenes and drag: docs/edit.md. Steps run in order, those of \
+options after those of the file. OUT is replaced only if everything succeeds.";
 
 /// Edit a scene in time: select, delete, hide, recolour, move, retime, merge, drag
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
-    /// The run or scene: whatever `convert` reads
+    /// The run or scene: everything that `convert` reads
     #[arg(value_name = "SCENE")]
     scene: PathBuf,
     /// The list of edits
     #[arg(value_name = "EDITS.toml")]
     edits: Option<PathBuf>,
-    /// The file to write, known by its ending
+    /// The file to write; its extension selects the format
     #[arg(short, long, value_name = "OUT", required_unless_present = "count")]
     output: Option<PathBuf>,
-    /// Say how many Gaussians a selection holds, over time, and do nothing
+    /// Print how many Gaussians a selection contains, over time, and change nothing
     #[arg(long, value_name = "SELECTION", conflicts_with = "output")]
     count: Option<String>,
     /// Delete a selection
@@ -58,16 +58,16 @@ pub(crate) struct Args {
     /// Delete the subject, by the capture's masks
     #[arg(long)]
     background: bool,
-    /// Delete what few views support and held-out ones do not miss: from 0, nothing, to 1
+    /// Delete floaters: Gaussians that few views support and held-out ones do not need; strength 0 (none) to 1
     #[arg(long, value_name = "STRENGTH")]
     floaters: Option<f64>,
-    /// Your own words, kept in a .s4d: whom it shows, who may use it
+    /// A note stored in the .s4d, such as who is shown and who may use it
     #[arg(long, value_name = "TEXT")]
     note: Option<String>,
     /// Write no provenance into a .s4d
     #[arg(long, conflicts_with = "note")]
     no_provenance: bool,
-    /// Write the list with the steps of these options as well
+    /// Write the list including the steps of these options
     #[arg(long, value_name = "FILE")]
     save: Option<PathBuf>,
 }

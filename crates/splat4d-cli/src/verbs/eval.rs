@@ -17,16 +17,16 @@ use std::sync::Arc;
 
 const EXAMPLES: &str = "\
 Examples:
-  splat4d eval runs/knight                 scores, pictures, film and report again
-  splat4d eval runs/knight --baseline      how much does motion gain over a still scene?
+  splat4d eval runs/knight                     scores, images, film and report again
+  splat4d eval runs/knight --baseline          compare with a static scene
   splat4d eval runs/knight --lpips-weights vgg.safetensors --json
   splat4d eval runs/mutant --background both   on white and on black
-  splat4d eval runs/mutant --split val         on views to choose by; the test views are for the end
-  splat4d eval runs/take --truth calibrated    how far are its cameras from where they truly stood?
+  splat4d eval runs/mutant --split val         validation views
+  splat4d eval runs/take --truth calibrated    distance of its cameras from ground truth
 
-Results are in RUN/results.json and RUN/per_view.json (keys as 3DGS writes them), pictures in RUN/test/ours_N. With --split
-or --background only scores are made; what is not the test split on the run's own background stands under an entry and in a
-folder of its own, such as `val` or `test-black`.";
+Results are in RUN/results.json and RUN/per_view.json (keys as in 3DGS), images in RUN/test/ours_N. --split and \
+--background only compute scores; results of another split or background have their own entry and folder, such as \
+`val` or `test-black`.";
 
 /// Folder of the still scene, in the run.
 const BASELINE: &str = "baseline";
@@ -56,11 +56,11 @@ impl Background {
 /// The views to measure.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum Split {
-    /// The views that were held out
+    /// Held-out views
     Test,
     /// The data set's validation views
     Val,
-    /// All views that were trained on
+    /// All training views
     Train,
 }
 
@@ -74,32 +74,32 @@ impl Split {
     }
 }
 
-/// Measure a run on the views that training never saw
+/// Measure a run on held-out views
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     /// The run
     #[arg(value_name = "RUN", required_unless_present = "model")]
     run: Option<PathBuf>,
-    /// Train a still scene with the same recipe and steps (once; kept in RUN/baseline) and compare
+    /// Train a static scene with the same recipe and steps (once, in RUN/baseline) and compare
     #[arg(long)]
     baseline: bool,
     /// Only scores and report, no orbit film
     #[arg(long)]
     no_film: bool,
-    /// Measure these views, and make nothing but scores [default: test]
-    #[arg(long, value_enum, conflicts_with = "baseline", help_heading = "What is measured")]
+    /// Measure these views, scores only [default: test]
+    #[arg(long, value_enum, conflicts_with = "baseline", help_heading = "Evaluation")]
     split: Option<Split>,
-    /// Composite transparent pixels of pictures and renders on this, and make nothing but scores [default: as the run]
-    #[arg(long, value_enum, conflicts_with = "baseline", help_heading = "What is measured")]
+    /// Background of transparent pixels, scores only [default: the run's]
+    #[arg(long, value_enum, conflicts_with = "baseline", help_heading = "Evaluation")]
     background: Option<Background>,
-    /// Compare the training cameras, as the run has them, with this capture's, which are right, and make nothing but that:
-    /// absolute and relative trajectory error after a similarity, and clocks
+    /// Compare the run's training cameras with the ground truth of this capture, and only that: absolute and relative
+    /// trajectory error after a similarity, and time offsets
     #[arg(long, value_name = "CAPTURE", conflicts_with_all = ["baseline", "split", "background"],
-          help_heading = "What is measured")]
+          help_heading = "Evaluation")]
     truth: Option<PathBuf>,
-    /// What draws the views; the metrics are computed on the CPU
-    #[arg(long, value_enum, default_value = "cpu", help_heading = "What computes")]
+    /// Device that renders the views; the CPU computes the metrics
+    #[arg(long, value_enum, default_value = "cpu", help_heading = "Device")]
     device: Device,
     #[command(flatten)]
     measure: finish::Measure,

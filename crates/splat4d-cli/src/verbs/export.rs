@@ -19,43 +19,43 @@ use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
 Examples:
-  splat4d export runs/knight -o now.ply --time 0.5         one moment; every 3DGS viewer opens it
-  splat4d export runs/knight --sequence frames/            frames/frame_00000.ply ...; SuperSplat plays them
+  splat4d export runs/knight -o now.ply --time 0.5         one time; every 3DGS viewer opens it
+  splat4d export runs/knight --sequence frames/            frame_00000.ply ...; SuperSplat plays them
   splat4d export runs/knight --sequence frames/ --fps 10 --from 0.2 --to 0.8
-  splat4d export runs/knight --html -o knight.html         player and scene in one page: send it, host it, open it
-  splat4d export runs/knight --html -o index.html --link knight.s4d         for a web server: seeks, starts at once
-  splat4d export runs/knight --tracks tracks.csv           where every Gaussian is at every frame; .json too
+  splat4d export runs/knight --html -o knight.html         player and scene in one page
+  splat4d export runs/knight --html -o index.html --link knight.s4d    for a web server
+  splat4d export runs/knight --tracks tracks.csv           positions at every frame; .json too
   splat4d export runs/knight --tracks tracks.json --every 50
   splat4d export runs/knight --tracks hand.csv --near 0.3,1.2,-0.5 --count 20
-  splat4d export runs/knight --tracks paths.csv --points asked.csv    points that are asked for, and who sees them
-  splat4d export runs/knight -o knight.ply --time 0.5 --label knight  what has this label
+  splat4d export runs/knight --tracks paths.csv --points asked.csv    given points, and their visibility
+  splat4d export runs/knight -o knight.ply --time 0.5 --label knight
 
-A file of points has a header and a line a point, either of what a camera's pixel shows at a time or of a place at a time:
+A file of points has a header and one line per point, either a camera's pixel at a time or a position at a time:
   camera,x,y,time          time,x,y,z           time,x,y,z,camera
   cam03,151.5,88,0.2       0,0.31,1.2,-0.5      0,0.31,1.2,-0.5,cam03
-Pixels are those of the camera's picture, the first one's centre at 0.5; times are seconds. Each point is followed through
-all moments; `visible` is 1 where its camera sees it, and empty where it has none.";
+Pixels are those of the camera's image, the first one's centre at 0.5; times are seconds. `visible` is 1 where the \
+camera sees the point, and empty without a camera.";
 
-/// Write moments of a scene as 3DGS .ply files, all of it as a page, or tracks of its Gaussians
+/// Write a scene as 3DGS .ply files, as an HTML page, or as tracks of its Gaussians
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     /// The run, scene file or .ply; for a page also a playback file
     #[arg(value_name = "RUN|FILE", required_unless_present = "model")]
     source: Option<PathBuf>,
-    /// The file of one moment, or the page
+    /// The file of one time, or the page
     #[arg(short, long, value_name = "OUT", required_unless_present_any = ["sequence", "tracks"])]
     output: Option<PathBuf>,
-    /// The moment, seconds of the scene [default: the clip's start]
+    /// The time, seconds of the scene [default: the clip's start]
     #[arg(long, value_name = "T", allow_negative_numbers = true, conflicts_with = "sequence")]
     time: Option<f64>,
-    /// A folder for one file a frame
+    /// A folder for one file per frame
     #[arg(long, value_name = "FOLDER", conflicts_with = "output")]
     sequence: Option<PathBuf>,
-    /// Replace a sequence that splat4d wrote to the folder, also a longer one
+    /// Replace a sequence that splat4d wrote to the folder, even a longer one
     #[arg(long, requires = "sequence")]
     force: bool,
-    /// Files a second of a sequence, moments a second of tracks [default: the capture's frames a second]
+    /// Files per second of a sequence, samples per second of tracks [default: the capture's frame rate]
     #[arg(long, value_name = "N")]
     fps: Option<f64>,
     /// First second of a sequence or of tracks
@@ -68,20 +68,20 @@ pub(crate) struct Args {
     /// Write positions of Gaussians over time (seconds, scene units) to this .csv or .json file
     #[arg(long, value_name = "FILE", conflicts_with_all = ["output", "sequence", "time", "html"])]
     tracks: Option<PathBuf>,
-    /// Follow these points through all moments, and say where their camera sees them, in place of Gaussians
+    /// Track these points and their visibility instead of Gaussians
     #[arg(long, value_name = "FILE", requires = "tracks", conflicts_with_all = ["near", "every", "label"])]
     points: Option<PathBuf>,
     /// Only Gaussians with this label
     #[arg(long, value_name = "NAME")]
     label: Option<String>,
-    /// Add the scene's offset: positions of the capture's world, in double precision (.ply, tracks of Gaussians)
+    /// Add the scene's offset: positions in the capture's world, in double precision (.ply, tracks of Gaussians)
     #[arg(long, conflicts_with_all = ["html", "points"])]
     world: bool,
     /// Only every N-th Gaussian's track
     #[arg(long, value_name = "N", requires = "tracks", conflicts_with = "near",
           value_parser = clap::value_parser!(u32).range(1..))]
     every: Option<u32>,
-    /// Only tracks of the Gaussians nearest to this point at the tracks' first moment
+    /// Only tracks of the Gaussians nearest to this point at the tracks' first time
     #[arg(
         long,
         value_name = "X,Y,Z",
@@ -91,14 +91,14 @@ pub(crate) struct Args {
         allow_negative_numbers = true
     )]
     near: Vec<f64>,
-    /// How many those are [default: 1]
+    /// Number of nearest Gaussians [default: 1]
     #[arg(long, value_name = "N", requires = "near", value_parser = clap::value_parser!(u32).range(1..))]
     count: Option<u32>,
 
-    /// Write one page with the player and the scene in it; it needs no network and no server
+    /// Write one HTML page with player and scene; it needs no network and no server
     #[arg(long, conflicts_with_all = ["time", "sequence"], requires = "output")]
     html: bool,
-    /// Keep the page's scene in this file, in the page's folder or below: for web servers, which can send parts of it
+    /// Store the page's scene in this file, in the page's folder or below, for web servers
     #[arg(long, value_name = "FILE", requires = "html")]
     link: Option<PathBuf>,
 
@@ -288,7 +288,7 @@ fn page(path: &Path, args: &Args, console: &Console) -> anyhow::Result<()> {
     console.say(&format!("a page of {}", files::human_bytes(html.len() as u64)));
     console.written(out);
     if args.link.is_some() {
-        console.say("put both on a web server: browsers do not let a page from a disk read a file beside it");
+        console.say("put both on a web server: browsers do not let a page from disk read another file");
     }
     Ok(())
 }

@@ -21,15 +21,15 @@ use std::sync::atomic::Ordering;
 
 const EXAMPLES: &str = "\
 Examples:
-  splat4d import videos/ -o my-take                  all videos of a folder: fixed cameras round a scene
+  splat4d import videos/ -o my-take                  all videos of a folder: fixed cameras
   splat4d import a.mp4 b.mp4 c.mp4 -o my-take --from 3.2 --to 9.8 --size 720
-  splat4d import walk.mp4 -o walk --every 5          one camera, carried round the scene
-  splat4d import videos/ -o my-take --apart left,right=2.4    in metres
-  splat4d import videos/ -o my-take --board 36h11:0.16:floor    an AprilTag of 16 cm lies on the floor
-  splat4d import videos/ -o my-take --calibration Calib.toml    poses are known: clocks and points are found
+  splat4d import walk.mp4 -o walk --every 5          one moving camera, a static scene
+  splat4d import videos/ -o my-take --apart left,right=2.4    lengths in metres
+  splat4d import videos/ -o my-take --board 36h11:0.16:floor    an AprilTag of 16 cm on the floor
+  splat4d import videos/ -o my-take --calibration Calib.toml    known poses; offsets and points are found
 
-What was found of every camera is written to my-take/import.toml: correct an offset, a lens, or leave a camera out there,
-and run the same command again. Then: splat4d train my-take. How to film a take that works: docs/filming.md.";
+my-take/import.toml contains the result of every camera: correct an offset or a lens, or leave a camera out, and run \
+the same command again. Then: splat4d train my-take. How to record: docs/filming.md.";
 
 /// Pixels of the shorter side that pictures get: training on a CPU sees no more.
 const SIZE: usize = 1080;
@@ -38,87 +38,87 @@ const MOST: usize = 6;
 /// Frames per second of folders of pictures.
 const FPS: f64 = 30.0;
 
-/// Make a capture of videos: frames, a common clock, poses and points, from the videos alone
+/// Make a capture from videos: frames, synchronization, poses, lenses and points
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
-    /// Videos, folders of videos, or folders of pictures (one for each camera)
+    /// Videos, folders of videos, or folders of images (one per camera)
     #[arg(value_name = "VIDEOS", required = true)]
     videos: Vec<PathBuf>,
-    /// The capture's folder; work that was interrupted there goes on
+    /// The capture's folder; interrupted work continues
     #[arg(short, long, value_name = "TAKE")]
     output: PathBuf,
-    /// Whether cameras stand still; auto: one video is of a moving camera, several are of fixed ones
+    /// Fixed or moving cameras; auto: one video is a moving camera, several are fixed ones
     #[arg(long, value_name = "auto|fixed|moving", default_value = "auto", value_parser = ["auto", "fixed", "moving"])]
     rig: String,
-    /// Do not listen to the videos' sound
+    /// Do not use the videos' sound
     #[arg(long)]
     no_audio: bool,
-    /// One clock drives all cameras: take the times of their files, and do not look how their clocks differ
+    /// Use the files' timestamps: one trigger drives all cameras
     #[arg(long)]
     synchronous: bool,
     /// Keep every Nth frame
     #[arg(long, value_name = "N", default_value_t = 1)]
     every: usize,
-    /// Begin at this second of the first camera's video
+    /// Start at this second of the first camera's video
     #[arg(long, value_name = "SECONDS")]
     from: Option<f64>,
     /// End before this second
     #[arg(long, value_name = "SECONDS")]
     to: Option<f64>,
-    /// Pixels of the pictures' shorter side, at most
+    /// Largest number of pixels of the images' shorter side
     #[arg(long, value_name = "PIXELS", default_value_t = SIZE)]
     size: usize,
-    /// Frames per second of folders of pictures
+    /// Frames per second of folders of images
     #[arg(long, value_name = "N", default_value_t = FPS)]
     fps: f64,
-    /// Two cameras and the metres between them
+    /// Two cameras and their distance in metres
     #[arg(long, value_name = "A,B=METRES", value_parser = apart)]
     apart: Option<([String; 2], f64)>,
-    /// Tags that are seen: their family (36h11; 4x4, 5x5, 6x6 of ArUco and ChArUco), the metres along one's dark square, and
-    /// floor or wall where the board tells upwards
+    /// Tags: family (36h11; 4x4, 5x5, 6x6 of ArUco and ChArUco), edge of a dark square in metres, and floor or wall if
+    /// they define the up direction
     #[arg(long, value_name = "FAMILY:METRES[:floor|:wall]", conflicts_with_all = ["apart", "camera_height"])]
     board: Option<Board>,
-    /// A camera and the metres that it stands above the floor
+    /// A camera and its height above the floor in metres
     #[arg(long, value_name = "NAME=METRES", value_parser = height, conflicts_with = "apart")]
     camera_height: Option<(String, f64)>,
-    /// Lenses and places of the cameras, from a file or a folder that another program wrote
+    /// Lenses and poses from a file or folder of another program
     #[arg(long, value_name = "FILE|FOLDER")]
     calibration: Option<PathBuf>,
-    /// Let the COLMAP program find lenses and places, if it is installed
+    /// Find lenses and poses by the COLMAP program, if it is installed
     #[arg(long, conflicts_with = "calibration")]
     colmap: bool,
-    /// Masks, white where pictures count: NAME.png for a camera, or a folder NAME with one for each frame
+    /// Masks, white where images count: NAME.png per camera, or a folder NAME with one per frame
     #[arg(long, value_name = "FOLDER")]
     masks: Option<PathBuf>,
-    /// Take interlaced videos, and fill their lines in
+    /// Accept interlaced videos and deinterlace them
     #[arg(long)]
     deinterlace: bool,
-    /// Store pictures as PNG: every bit, four times as large
+    /// Store images as PNG: lossless, four times as large
     #[arg(long)]
     png: bool,
-    /// Do not look for what is wrong with the finished capture
+    /// Skip the check of the finished capture (doctor)
     #[arg(long)]
     no_doctor: bool,
 }
 
 fn apart(text: &str) -> Result<([String; 2], f64), String> {
-    let wrong = || format!("\"{text}\" is no distance of two cameras: write left,right=2.4");
+    let wrong = || format!("invalid distance of two cameras \"{text}\": write left,right=2.4");
     let (pair, metres) = text.rsplit_once('=').ok_or_else(wrong)?;
     let (a, b) = pair.split_once(',').ok_or_else(wrong)?;
     let metres: f64 = metres.trim().parse().map_err(|_| wrong())?;
     if !metres.is_finite() || metres <= 0.0 {
-        return Err(format!("{metres} m is no distance"));
+        return Err(format!("invalid distance {metres} m: expected more than 0"));
     }
     Ok(([a, b].map(|n| n.trim().to_owned()), metres))
 }
 
 fn height(text: &str) -> Result<(String, f64), String> {
-    let wrong = || format!("\"{text}\" is no height of a camera: write left=1.6");
+    let wrong = || format!("invalid height of a camera \"{text}\": write left=1.6");
     let (name, metres) = text.rsplit_once('=').ok_or_else(wrong)?;
     let metres: f64 = metres.trim().parse().map_err(|_| wrong())?;
     if !metres.is_finite() || metres <= 0.0 {
-        return Err(format!("{metres} m is no height"));
+        return Err(format!("invalid height {metres} m"));
     }
     Ok((name.trim().to_owned(), metres))
 }
@@ -196,7 +196,7 @@ fn told(report: &Report, looked: Option<&(Looked, PathBuf)>, console: &Console) 
     let guessed: Vec<&str> = report.cameras.iter().filter(guess).map(|c| c.name.as_str()).collect();
     if !guessed.is_empty() {
         console.warn(&format!(
-            "the clocks of these cameras are guessed from how much moves, and nothing confirms it: {} (tell them in {})",
+            "the time offsets of these cameras are guessed from the amount of motion and not confirmed: {} (correct them in {})",
             guessed.join(", "),
             corrections::FILE
         ));

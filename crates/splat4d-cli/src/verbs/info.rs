@@ -46,18 +46,18 @@ const BAR: usize = 32;
 const EXAMPLES: &str = "\
 Examples:
   splat4d info my-take            cameras, frames, split, findings, memory estimate
-  splat4d info my-take --doctor   what is wrong with which camera, and what to do (writes ./doctor/doctor.html)
+  splat4d info my-take --doctor   problems per camera and remedies (writes ./doctor/doctor.html)
   splat4d info runs/knight        recipe, progress, scores
   splat4d info scene.ply --json   Gaussians, SH degree, bounds, opacity and scales, damage";
 
-/// Tell what a capture, run or file contains, and whether it looks healthy
+/// Print what a capture, run or file contains, and whether it looks healthy
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     /// A capture folder, a run, a scene.safetensors, a checkpoint, a .s4d or a 3DGS .ply
     #[arg(value_name = "ANY")]
     path: PathBuf,
-    /// Read a capture with pictures reduced by k
+    /// Read a capture with images reduced by k
     #[arg(long, value_name = "K")]
     downscale: Option<usize>,
     /// Read a capture with these views held out: camera=0,10 or every=8 or none
@@ -69,13 +69,13 @@ pub(crate) struct Args {
     /// Read a capture's poses in this convention: opencv, opengl, inverse, transposed or xyzw, or several joined by +
     #[arg(long, value_name = "CONVENTION")]
     poses: Option<String>,
-    /// Read a capture with a knob of the recipe set, such as capture.sequence=photos; may be repeated
+    /// Read a capture with a setting, such as capture.sequence=photos, repeatable
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    /// Look at a capture's pictures for everything that spoils results, and write doctor.html and doctor.json
+    /// Check a capture's images and poses, and write doctor.html and doctor.json
     #[arg(long)]
     doctor: bool,
-    /// Where --doctor writes; a folder
+    /// Folder of --doctor's output
     #[arg(short, long, value_name = "FOLDER", default_value = "doctor", requires = "doctor")]
     output: PathBuf,
 }

@@ -12,14 +12,14 @@ Examples:
   splat4d join runs/concert             after `splat4d train concert -o runs/concert --chunk I` for every I
   splat4d join runs/concert --no-eval   only the scene and the file";
 
-/// Join the chunks of a long take, whoever trained them: one scene, one file, measured and reported
+/// Join the chunks of a long capture into one scene and file, measure and report
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     /// The run
     #[arg(value_name = "RUN")]
     run: PathBuf,
-    /// Only the scene and its file: no evaluation, film or report
+    /// Only the scene and its file; skip evaluation, film and report
     #[arg(long)]
     no_eval: bool,
     #[command(flatten)]

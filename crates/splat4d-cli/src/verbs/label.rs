@@ -8,24 +8,24 @@ use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
 Examples:
-  splat4d label runs/take                      from what its capture.json names (docs/labels.md)
-  splat4d label runs/take --from segmented/    from another capture's masks, of the same cameras
+  splat4d label runs/take                      masks that its capture.json names (docs/labels.md)
+  splat4d label runs/take --from segmented/    masks of another capture of the same cameras
   splat4d render runs/take --channel label -o labels.mp4
   splat4d edit runs/take --delete 'not label(hand)' -o hand.s4d
 
-`train` does it at its end where the capture has labels or features. Shapes, places and colours stay as they are.";
+`train` does it at its end if the capture has labels or features. Geometry and colours stay unchanged.";
 
-/// Learn what each Gaussian is part of from masks of labels, and its features from pictures of features
+/// Learn a label of each Gaussian from masks, and its features from feature images
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     /// The run
     #[arg(value_name = "RUN")]
     run: PathBuf,
-    /// The capture whose masks and features are meant [default: the run's]
+    /// The capture with masks and features [default: the run's]
     #[arg(long, value_name = "CAPTURE")]
     from: Option<PathBuf>,
-    /// Passes over the pictures
+    /// Passes over the images
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=100))]
     rounds: Option<u16>,
 }

@@ -19,31 +19,31 @@ const SHAPE: f64 = 0.02;
 
 const EXAMPLES: &str = "\
 Examples:
-  splat4d localise runs/knight photo.jpg                   where and when was it taken?
-  splat4d localise runs/knight a.png b.png -o found.json   cameras as `cameras.json` has them
-  splat4d localise scene.ply photo.jpg --start cam.json    near this camera, which tells the lens too
+  splat4d localise runs/knight photo.jpg                   pose and time of an image
+  splat4d localise runs/knight a.png b.png -o found.json   cameras in the format of `cameras.json`
+  splat4d localise scene.ply photo.jpg --start cam.json    near this camera, with its lens
 
-Pictures must be undistorted and of the starts' shape: the lens is that of the start that suits best, or found with --lens.
-Exposure and white balance may be others than the scene's. Starts are a run's own cameras; one within some 20° of the picture is
-needed. A picture is refused where the scene differs from it by more than a third of what one plain colour would.";
+Images must be undistorted and have the shape of the starts: the lens is that of the best start, or found with --lens. \
+Exposure and white balance may differ from the scene's. A start within about 20° of the image is needed. An image is \
+refused if more than a third of its difference from one plain colour remains.";
 
-/// Find from where and when pictures of a scene were taken
+/// Find pose and time of images of a scene
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     /// The run or scene file
     #[arg(value_name = "SCENE")]
     scene: PathBuf,
-    /// The pictures: JPEG, PNG or WebP, each on its own
+    /// The images: JPEG, PNG or WebP, each localised independently
     #[arg(value_name = "PICTURE", required = true)]
     pictures: Vec<PathBuf>,
-    /// Begin from this camera (a camera file), or these (a cameras.json) [default: the run's cameras]
+    /// Start from this camera (a camera file), or these (a cameras.json) [default: the run's cameras]
     #[arg(long, value_name = "FILE")]
     start: Option<PathBuf>,
-    /// Find the focal length too
+    /// Also find the focal length
     #[arg(long)]
     lens: bool,
-    /// Where to write the cameras that were found, as `cameras.json`
+    /// Write the cameras found to this file, as `cameras.json`
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
 }

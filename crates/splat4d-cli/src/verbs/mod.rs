@@ -1,4 +1,4 @@
-//! A file per verb: its options, its help and what it does.
+//! One file per command: its options, its help and its work.
 
 pub(crate) mod bake;
 pub(crate) mod bench;

@@ -14,18 +14,18 @@ use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
 Examples:
-  splat4d train my-take --observe 0.8 -o runs/seen      the last fifth is not looked at
-  splat4d predict runs/seen                             all models, as far as there are pictures to compare with
-  splat4d predict runs/seen --model koopman --horizon 90   three seconds, of which some cannot be compared
-  splat4d predict runs/seen --model graph --seeds 3     an ensemble tells how sure it is
-  splat4d predict runs/block --actions actions.csv      what is done to the scene, a row a frame from its first
-  splat4d predict runs/seen --oracle runs/all           beside a run of the same take that saw all of it
-  splat4d predict runs/seen --assimilate                corrected by each new frame, beside the open loop
+  splat4d train my-take --observe 0.8 -o runs/seen      keep the last fifth from training
+  splat4d predict runs/seen                             all models, as far as there are images
+  splat4d predict runs/seen --model koopman --horizon 90   three seconds, partly without comparison
+  splat4d predict runs/seen --model graph --seeds 3     an ensemble, with its uncertainty
+  splat4d predict runs/block --actions actions.csv      known actions, one row per frame
+  splat4d predict runs/seen --oracle runs/all           compare with a run that saw everything
+  splat4d predict runs/seen --assimilate                correct by each new frame
 
-Models, each a baseline for the next: freeze, velocity, acceleration, extrapolate (what the motion model itself says of later
-times), koopman (swings that fade), causal (state space), graph (messages along edges). RUN/predict holds report.html,
-predict.json, dynamics.safetensors and the predicted scene as scene.s4d and scene.safetensors, which view, render, bake and
-export take. With several models the scene is that of the one whose forecasts from three moments of the observed part were best.";
+Models, each a baseline for the next: freeze, velocity, acceleration, extrapolate (the motion model at later times), \
+koopman (decaying oscillations), causal (state space), graph (messages along edges). RUN/predict contains report.html, \
+predict.json, dynamics.safetensors and the predicted scene as scene.s4d and scene.safetensors. With several models, the \
+scene uses the one with the best forecasts within the observed part.";
 
 /// Default of `--nodes`.
 const NODES: usize = 48;
@@ -34,42 +34,42 @@ const MAX_HORIZON: usize = 3600;
 /// Most members of an ensemble.
 const MAX_SEEDS: u64 = 16;
 
-/// Predict how a scene goes on, and compare with the part of the take that was kept from training
+/// Forecast a scene, and compare with the part of the capture that was kept from training
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
-    /// The run, trained with --observe; its capture must still be where it was
+    /// The run, trained with --observe; its capture must still be at its place
     #[arg(value_name = "RUN")]
     run: PathBuf,
-    /// Frames to predict [default: as many as there are pictures of]
+    /// Frames to predict [default: as many as have images]
     #[arg(long, value_name = "FRAMES", value_parser = clap::value_parser!(u32).range(1..=MAX_HORIZON as i64))]
     horizon: Option<u32>,
     /// freeze, velocity, acceleration, extrapolate, koopman, causal, graph or all
     #[arg(long, value_name = "NAME", default_value = "all")]
     model: String,
-    /// What is done to the scene: a header of up to 8 names, then a row a frame from the first of the clip on. Columns NAME.x,
+    /// Known actions: a header of up to 8 names, then one row per frame from the first of the clip. Columns NAME.x,
     /// NAME.y, NAME.z are a vector
     #[arg(long, value_name = "CSV")]
     actions: Option<PathBuf>,
     /// Members of the ensembles of the trained models
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=MAX_SEEDS))]
     seeds: u64,
-    /// Most nodes that carry what moves
+    /// Largest number of nodes on dynamic regions
     #[arg(long, value_name = "N", default_value_t = NODES as u32, value_parser = clap::value_parser!(u32).range(1..=MAX_NODES as i64))]
     nodes: u32,
-    /// Steps that train causal and graph
+    /// Training steps of causal and graph
     #[arg(long, value_name = "STEPS", default_value_t = 1500, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     steps: u32,
-    /// Tell causal and graph which way is down
+    /// Give causal and graph the down direction
     #[arg(long)]
     gravity: bool,
-    /// Correct the prediction by each new frame: predict, draw, compare, update
+    /// Correct the prediction by each new frame: predict, render, compare, update
     #[arg(long)]
     assimilate: bool,
-    /// A run of the same capture that saw all of it: the best that can be reached
+    /// A run of the same capture that saw all of it: the upper bound
     #[arg(long, value_name = "RUN")]
     oracle: Option<PathBuf>,
-    /// No films of truth and prediction
+    /// Skip films of truth and prediction
     #[arg(long)]
     no_film: bool,
 }

@@ -27,7 +27,7 @@ const NO_RANGE: [f32; 2] = [1.0, 2.0];
 const EXAMPLES: &str = "\
 Examples:
   splat4d render runs/knight                               an orbit, into runs/knight/renders/orbit.mp4
-  splat4d render runs/knight -o frozen.mp4 --freeze 0.4    bullet time: everything at 0.4 s
+  splat4d render runs/knight -o frozen.mp4 --freeze 0.4    bullet time: time stops at 0.4 s
   splat4d render runs/knight --path camera=cam03 --slow-motion 4 -o slow.mp4
   splat4d render runs/knight --path keys.json --size 1280x720 -o flight.mp4
   splat4d render runs/knight --path test -o views/         held-out views as numbered PNGs
@@ -35,10 +35,10 @@ Examples:
   splat4d render runs/knight --channel flow --path camera=cam03 -o flow/ --raw flow/ --raw-format flo
   splat4d render runs/knight --channel uncertainty -o unsure.mp4
   splat4d render scene.ply --camera cam.json -o view.png --raw view
-  splat4d render runs/knight --device gpu -v               on the GPU, or say why not; prints frames/s
+  splat4d render runs/knight --device gpu -v               on the GPU; prints frames/s
 
-The output's ending decides: .mp4 (needs ffmpeg), .png (animated if it has several frames), no ending: a folder of
-PNGs. A key frame file is
+The output's extension selects the format: .mp4 (needs ffmpeg), .png (animated if it has several frames), none: a folder \
+of PNGs. A key frame file is
   {\"fps\": 30, \"keys\": [{\"time\": 0, \"position\": [0, 1, 4], \"look_at\": [0, 1, 0], \"fov_y\": 45, \"scene_time\": 0},
                        {\"time\": 3, \"world_to_camera\": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]}]}
 and a camera file
@@ -46,60 +46,60 @@ and a camera file
    \"world_to_camera\": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]}
 with a row-major pose in OpenCV axes (x right, y down, z forward) and pixel centres at +0.5.";
 
-/// Draw pictures and films of a run, a scene.safetensors or a 3DGS .ply
+/// Render images and films of a run, a scene.safetensors or a 3DGS .ply
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
     /// The run, scene file or .ply
     #[arg(value_name = "RUN|FILE", required_unless_present = "model")]
     source: Option<PathBuf>,
-    /// Where to write: NAME.mp4, NAME.png, or a folder
+    /// Output: NAME.mp4, NAME.png, or a folder
     #[arg(short, long, value_name = "OUT")]
     output: Option<PathBuf>,
-    /// Where the camera goes: orbit, test, train, camera=NAME or a key frame file [default: orbit]
+    /// Camera path: orbit, test, train, camera=NAME or a key frame file [default: orbit]
     #[arg(long, value_name = "PATH", help_heading = "Camera")]
     path: Option<Route>,
-    /// One picture from this camera (JSON)
+    /// One image from this camera (JSON)
     #[arg(long, value_name = "FILE", conflicts_with_all = ["path", "from", "to", "slow_motion", "fps", "size"],
         help_heading = "Camera")]
     camera: Option<PathBuf>,
-    /// Size of the pictures [default: the training cameras']
+    /// Image size [default: the training cameras']
     #[arg(long, value_name = "WxH", value_parser = parse_size, help_heading = "Camera")]
     size: Option<[usize; 2]>,
-    /// First second of the scene that is shown
+    /// First second of the scene
     #[arg(long, value_name = "S", value_parser = second, help_heading = "Time", allow_negative_numbers = true)]
     from: Option<f64>,
-    /// Last second of the scene that is shown
+    /// Last second of the scene
     #[arg(long, value_name = "S", value_parser = second, help_heading = "Time", allow_negative_numbers = true)]
     to: Option<f64>,
-    /// Everything at this second of the scene
+    /// Render everything at this second of the scene
     #[arg(long, value_name = "S", value_parser = second, visible_alias = "time", conflicts_with_all = ["from", "to"],
         help_heading = "Time", allow_negative_numbers = true)]
     freeze: Option<f64>,
-    /// How many times slower than life
+    /// Slow-motion factor
     #[arg(long, value_name = "F", value_parser = factor, help_heading = "Time")]
     slow_motion: Option<f64>,
-    /// Frames a second of the film [default: 30, or the key frame file's]
+    /// Frames per second of the film [default: 30, or the key frame file's]
     #[arg(long, value_name = "N", value_parser = fps, help_heading = "Time")]
     fps: Option<f64>,
-    /// What is shown
-    #[arg(long, value_enum, default_value = "color", help_heading = "Picture")]
+    /// Channel to render
+    #[arg(long, value_enum, default_value = "color", help_heading = "Image")]
     channel: Channel,
     /// Colour behind the scene, 0 to 1 [default: the scene's, or the camera file's]
-    #[arg(long, value_name = "R,G,B", value_parser = color, help_heading = "Picture")]
+    #[arg(long, value_name = "R,G,B", value_parser = color, help_heading = "Image")]
     background: Option<Color>,
-    /// Also write the numbers behind the pictures. With --camera P.npy [h,w,3], P.alpha.npy [h,w] and P.depth.npy [h,w]
-    /// (Σ zαT), unclamped, and those of another --channel as P.CHANNEL.npy; of a film the channel's as numbered files in P
-    #[arg(long, value_name = "P", help_heading = "Picture")]
+    /// Also write the raw values. With --camera: P.npy [h,w,3], P.alpha.npy [h,w] and P.depth.npy [h,w] (Σ zαT), not
+    /// clamped, and those of another --channel as P.CHANNEL.npy. Of a film: the channel's as numbered files in P
+    #[arg(long, value_name = "P", help_heading = "Image")]
     raw: Option<PathBuf>,
-    /// Replace numbered files that splat4d wrote to the folder, also more of them
+    /// Replace numbered files that splat4d wrote to the folder, even if there are more
     #[arg(long, conflicts_with = "camera")]
     force: bool,
-    /// How the channel's numbers are written
-    #[arg(long, value_enum, default_value = "npy", requires = "raw", help_heading = "Picture")]
+    /// Format of the raw values
+    #[arg(long, value_enum, default_value = "npy", requires = "raw", help_heading = "Image")]
     raw_format: RawFormat,
 
-    /// What draws
+    /// Device that renders
     #[arg(long, value_enum, default_value = "auto")]
     device: Device,
 

@@ -39,20 +39,20 @@ const SAME_RATE: f64 = 0.01;
 const EXAMPLES: &str = "\
 Examples:
   splat4d train examples/knight                     default recipe, into runs/knight
-  splat4d train my-take -o runs/first --minutes 10  as many steps as fit into ten minutes
+  splat4d train my-take -o runs/first --minutes 10  finish within ten minutes
   splat4d train my-take --quality draft             a first look, after minutes
   splat4d train my-take --view                      watch it learn in the browser
-  splat4d train my-take --motion still              one scene for all times: a calibration check
+  splat4d train my-take --motion still              a static scene: checks the calibration
   splat4d train my-take --downscale 4 --set iterations=1000 --set sh_degree=0
   splat4d train my-take --hold-out camera=0,10      measure on these cameras
-  splat4d train my-take --observe 0.8               keep the last fifth of the take for `predict`
-  splat4d train concert -o runs/concert --chunk-frames 60        a long take, chunk by chunk
+  splat4d train my-take --observe 0.8               keep the last fifth for `predict`
+  splat4d train concert -o runs/concert --chunk-frames 60    a long capture in chunks
   splat4d train my-take --device auto               on a GPU, if there is one
-  splat4d train --resume runs/first                 continue exactly where it stopped
+  splat4d train --resume runs/first                 continue exactly
 
-A capture is a folder with one of these: capture.json (write it by hand for your own rig), transforms_train.json
-(D-NeRF, Blender), transforms.json (Nerfstudio), sparse/ (COLMAP), train_meta.json (PanopticSports) or
-poses_bounds.npy (N3DV). `splat4d info CAPTURE` checks one. `--help-knobs` lists every knob of the recipe.";
+A capture is a folder with one of these: capture.json (write it for your own rig), transforms_train.json (D-NeRF, \
+Blender), transforms.json (Nerfstudio), sparse/ (COLMAP), train_meta.json (PanopticSports), dataset.json (HyperNeRF) or \
+poses_bounds.npy (N3DV). `splat4d info CAPTURE` checks one. `--help-knobs` lists all settings.";
 
 /// The knobs that most runs are told by, for `--help`.
 const IMPORTANT: [&str; 12] = [
@@ -70,91 +70,93 @@ const IMPORTANT: [&str; 12] = [
     "loss.dssim",
 ];
 
-/// Train a scene from a capture, then measure it, film it and write a report
+/// Train a scene from a capture, measure it, film it and write a report
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, after_long_help = long_help())]
 pub struct Args {
     /// The capture: a folder, or its marker file
     #[arg(value_name = "CAPTURE", required_unless_present_any = ["resume", "source", "help_knobs"])]
     capture: Option<PathBuf>,
-    /// Where the run is written [default: runs/NAME, or runs/NAME-2 ... if that is taken]
+    /// Output folder [default: runs/NAME, or runs/NAME-2 ... if it exists]
     #[arg(short, long, value_name = "RUN", short_alias = 'm', alias = "model_path", alias = "model-path")]
     output: Option<PathBuf>,
-    /// Continue this run exactly where its newest checkpoint is
+    /// Continue this run from its newest checkpoint
     #[arg(long, value_name = "RUN", conflicts_with_all = ["capture", "output", "motion", "minutes", "quality", "recipe", "set",
         "downscale", "hold_out", "images", "poses", "observe", "chunk_frames", "overlap", "chunk", "image_memory", "memory_limit", "seed", "source", "iterations", "force"])]
     resume: Option<PathBuf>,
-    /// Replace the run in the -o folder: the files that splat4d wrote there, once the new run has taken its first steps
+    /// Replace the run in the -o folder (only files that splat4d wrote) once the new run has begun
     #[arg(long)]
     force: bool,
-    /// How Gaussians move: auto (chosen by the capture), still, spacetime, deform-mlp, hexplane, tracked, native4d,
-    /// control or ssm [default: auto, or the recipe's]
-    #[arg(long, value_name = "MODEL", help_heading = "What is learned")]
+    /// Motion model: auto (chosen by the capture), still, spacetime, deform-mlp, hexplane, tracked, native4d, control
+    /// or ssm [default: auto, or the recipe's]
+    #[arg(long, value_name = "MODEL", help_heading = "Training")]
     motion: Option<String>,
-    /// Be done in M minutes, from reading the capture to the report: steps are fitted, and fitted anew while it goes; the
-    /// recipe says what they became
-    #[arg(long, value_name = "M", value_parser = minutes, help_heading = "What is learned")]
+    /// Finish within M minutes, evaluation and report included. The step count is planned and re-planned to fit, and
+    /// recorded in the recipe
+    #[arg(long, value_name = "M", value_parser = minutes, help_heading = "Training")]
     minutes: Option<f64>,
-    /// How much it may take: draft (half-size pictures, 2,500 steps), standard (the default: 7,000 steps) or best (20,000
-    /// steps, 60,000 Gaussians). Says first how long that takes here. Knobs that are set win over it, --minutes over its steps
-    #[arg(long, value_name = "QUALITY", help_heading = "What is learned")]
+    /// draft (half-size images, 2,500 steps, half the Gaussians), standard (the default: 7,000 steps) or best (20,000
+    /// steps, twice the Gaussians). Prints the expected time first. Settings have priority over it, and --minutes over
+    /// its steps
+    #[arg(long, value_name = "QUALITY", help_heading = "Training")]
     quality: Option<Quality>,
-    /// Start from this recipe (TOML); a run's own recipe.toml repeats it
-    #[arg(long, value_name = "FILE", help_heading = "What is learned")]
+    /// Start from this recipe (TOML); a run's recipe.toml repeats that run
+    #[arg(long, value_name = "FILE", help_heading = "Training")]
     recipe: Option<PathBuf>,
-    /// List the knobs of the recipe: all, or those of a table or with a word in their name
-    #[arg(long, value_name = "TOPIC", num_args = 0..=1, default_missing_value = "", help_heading = "What is learned")]
+    /// List all settings, or those of a table or with a word in their name
+    #[arg(long, value_name = "TOPIC", num_args = 0..=1, default_missing_value = "", help_heading = "Training")]
     help_knobs: Option<String>,
-    /// Set a knob of the recipe; may be repeated
-    #[arg(long, value_name = "KEY=VALUE", help_heading = "What is learned")]
+    /// Change a setting, repeatable
+    #[arg(long, value_name = "KEY=VALUE", help_heading = "Training")]
     set: Vec<String>,
     /// Seed of every random choice
-    #[arg(long, value_name = "N", help_heading = "What is learned")]
+    #[arg(long, value_name = "N", help_heading = "Training")]
     seed: Option<u64>,
-    /// Reduce pictures by k: the mean of k x k boxes
-    #[arg(long, value_name = "K", short_alias = 'r', alias = "resolution", help_heading = "What is read")]
+    /// Reduce images by k: the mean of k x k boxes
+    #[arg(long, value_name = "K", short_alias = 'r', alias = "resolution", help_heading = "Input")]
     downscale: Option<usize>,
     /// Views kept from training: camera=0,10 or every=8 or none [default: the data set's convention]
-    #[arg(long, value_name = "RULE", help_heading = "What is read")]
+    #[arg(long, value_name = "RULE", help_heading = "Input")]
     hold_out: Option<String>,
-    /// Folder of images in place of the one that the capture names, such as images_4
-    #[arg(long, value_name = "NAME", help_heading = "What is read")]
+    /// Folder of images instead of the capture's, such as images_4
+    #[arg(long, value_name = "NAME", help_heading = "Input")]
     images: Option<String>,
-    /// Convention in which poses are written where it is not the layout's: opencv or opengl (camera axes), inverse, transposed
-    /// or xyzw (quaternions), or several joined by +
-    #[arg(long, value_name = "CONVENTION", help_heading = "What is read")]
+    /// Convention of poses if it differs from the layout's: opencv or opengl (camera axes), inverse, transposed or xyzw
+    /// (quaternions), or several joined by +
+    #[arg(long, value_name = "CONVENTION", help_heading = "Input")]
     poses: Option<String>,
-    /// Train on the first SHARE of the clip only; what comes later scores `predict` and is not looked at [default: 1]
-    #[arg(long, value_name = "SHARE", help_heading = "What is read")]
+    /// Train on the first SHARE of the clip only; later frames score `predict` [default: 1]
+    #[arg(long, value_name = "SHARE", help_heading = "Input")]
     observe: Option<f64>,
-    /// Learn a longer take in chunks of N frames [default: 60 where fixed cameras film more than 300 frames]
-    #[arg(long, value_name = "N", help_heading = "Long takes")]
+    /// Train longer captures in chunks of N frames [default: 60 if fixed cameras have more than 300 frames]
+    #[arg(long, value_name = "N", help_heading = "Long captures")]
     chunk_frames: Option<usize>,
     /// Frames that neighbouring chunks share, an even number [default: 16]
-    #[arg(long, value_name = "N", help_heading = "Long takes")]
+    #[arg(long, value_name = "N", help_heading = "Long captures")]
     overlap: Option<usize>,
-    /// Do one part and end: shared, then even chunks by their number, then odd ones; or all, beside other workers on the same
-    /// RUN. What is done already is not done again; `splat4d join RUN` ends the run
-    #[arg(long, value_name = "PART", help_heading = "Long takes", requires = "output", conflicts_with = "force")]
+    /// Train one part and end: shared, then even chunks by number, then odd ones; or all, in parallel with other
+    /// workers on the same RUN. Finished parts are skipped; `splat4d join RUN` ends the run
+    #[arg(long, value_name = "PART", help_heading = "Long captures", requires = "output", conflicts_with = "force")]
     chunk: Option<Wanted>,
-    /// Memory for decoded pictures [default: 1GiB]
-    #[arg(long, value_name = "SIZE", value_parser = parse_bytes, help_heading = "What is read")]
+    /// Memory for decoded images [default: 1GiB]
+    #[arg(long, value_name = "SIZE", value_parser = parse_bytes, help_heading = "Input")]
     image_memory: Option<u64>,
-    /// Most memory that training may take: a long take is cut into as short chunks of as few Gaussians as that asks for
-    #[arg(long, value_name = "SIZE", value_parser = parse_bytes, help_heading = "What is read")]
+    /// Memory limit of training: long captures get shorter chunks with fewer Gaussians
+    #[arg(long, value_name = "SIZE", value_parser = parse_bytes, help_heading = "Input")]
     memory_limit: Option<u64>,
-    /// What trains; what a GPU cannot of a recipe is done by the CPU. Not part of the recipe: a run may go on on another device
-    #[arg(long, value_enum, default_value = "cpu", help_heading = "What computes")]
+    /// Device to train on. The CPU runs whatever the GPU does not support. Not part of the recipe: a run can be resumed
+    /// on another device
+    #[arg(long, value_enum, default_value = "cpu", help_heading = "Device")]
     device: Device,
     #[command(flatten)]
     measure: finish::Measure,
-    /// Show the scene in the browser while it learns, and on a terminal afterwards too, until Ctrl-C
-    #[arg(long, help_heading = "Where it is served")]
+    /// Show the scene in the browser during training, and on a terminal afterwards until Ctrl-C
+    #[arg(long, help_heading = "Serving")]
     view: bool,
     #[command(flatten)]
     place: Place,
-    /// Only train and bake: no evaluation, film or report
-    #[arg(long, help_heading = "What is measured")]
+    /// Only train and bake; skip evaluation, film and report
+    #[arg(long, help_heading = "Evaluation")]
     no_eval: bool,
 
     // What users of other systems type.
@@ -477,7 +479,7 @@ fn place(
         } else {
             String::new()
         };
-        console.say(&format!("{} is taken{hint}: this run goes to {}", wanted.display(), run.display()));
+        console.say(&format!("{} exists{hint}: this run is written to {}", wanted.display(), run.display()));
     }
     Ok(asked.begin(&run, args.force, TRAIN)?)
 }
@@ -543,9 +545,7 @@ fn long_help() -> String {
         .iter()
         .map(|key| line(knobs.iter().find(|k| k.key() == *key).expect("IMPORTANT names knobs of the recipe")))
         .collect();
-    format!(
-        "{EXAMPLES}\n\nKnobs of the recipe (--set KEY=VALUE, or a TOML file for --recipe; --help-knobs: all):\n{lines}"
-    )
+    format!("{EXAMPLES}\n\nSettings (--set KEY=VALUE, or a TOML file for --recipe; --help-knobs: all):\n{lines}")
 }
 
 /// Every knob, those of a table, or those with the topic in their name. Errors: there is none.
@@ -567,7 +567,7 @@ fn knob_list(topic: &str) -> Result<String, Error> {
         let mut tables: Vec<&str> = knobs.iter().map(|k| k.table).collect();
         tables.dedup();
         let near = nearest(topic, &tables).map_or_else(String::new, |n| format!("Did you mean `{n}`? "));
-        return Err(Error::input(format!("no knob is called after `{topic}`"))
+        return Err(Error::input(format!("no setting or table has `{topic}` in its name"))
             .at("--help-knobs")
             .remedy(format!("{near}Tables are: {}", tables.join(", "))));
     }

@@ -15,14 +15,14 @@ use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
 Examples:
-  splat4d view runs/knight              play a run; works while it trains, too (its newest checkpoint)
+  splat4d view runs/knight              play a run, also during training (its newest checkpoint)
   splat4d view scene.s4d                or a playback file, a scene.safetensors, a 3DGS .ply
   splat4d view https://example.org/a.s4d
-  splat4d view runs/knight --edit edits.toml    select, clean, recolour, move, bend; saved as a list (docs/edit.md)
+  splat4d view runs/knight --edit edits.toml    edit in the browser, saved as a list (docs/edit.md)
   splat4d view runs/knight --no-open --port 8080
 
-On a machine without a screen it says how to look from another one through ssh. A scene on another web server is read
-by the browser itself: that server must allow it (Access-Control-Allow-Origin, and best ranges). Ctrl-C stops.";
+Without a screen it prints how to connect from another machine through ssh. The browser itself reads a scene on another \
+web server, which must allow it (Access-Control-Allow-Origin, and preferably ranges). Ctrl-C stops.";
 
 /// Play a scene in the browser
 #[derive(Debug, clap::Args)]
@@ -31,7 +31,7 @@ pub(crate) struct Args {
     /// The run, scene file, .ply, playback file, or the address of a playback file
     #[arg(value_name = "RUN|FILE|URL")]
     source: OsString,
-    /// Let the page edit, and save its list of edits in this file; it is made where it is not there
+    /// Edit in the page and save the list of edits in this file; it is created if it does not exist
     #[arg(long, value_name = "FILE")]
     edit: Option<PathBuf>,
     #[command(flatten)]

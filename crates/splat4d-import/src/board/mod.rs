@@ -1,8 +1,8 @@
-//! Square tags in pictures: AprilTag 36h11 and the markers of ArUco and ChArUco boards.
+//! Square tags in images: AprilTag 36h11 and the markers of ArUco and ChArUco boards.
 //!
-//! A tag is a dark square with bits inside on something bright. Dark regions whose outline has four corners are found
-//! (`quads.rs`), their edges are laid exactly, and their bits are looked up among the family's. (Olson 2011,
-//! "AprilTag: a robust and flexible visual fiducial system"; Garrido-Jurado et al. 2014, "Automatic generation and detection of
+//! A tag is a dark square with bits inside on a bright background. Dark regions whose outline has four corners are
+//! found (`quads.rs`), their edges are fitted, and their bits are looked up in the family. (Olson 2011, "AprilTag: a
+//! robust and flexible visual fiducial system"; Garrido-Jurado et al. 2014, "Automatic generation and detection of
 //! highly reliable fiducial markers under occlusion".)
 
 mod quads;

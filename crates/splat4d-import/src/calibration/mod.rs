@@ -1,8 +1,8 @@
-//! Calibrations that other programs wrote: lenses, and where cameras stand.
+//! Calibrations of other programs: lenses and poses.
 //!
-//! A dialect is a file here and a line in its list; which one a file is in, its content tells. What a camera is called is
-//! matched with what its video is called ([`assign`]). Everything comes out as the rest of the program has it: `cam_from_world` in
-//! OpenCV axes, pixels whose first centre is at 0.5.
+//! A dialect is a file here and a line in the list; the content of a file identifies its dialect. Names of cameras are
+//! matched with names of videos ([`assign`]). The result is `cam_from_world` in OpenCV axes, and pixels whose first
+//! centre is at 0.5.
 
 mod capture;
 mod easymocap;

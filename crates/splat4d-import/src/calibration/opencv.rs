@@ -142,7 +142,7 @@ fn camera(tree: &Tree) -> Result<Part> {
 /// Finite numbers of a matrix.
 pub(super) fn numbers(key: &str, tree: &Tree) -> Result<Matrix> {
     let matrix = tree.matrix().ok_or_else(|| {
-        Error::input(format!("{key} is no matrix of numbers, or has not as many as it says"))
+        Error::input(format!("invalid {key}: expected a matrix with the stated number of values"))
             .remedy("Write it row by row.")
     })?;
     if let Some(bad) = matrix.data.iter().find(|v| !v.is_finite()) {

@@ -1,7 +1,7 @@
-//! A look at a capture before it is trained on: what is wrong, with which camera, by how much, what it will look like and what
-//! to do. Reads pictures and poses of any layout and writes nothing.
+//! Checks a capture before training: problem, camera, size, effect and remedy. Reads images and poses of any layout and
+//! writes nothing.
 //!
-//! Matches between cameras are found without the capture's poses, so that wrong poses do not hide themselves.
+//! Matches between cameras are found without the capture's poses, so that wrong poses cannot hide themselves.
 
 mod alone;
 mod between;

@@ -1,8 +1,8 @@
-//! Structure from motion: poses, lenses, clocks and points of pictures that bring none.
+//! Structure from motion: poses, lenses, time offsets and points of images without any.
 //!
-//! Fixed cameras are one picture each: the features of their median background, and the features of what moves at some moments
-//! that all share. People and balls are evidence where walls are alike, and each of their features carries its velocity, so that
-//! clocks are found together with poses ([`adjust`]). Frames of moving cameras are a picture each.
+//! A fixed camera is one image: the features of its median background, and the features of moving objects at some
+//! shared times. Moving objects are evidence where walls look alike. Each of their features has a velocity, so time
+//! offsets are found together with poses ([`adjust`]). Each frame of a moving camera is an image.
 
 pub mod adjust;
 pub(crate) mod algebra;

@@ -1,10 +1,10 @@
-//! A clock that all cameras share, found by sound, by motion and by geometry.
+//! Synchronisation of cameras by sound, motion and geometry.
 //!
-//! Every camera's frames have times on its own clock. What is looked for is, per camera, the [`graph::Offset`] that is
-//! added to them. Evidence is about pairs: a *lag* of cameras a and b is how much later, on its own clock, b notes what a
-//! notes: `t_b − t_a` of one event, so that `lag = offset_a − offset_b`. [`sound`] and [`epipolar`] measure lags, [`motion`]
-//! guesses them, and [`graph`] makes offsets of lags and leaves out the ones that contradict the rest. What cannot be told is
-//! refused with a [`Refusal`] and never averaged in.
+//! Every camera's frames have timestamps on its own clock; the result is one [`graph::Offset`] per camera to add to
+//! them. Evidence is pairwise: a *lag* of cameras a and b is the difference of their timestamps of one event, `t_b −
+//! t_a`, so that `lag = offset_a − offset_b`. [`sound`] and [`epipolar`] measure lags, [`motion`] guesses them, and
+//! [`graph`] computes offsets and drops lags that contradict the rest. Undetermined offsets are refused with a
+//! [`Refusal`] and never averaged in.
 
 pub mod epipolar;
 mod fft;

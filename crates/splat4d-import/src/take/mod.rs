@@ -1,8 +1,8 @@
-//! From videos to a capture: frames, a common clock, poses and points, in one folder that training takes.
+//! The whole import, from videos to a capture folder.
 //!
-//! Sound comes first, for it needs no pictures; then frames of the part that all cameras share are stored; motion guesses the
-//! clocks that sound leaves open; clocks and poses are solved in turn until both rest. What was found stands in
-//! [`corrections::FILE`], where it can be corrected and the same work run again.
+//! Sound comes first because it needs no images. Then frames of the shared time span are stored, motion guesses the
+//! offsets that sound leaves open, and offsets and poses are solved in turn until both converge. Results are stored in
+//! [`corrections::FILE`], where they can be corrected before the next run.
 
 mod cache;
 mod clocks;

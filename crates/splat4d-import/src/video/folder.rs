@@ -25,7 +25,9 @@ impl Folder {
     /// Errors: no pictures, a frame rate that is none, a damaged first picture.
     pub fn open(path: &Path, fps: f64) -> Result<Self> {
         if !RATES.contains(&fps) {
-            return Err(Error::input(format!("{fps} is no frame rate")).at(path.display()).remedy("30, for example."));
+            return Err(Error::input(format!("invalid frame rate {fps}"))
+                .at(path.display())
+                .remedy("30, for example."));
         }
         let entries =
             std::fs::read_dir(path).map_err(|e| Error::io("the folder cannot be read", e).at(path.display()))?;

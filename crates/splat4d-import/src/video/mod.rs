@@ -1,8 +1,8 @@
-//! Pictures with their times: videos through the ffmpeg program, folders of pictures, motion JPEG without any program.
+//! Images with timestamps: videos through the ffmpeg program, folders of images, motion JPEG without any program.
 //!
-//! A [`Source`] tells what it holds ([`Info`]) and gives its frames one by one, each with the time stamp that it has in the
-//! file: frame rates vary and frames get lost, so that a frame's number is no clock. What comes is upright, in square pixels
-//! and in sRGB; one frame is in memory at a time.
+//! A [`Source`] describes its content ([`Info`]) and returns its frames one by one with their timestamps in the file:
+//! frame rates vary and frames get lost, so frame numbers are not times. Frames are upright, have square pixels and are
+//! in sRGB; one frame is in memory at a time.
 
 mod avi;
 mod chapters;
@@ -61,7 +61,10 @@ impl Selection {
         }
         for second in [self.from, self.to].into_iter().flatten() {
             if !second.is_finite() || second < 0.0 {
-                return bad(format!("{second} is no second of a video"), "Give seconds from its beginning, 3.2 or so.");
+                return bad(
+                    format!("invalid second of a video: {second}"),
+                    "Give seconds from its beginning, 3.2 or so.",
+                );
             }
         }
         if let (Some(from), Some(to)) = (self.from, self.to)

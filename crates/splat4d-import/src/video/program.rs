@@ -97,7 +97,7 @@ impl Tools {
             // The last line says that it did not work, the one before why.
             let lines: Vec<String> = said.lines().map(|l| plain(l, path)).filter(|l| !l.is_empty()).collect();
             let last = lines[lines.len().saturating_sub(2)..].join("; ");
-            let what = format!("it is no video that ffmpeg can read, or damaged ({last})");
+            let what = format!("ffmpeg cannot read it as a video, or it is damaged ({last})");
             return Err(Error::input(what)
                 .at(path.display())
                 .remedy("Play it; if it plays, convert it to mp4, else copy it again from the camera."));

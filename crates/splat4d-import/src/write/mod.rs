@@ -1,7 +1,7 @@
-//! The capture that comes out: pictures of all cameras with their times, and `capture.json` (docs/capture-format.md).
+//! Writes the capture: images of all cameras with their times, and `capture.json` (docs/capture-format.md).
 //!
-//! Pictures come first, because poses are found in them. A folder that was left half way is gone on with: every file is
-//! written under another name and renamed, and [`pictures`] notes beside them what they were made of.
+//! Images come first because poses are found in them. An interrupted folder is continued: every file is written under
+//! another name and renamed, and [`pictures`] records their source.
 
 mod capture;
 mod masks;

@@ -259,7 +259,7 @@ fn lines(text: &str) -> impl Iterator<Item = (usize, &str)> {
 
 fn word<'a, T: std::str::FromStr>(words: &mut impl Iterator<Item = &'a str>, line: usize, what: &str) -> Result<T> {
     let text = words.next().ok_or_else(|| Error::input(format!("line {line} ends before the {what}")))?;
-    text.parse().map_err(|_| Error::input(format!("line {line}: \"{text:.40}\" is no {what}")))
+    text.parse().map_err(|_| Error::input(format!("line {line}: expected the {what}, found \"{text:.40}\"")))
 }
 
 fn numbers<'a, const N: usize>(words: &mut impl Iterator<Item = &'a str>, line: usize, what: &str) -> Result<[f64; N]> {

@@ -116,7 +116,7 @@ fn decode_flo(path: &Path, camera: &Camera) -> Result<Vec<Code>> {
         return Err(bad("the .flo file is cut short".into()));
     };
     if f32::from_le_bytes(mark) != FLO_MARK {
-        return Err(bad("this is no .flo file: it does not begin with 202021.25".into()));
+        return Err(bad("not a .flo file: it does not start with 202021.25".into()));
     }
     let [width, height] = [width, height].map(|side| i32::from_le_bytes(side).max(0) as usize);
     picture::check_beside(path, "flow", (width, height), camera)?;

@@ -129,7 +129,7 @@ impl<'a> Node<'a> {
             let mut values = [0.0; N];
             for (slot, value) in values.iter_mut().zip(row) {
                 *slot = value.as_f64().filter(|x| x.is_finite()).ok_or_else(|| {
-                    self.error("the matrix holds a value that is no finite number")
+                    self.error("the matrix contains a value that is not finite")
                         .remedy("Calibrate that camera again or leave it out.")
                 })?;
             }

@@ -1,10 +1,9 @@
-//! Posed captures: where the pictures lie, which camera took each and when; and the pictures themselves, out of memory
-//! until they are asked for.
+//! Captures with poses: files, cameras and times of all images, and the images themselves, decoded on demand.
 //!
-//! [`Capture::open`] finds out which of the known layouts a folder has, reads poses and times, checks them and brings
-//! them to one form: pinhole cameras with OpenCV axes, seconds, and one held-out split. No pixel is kept; an
-//! [`ImageStore`] decodes on demand within a byte budget. Every reader produces a `Take` (what the files say) and
-//! `assemble` alone turns takes into captures, so that all layouts are checked alike.
+//! [`Capture::open`] identifies the layout of a folder, reads poses and times, checks them and converts them to one
+//! form: pinhole cameras with OpenCV axes, seconds, and one held-out split. An [`ImageStore`] decodes images on demand
+//! within a byte budget. Every reader produces a `Take` (the content of the files); `assemble` alone turns takes into
+//! captures, so all layouts are checked alike.
 
 mod account;
 mod assemble;

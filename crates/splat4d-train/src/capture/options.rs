@@ -35,7 +35,7 @@ impl FromStr for HoldOut {
             }
             Some(("every", n)) => match n.parse() {
                 Ok(n) if n >= 2 => Ok(Self::Every(n)),
-                _ => Err(bad(format!("every={n} is no whole number of at least 2"))),
+                _ => Err(bad(format!("invalid every={n}: expected a whole number of at least 2"))),
             },
             _ => Err(bad(format!("\"{text}\" is not understood"))),
         }
@@ -133,43 +133,43 @@ choices! {
 }
 
 settings! {
-    /// The capture: what of it is read, and how.
+    /// What is read of the capture, and how.
     pub struct CaptureSettings {
         /// Images are reduced by this factor (mean of k×k boxes).
         downscale: usize = 1 => at_least(1);
-        /// Held-out views: empty (the data set's own convention), "camera=0,10", "every=8" or "none".
+        /// Held-out views: empty (the data set's convention), "camera=0,10", "every=8" or "none".
         hold_out: Option<HoldOut> = None;
-        /// Frames a second; 0: as the capture says.
+        /// Frames per second; 0: as the capture states.
         fps: f64 = 0.0 => any().unit("frames/s");
-        /// Pictures that state no times: photos of one moment, frames of a video, or auto: as their names tell.
+        /// Images without times: photos (of one time), video (frames of a video), or auto (by their names).
         sequence: Sequence = Sequence::Auto;
-        /// Where optical flow is from: files (the capture's own) or own (followed from picture to picture where it brings
-        /// none, and kept beside the run).
+        /// Source of optical flow: files (of the capture) or own (computed where the capture has none, and stored with
+        /// the run).
         flow: FlowSource = FlowSource::Files => any().when(On("loss.flow"));
-        /// Only this many frames of the take; 0: all.
+        /// Number of frames of the capture to use; 0: all.
         max_frames: usize = 0 => any().unit("frames");
-        /// How near to a camera Gaussians are drawn, of the extent; less where the capture's points come nearer, a
-        /// quarter of it where there are none.
+        /// Near distance of cameras, of the extent; less if the capture's points are nearer, a quarter of it without
+        /// points.
         near: f64 = NEAR => below_one().unit("extents");
-        /// Share of the used part of the clip that training may see; what comes later only scores predictions. 1: all.
+        /// Share of the clip that training sees; later frames only score forecasts. 1: all.
         observe: f64 = 1.0 => share();
-        /// Folder of images, in place of the one that the capture names, such as "images_4"; empty: the capture's.
+        /// Folder of images instead of the capture's, such as "images_4"; empty: the capture's.
         images: Text = Text::default();
-        /// What poses are written as where it is not what the layout states: opencv or opengl (camera axes), inverse,
-        /// transposed or xyzw (quaternions), joined by +; empty: as the layout states.
+        /// Convention of poses if it differs from the layout's: opencv or opengl (camera axes), inverse, transposed or
+        /// xyzw (quaternions), joined by +; empty: the layout's.
         poses: Poses = Poses::STATED;
-        /// Pixels that poses describe where images have an EXIF orientation: stored, upright, or auto (as stored for
+        /// Pixels that poses describe if images have an EXIF orientation: stored, upright, or auto (as stored for
         /// COLMAP, else by the sizes).
         exif: Exif = Exif::Auto;
-        /// What times count: seconds, fractions (of the capture), frames, or auto (by their range, steps and names).
+        /// Unit of times: seconds, fractions (of the capture), frames, or auto (by their range, steps and names).
         times: Times = Times::Auto;
-        /// Images without a pose whose camera has one: share it, leave them out, or auto (by names).
+        /// Images without a pose whose camera has one: share (the pose), leave (out), or auto (by names).
         unregistered: Unregistered = Unregistered::Auto;
-        /// Share of the images that may be missing; they are skipped.
+        /// Largest share of missing images; they are skipped.
         max_missing: f64 = MAX_MISSING => share();
-        /// First frame of the take that is used.
+        /// First frame of the capture to use.
         first_frame: usize = 0 => any().unit("frames");
-        /// RGBA captures composite on white; false: on black.
+        /// RGBA images are composited on white; false: on black.
         white_background: bool = true;
     }
 }

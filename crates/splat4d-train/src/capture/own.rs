@@ -446,7 +446,7 @@ impl Files {
             return Ok(Self::List(node.list()?.iter().map(|n| n.text().map(str::to_string)).collect::<Result<_>>()?));
         };
         let bad = || {
-            node.error(format!("\"{text:.200}\" is no file pattern")).remedy(
+            node.error(format!("invalid file pattern \"{text:.200}\"")).remedy(
                 "Write the frame number as %d or, padded with zeros, %04d; for example \"images/cam00/%04d.png\".",
             )
         };

@@ -30,7 +30,7 @@ pub(super) fn checked(pose: Se3) -> Result<Se3> {
     }
     let shear = pose.orthogonality_error();
     if shear > MAX_SHEAR {
-        return Err(Error::input(format!("the pose is no rigid motion (its rotation is off by {shear:.3})"))
+        return Err(Error::input(format!("invalid pose: not a rigid motion (its rotation is off by {shear:.3})"))
             .remedy("Remove scale and shear from the matrix, and write it row by row with at least four decimals."));
     }
     Ok(Se3 { rotation: nearest_rotation(pose.rotation), ..pose })
@@ -87,7 +87,7 @@ mod tests {
         assert!(checked(mirrored).unwrap_err().to_string().contains("mirrored"));
         let mut scaled = good;
         scaled.rotation.iter_mut().flatten().for_each(|x| *x *= 2.0);
-        assert!(checked(scaled).unwrap_err().to_string().contains("no rigid motion"));
+        assert!(checked(scaled).unwrap_err().to_string().contains("not a rigid motion"));
         let mut nan = good;
         nan.translation[1] = f64::NAN;
         assert!(checked(nan).unwrap_err().to_string().contains("NaN"));

@@ -141,7 +141,7 @@ fn arrays(bytes: &[u8]) -> Result<Vec<Row>> {
     for k in (0..frames * points).filter(|&k| seen[k] > 0.5) {
         let place = [places[2 * k], places[2 * k + 1]];
         if place.iter().any(|x| !x.is_finite()) {
-            return Err(Error::input("the place of a visible point is no number")
+            return Err(Error::input("the position of a visible point is not finite")
                 .at(format!("point {}, frame {}", k % points, k / points))
                 .remedy("Mark it as not visible"));
         }

@@ -1,12 +1,13 @@
-//! Compression: a trained scene loses the Gaussians that matter least, becomes a playback file, and learns on as that file.
+//! Compression: a trained scene loses its least important Gaussians, becomes a playback file, and is fine-tuned as that
+//! file.
 //!
 //! 1. Rounds of pruning in floats, each followed by fine-tuning with the model's own losses (4DGS-1K, Yuan et al. 2025).
-//! 2. The scene is baked and written, and what a reader makes of it takes its place: a layer a page, rows in the file's
-//!    order, whatever model it came from. Masks say which of them the training views show around which key time.
-//! 3. Fine-tuning through the file's codes: pictures show what a reader would see, gradients go to the numbers behind them
-//!    (straight-through). What is written at the end is, bit for bit, what was shown.
+//! 2. The scene is baked and written, and the decoded file replaces it: a layer per page, rows in the file's order,
+//!    from any model. Masks state which Gaussians the training views show around which key time.
+//! 3. Fine-tuning through the file's codes: renders show the decoded file, gradients go to the values before rounding
+//!    (straight-through). The final file equals the last render's scene, bit for bit.
 //!
-//! It is a run like any other: [`compress`] begins it or continues it, exactly.
+//! It is a run like any other: [`compress`] starts it or continues it exactly.
 
 mod fit;
 pub(crate) mod quantise;

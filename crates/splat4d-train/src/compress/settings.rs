@@ -33,37 +33,39 @@ macro_rules! settings {
 }
 
 settings! {
-    /// Share of the Gaussians that is removed, 0 to 0.98.
+    /// Share of the Gaussians to remove, 0 to 0.98.
     prune: f64 = 0.0,
-    /// In so many rounds, each followed by its part of the fine-tuning.
+    /// Rounds of pruning, each followed by its part of the fine-tuning.
     rounds: usize = 1,
-    /// What of a view counts: share of the picture, change by removal, both, opacity, light-gaussian, pup or speedy.
+    /// Score of a view: share of the image, change by removal, both, opacity, light-gaussian, pup or speedy.
     spatial: String = "change".into(),
-    /// How lives count in the score: instant-abs, literal-signed-clamped, first-derivative, width, active-fraction, none.
+    /// Temporal score: instant-abs, literal-signed-clamped, first-derivative, width, active-fraction, none.
     temporal: String = "instant-abs".into(),
-    /// How spatial and temporal score become one: product, sum or temporal-alone.
+    /// Combination of spatial and temporal score: product, sum or temporal-alone.
     combine: String = "product".into(),
-    /// Whether large Gaussians count a little more.
+    /// Whether large Gaussians have a slightly higher score.
     volume: bool = false,
-    /// Power of the mean share that a Gaussian has of the pixels it touches: above 0, what costs time goes first.
+    /// Exponent of the mean share that a Gaussian has of the pixels it touches: above 0, costly Gaussians are removed
+    /// first.
     cost: f64 = 0.0,
-    /// Scores look at every so many of the training views.
+    /// Every how many training views scores use.
     every: usize = 1,
-    /// Steps of fine-tuning in floats after pruning, all rounds together.
+    /// Total steps of fine-tuning in floats after pruning.
     fine_tune: usize = 0,
-    /// Fine-tuning begins at this share of the training's rates; 0: 0.3 where up to a half is pruned, 1 from four fifths on.
+    /// Share of the training's rates at which fine-tuning starts; 0: 0.3 if up to a half is pruned, 1 from four fifths
+    /// on.
     rates: f64 = 0.0,
-    /// Weight of the mean opacity while fine-tuning: what no view asks for fades, and does not veil views between them.
+    /// Weight of the mean opacity during fine-tuning: Gaussians that no view needs fade and do not veil novel views.
     opacity_reg: f64 = 0.01,
-    /// Whether the scene is quantised at all; false only where a study wants to see the rest by itself.
+    /// Whether the scene is quantised; false only for studies of the other parts.
     codec: bool = true,
     /// Steps of fine-tuning through the quantised scene.
     quantise: usize = 0,
     /// Frames between the key times of the visibility masks; 0: no masks.
     mask_interval: usize = 0,
-    /// Highest degree of the spherical harmonics that is kept.
+    /// Highest degree of the spherical harmonics to keep.
     sh_degree: usize = 3,
-    /// Most entries of the palette.
+    /// Largest number of palette entries.
     palette: usize = WriteConfig::default().palette,
     /// Bits of the codes.
     depths: Depths = Depths::default(),

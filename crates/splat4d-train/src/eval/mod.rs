@@ -1,4 +1,4 @@
-//! Measures how good a render is, and writes it down in the files that 3DGS users know.
+//! Measures renders and writes the scores in the files that 3DGS users know.
 //!
 //! [`score_view`] measures one image, a [`Split`] holds the images of the held-out or the training cameras, and
 //! [`run::evaluate`] writes `results.json` (means) and `per_view.json` in the layout of the 3DGS scripts.

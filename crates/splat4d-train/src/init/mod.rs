@@ -1,5 +1,5 @@
-//! Where Gaussians start: the capture's points, those of its depth maps, the visual hull of the masks, or of what moves, at several moments, or random
-//! points in the volume that the cameras share.
+//! Initial Gaussians: from the capture's points or depth maps, the visual hulls of masks or of dynamic regions at
+//! several times, or random points in the cameras' common volume.
 
 mod depth;
 pub(crate) mod fill;
@@ -93,18 +93,20 @@ impl Seeds {
 }
 
 settings! {
-    /// The first Gaussians.
+    /// Initial Gaussians.
     pub struct InitSettings {
-        /// Where Gaussians start: "auto", "points", "pictures", "hull", "random", or a .ply file.
+        /// Source of initial Gaussians: `auto`, `points`, `pictures` (found in the images), `hull`, `random`, or a .ply
+        /// file.
         source: Source = Source::Auto;
-        /// Initial Gaussians. Points that a capture lacks to so many are laid between its own, along surfaces; the hulls
-        /// of masks and of what moves, and random points, bring as many of their own.
+        /// Number of initial Gaussians. If a capture has fewer points, more are placed between them along surfaces;
+        /// hulls of masks and of dynamic regions, and random points, add as many.
         count: usize = 10_000 => any().when(IsNot("init.source", &["points"]));
         /// Initial opacity.
         opacity: f64 = 0.1 => inside_share();
-        /// Moments at which initial points are spread over the clip; 0: about every 5 frames.
+        /// Number of times at which initial points are placed over the clip; 0: about every 5 frames.
         keyframes: usize = 0;
-        /// Initial life width of moving points, clips; 0: twice the gap between keyframes; of depth maps what covers what moves.
+        /// Initial lifespan width of moving points, clips; 0: twice the gap between keyframes, and from depth maps by
+        /// the coverage of dynamic regions.
         life: f64 = 0.0
             => any().unit("clips").when(Any(&[Is("run.motion", &["spacetime", "native4d"]), Is("life.kind", &["gauss-half", "gauss-one", "interval"])]));
     }

@@ -12,45 +12,45 @@ use splat4d::math::se3::{cross, dot, mat_vec, norm, sub, transpose};
 use splat4d::scene::{Camera, Intrinsics, Table, Time};
 
 settings! {
-    /// Refinement of what the capture says of its cameras: poses and clocks that are corrected while the scene is learnt.
+    /// Refinement of cameras during training: poses, focal lengths and time offsets.
     pub struct RefineSettings {
-        /// Learn a correction of every training camera's pose; one for all frames of a fixed camera. The cameras' mean
-        /// motion and growth stay nothing. Held-out views are measured aligned as well.
+        /// Learn a correction of every training camera's pose, one for all frames of a fixed camera. The cameras' mean
+        /// motion and scale stay fixed. Held-out views are also measured aligned.
         poses: bool = false;
-        /// Find by how much every training camera's clock is early or late: searched first, then learnt; the median of all
-        /// clocks stays. Held-out views are measured aligned as well.
+        /// Find the time offset of every training camera: searched first, then learned; the median of all offsets stays
+        /// fixed. Held-out views are also measured aligned.
         times: bool = false => any().when(IsNot("run.motion", &["still", "tracked"]));
-        /// Learn a correction of every training camera's focal length, as small as pictures allow.
+        /// Learn a correction of every training camera's focal length, with a prior to the stated one.
         focal: bool = false;
-        /// Rate of rotations at first: half a degree is within reach of the 50 views that a camera gets in a short run. Three
-        /// times as much leaves poses as exact (docs/refine.md).
+        /// Rate of rotations at the start; 50 views per camera suffice for half a degree. Three times as much is as
+        /// exact (studies/records/2026-11-26-refine.md).
         rotation_init: f64 = 1e-3 => positive().unit("radians").when(On("refine.poses"));
-        /// Rate of rotations at the end. Lower ones come to rest on the way: 1e-5 left half as much error again (docs/refine.md).
+        /// Rate of rotations at the end. 1e-5 left 1.5 times the error (studies/records/2026-11-26-refine.md).
         rotation_final: f64 = 1e-4 => positive().unit("radians").when(On("refine.poses"));
-        /// Rate of positions at first.
+        /// Rate of positions at the start.
         position_init: f64 = 1e-3 => positive().unit("extents").when(On("refine.poses"));
         /// Rate of positions at the end.
         position_final: f64 = 1e-4 => positive().unit("extents").when(On("refine.poses"));
-        /// Searches of clocks: each compares every camera's pictures with the scene at shifted times. 4 to 20 found clocks
-        /// alike (docs/refine.md).
+        /// Searches of time offsets: each compares every camera's images with the scene at shifted times. 4 to 20 are
+        /// equally exact (studies/records/2026-11-26-refine.md).
         searches: usize = 8 => any().when(On("refine.times"));
-        /// Rate of focal lengths at first, a share of them.
+        /// Rate of focal lengths at the start, relative.
         focal_init: f64 = 1e-3 => positive().when(On("refine.focal"));
         /// Rate of focal lengths at the end.
         focal_final: f64 = 1e-5 => positive().when(On("refine.focal"));
-        /// Rate of clocks at first, after the last search.
+        /// Rate of time offsets at the start, after the last search.
         time_init: f64 = 0.05 => positive().unit("frames").when(On("refine.times"));
-        /// Rate of clocks at the end.
+        /// Rate of time offsets at the end.
         time_final: f64 = 1e-3 => positive().unit("frames").when(On("refine.times"));
-        /// A clock is shifted by at most so much; the first searches look so far.
+        /// Largest time offset, and range of the first searches.
         time_limit: f64 = 4.0 => positive().unit("frames").when(On("refine.times"));
-        /// Share of the run after which poses and focal lengths are learnt: the scene has formed by then.
+        /// Share of the run after which poses and focal lengths are learned.
         poses_from: f64 = 0.1 => share().when(Any(&[On("refine.poses"), On("refine.focal")]));
-        /// Share of the run after which clocks are searched; the searches are spread over what is left up to half of it.
+        /// Share of the run after which time offsets are searched; the searches are spread up to half of the run.
         times_from: f64 = 0.1 => share().when(On("refine.times"));
-        /// Share of the run after which nothing of a camera is learnt any more, so that the scene settles on it.
+        /// Share of the run after which cameras are fixed, so that the scene converges.
         until: f64 = 0.8 => share().when(Any(&[On("refine.poses"), On("refine.focal"), On("refine.times")]));
-        /// Steps by which every held-out camera is aligned before it is measured a second time.
+        /// Steps to align every held-out camera before its second measurement.
         align_steps: usize = 100 => any().unit("iterations").when(Any(&[On("refine.poses"), On("refine.focal"), On("refine.times")]));
     }
 }

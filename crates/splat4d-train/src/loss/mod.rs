@@ -1,4 +1,4 @@
-//! Losses that training minimises: the picture loss and the regularisers, each with its gradient.
+//! Losses that training minimises: the image loss and the regularisers, each with its gradient.
 //!
 //! Every function returns its value and writes or adds its gradient; none keeps state that a result depends on.
 
@@ -27,50 +27,49 @@ settings! {
     pub struct LossSettings {
         /// Share of D-SSIM in the photometric loss.
         dssim: f64 = 0.2 => share();
-        /// How much more the pixels of fixed cameras weigh that differ from their temporal median (after DyNeRF).
+        /// Additional weight of pixels of fixed cameras that differ from their temporal median (after DyNeRF).
         moving: f64 = 1.0 => any().when(IsNot("run.motion", &["still"]));
-        /// Weight of the alpha-mask loss |alpha − mask| where masks cover the whole scene (RGBA captures).
+        /// Weight of the alpha-mask loss |alpha − mask| if masks cover the whole scene (RGBA captures).
         mask: f64 = 0.0;
         /// Weight of the σ-weighted opacity regulariser (FreeTimeGS).
         opacity_life: f64 = 0.0 => any().when(Is("run.motion", &["spacetime", "native4d"]));
-        /// Weight of the velocity smoothness over nearest neighbours, (extents a clip)²; any model that moves.
+        /// Weight of the velocity smoothness over nearest neighbours, (extents per clip)²; any dynamic model.
         velocity: f64 = 0.0 => any().when(IsNot("run.motion", &["still"]));
-        /// Weight of local rigidity over a frame, extents: neighbours keep their offsets (Luiten et al.; they take 4).
+        /// Weight of local rigidity over a frame, extents: neighbours keep their offsets (Luiten et al. use 4).
         rigid: f64 = 0.0 => any().when(IsNot("run.motion", &["still"]));
-        /// Weight of the agreement of Gaussians' turns with their neighbourhood's over a frame (Luiten et al.; they
-        /// take 4).
+        /// Weight of rotations that agree with the neighbourhood's over a frame (Luiten et al. use 4).
         rot: f64 = 0.0 => any().when(IsNot("run.motion", &["still"]));
-        /// Weight of isometry between two instants, extents: neighbours keep their distances (Luiten et al.; they take
-        /// 2).
+        /// Weight of isometry between two times, extents: neighbours keep their distances (Luiten et al. use 2).
         iso: f64 = 0.0 => any().when(IsNot("run.motion", &["still"]));
-        /// Weight of the as-rigid-as-possible energy between two instants, extents² (SC-GS).
+        /// Weight of the as-rigid-as-possible energy between two times, extents² (SC-GS).
         arap: f64 = 0.0 => any().when(IsNot("run.motion", &["still"]));
-        /// Weight of the variance of neighbours' distances over four frames, over itself (SC-GS; 1e-3 there).
+        /// Weight of the relative variance of neighbours' distances over four frames (SC-GS uses 1e-3).
         elastic: f64 = 0.0 => any().when(IsNot("run.motion", &["still"]));
-        /// Weight of the third difference of positions over four frames, extents: against jitter.
+        /// Weight of the third difference of positions over four frames (jerk), extents.
         jerk: f64 = 0.0 => any().when(IsNot("run.motion", &["still"]));
-        /// Weight of the square of the acceleration over three frames, extents² (NSFF; 0.1 there).
+        /// Weight of the squared acceleration over three frames, extents² (NSFF uses 0.1).
         acceleration: f64 = 0.0 => any().when(IsNot("run.motion", &["still"]));
-        /// Weight of the way over a frame, extents: what need not move stays (NSFF's minimal flow; 0.1 there).
+        /// Weight of the displacement over a frame, extents (minimal flow of NSFF, which uses 0.1).
         least_motion: f64 = 0.0 => any().when(IsNot("run.motion", &["still"]));
-        /// Weight of the total variation of the picture's colours.
+        /// Weight of the total variation of the image's colours.
         tv: f64 = 0.0;
         /// Weight of the edge-aware total variation of depth, over its mean.
         depth_tv: f64 = 0.0;
-        /// Weight of the agreement of depth with the splats' shortest axes (2DGS; 0.05 there).
+        /// Weight of the agreement of depth with the splats' shortest axes (2DGS uses 0.05).
         depth_normal: f64 = 0.0;
         /// Weight of the discrepancy of amplitudes and phases of the spectrum, coarse ones first (FreGS).
         frequency: f64 = 0.0;
-        /// Weight of the entropy of the drawn alpha, nats: pixels decide between scene and background.
+        /// Weight of the entropy of the rendered alpha, nats: pixels become scene or background.
         mask_entropy: f64 = 0.0;
-        /// Weight of the entropy of opacities, nats: Gaussians are there or not (SuGaR; 0.1 there).
+        /// Weight of the entropy of opacities, nats: Gaussians become opaque or transparent (SuGaR uses 0.1).
         opacity_entropy: f64 = 0.0;
-        /// Weight of the drawn depth against the capture's depth maps (capture.json: `depth`); falls to a tenth by the end.
+        /// Weight of the rendered depth against the capture's depth maps (capture.json: `depth`); decays to a tenth by
+        /// the end.
         depth: f64 = 0.1;
-        /// Weight of the drawn flow against a known one, shares of the picture's longer side (capture.json: `flow`).
+        /// Weight of the rendered flow against the known one, shares of the image's longer side (capture.json: `flow`).
         flow: f64 = 0.0;
-        /// Weight of the drawn way of tracked points against their tracks, shares of the picture's longer side (capture.json:
-        /// `tracks`).
+        /// Weight of the rendered displacement of tracked points against their tracks, shares of the image's longer
+        /// side (capture.json: `tracks`).
         tracks: f64 = 0.0;
     }
 }

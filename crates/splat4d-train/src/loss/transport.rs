@@ -28,24 +28,24 @@ use splat4d::scene::{Space, Table, Time};
 use std::sync::atomic::{AtomicU64, Ordering};
 
 settings! {
-    /// Settings of the transport losses: distances over time that training keeps small.
+    /// Settings of the transport losses: distances over time that training minimises.
     pub struct TransportSettings
     when (On("transport.metric")) {
-        /// Distances over time that training keeps small: off, linear (means) or wasserstein (Gaussians).
+        /// Distances over time that training minimises: off, linear (means) or wasserstein (Gaussians).
         metric: Option<Metric> = None => any().switch();
         /// Weight of small motion (first order), per squared extent.
         temporal: f64 = 0.0 => any().unit("1/extents²");
         /// Weight of constant velocity (second order), per squared extent.
         second: f64 = 10.0 => any().unit("1/extents²");
-        /// Weight of the distance between what the motion alone says and what the filter makes of it, per squared extent.
+        /// Weight of the distance between the motion's result and the filtered one, per squared extent.
         align: f64 = 0.0 => any().unit("1/extents²").when(All(&[On("transport.metric"), On("filter.fusion")]));
-        /// What shapes count for, against positions.
+        /// Weight of shapes relative to positions.
         covariance: f64 = 100.0;
-        /// Share of the steps that look at three frames.
+        /// Share of the steps that use three frames.
         every: f64 = 0.25 => share();
-        /// Share of a stage after which it begins.
+        /// Share of a stage after which the loss begins.
         start: f64 = 0.2 => share();
-        /// Share of a stage over which it grows to its weight.
+        /// Share of a stage over which the loss reaches its weight.
         ramp: f64 = 0.13 => share();
     }
 }

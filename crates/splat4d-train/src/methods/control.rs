@@ -47,13 +47,13 @@ settings! {
     when (Is("run.motion", &["control", "ssm"])) {
         /// Control nodes at the start.
         nodes: usize = 512 => within(1, MAX_NODES);
-        /// Nodes that pull each Gaussian, 1 to 8.
+        /// Nodes that move each Gaussian, 1 to 8.
         neighbours: usize = 3 => within(1, MAX_NEIGHBOURS);
-        /// Hyper coordinates, by which touching parts that move differently come apart.
+        /// Hyper coordinates, which separate touching parts with different motion.
         hyper: usize = 2;
-        /// Whether every Gaussian learns how far it follows its nodes.
+        /// Whether every Gaussian learns how much it follows its nodes.
         mask: bool = false;
-        /// What drives the nodes: spline, linear, slerp, low-rank or network.
+        /// Model of node trajectories: spline, linear, slerp, low-rank or network.
         trajectory: Trajectory = Trajectory::Spline => any().when(Is("run.motion", &["control"]));
         /// Keys of a trajectory in time; 0: about every 12 frames.
         keys: usize = 0
@@ -93,7 +93,7 @@ settings! {
         hyper_lr: f64 = 1e-4 => any().unit("extents").when(On("control.hyper"));
         /// Rate of motion masks' logits.
         mask_lr: f64 = 0.02 => any().when(On("control.mask"));
-        /// Weight of nodes moving as rigidly as possible.
+        /// Weight of as-rigid-as-possible motion of nodes.
         arap: f64 = 0.0;
         /// Weight of neighbouring nodes keeping their distance.
         elastic: f64 = 0.0;

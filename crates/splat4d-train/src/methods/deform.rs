@@ -58,11 +58,11 @@ settings! {
         width: usize = 128 => any().when(IsNot("deform.trunk", &["mlp"]));
         /// Hidden layers of the small and hash networks.
         layers: usize = 2 => any().when(IsNot("deform.trunk", &["mlp", "hash-linear"]));
-        /// Levels of the positional encoding of places (the published 10 suits mlp).
+        /// Levels of the positional encoding of positions (the published 10 suits mlp).
         x_levels: usize = 4 => any().when(Is("deform.trunk", &["auto", "mlp", "small"]));
         /// Levels of the positional encoding of time (published: 6 with deform_time_net, else 10).
         t_levels: usize = 3 => any().when(Is("deform.trunk", &["auto", "mlp", "small"]));
-        /// Whether time goes through a small network of its own first (published for synthetic scenes).
+        /// Whether time passes through a small network first (published for synthetic scenes).
         time_net: bool = false => any().when(Is("deform.trunk", &["auto", "mlp", "small"]));
         /// Positions move by screw motions (6 degrees of freedom) instead of offsets.
         rigid: bool = false;
@@ -70,9 +70,9 @@ settings! {
         lr_init: f64 = 2e-3;
         /// Rate of networks at the end.
         lr_final: f64 = 1e-4;
-        /// Share of the iterations that fit the cloud alone before networks learn.
+        /// Share of the iterations in which only the Gaussians learn, before the networks do.
         warmup: f64 = 0.05 => share();
-        /// Share of the iterations after which every level of the hash grids learns; 0: all at once.
+        /// Share of the iterations after which every level of the hash grids learns; 0: all from the start.
         unlock: f64 = 0.3 => share().when(Is("deform.trunk", &["auto", "hash", "hash-linear"]));
         /// Annealed smoothing noise on time at the start, frames; it is zero by half the iterations. 0.1 for real
         /// captures with uncertain poses.

@@ -22,28 +22,28 @@ settings! {
     /// Settings of the temporal filter around a motion model.
     pub struct FilterSettings
     when (On("filter.fusion")) {
-        /// How prediction and the motion's answer merge: off, geodesic (a learnt share) or literal (as published).
+        /// Fusion of prediction and the motion's result: off, geodesic (a learned share) or literal (as published).
         fusion: Fusion = Fusion::Off => any().switch();
-        /// How shapes go on: wasserstein (log and exp), euclidean (numbers go straight) or hold (stay).
+        /// Prediction of shapes: wasserstein (log and exp), euclidean (linear) or hold (constant).
         predictor: Predictor = Predictor::Wasserstein
             => any().switch().when(Any(&[On("filter.fusion"), On("transport.metric")]));
-        /// Share of the iterations after which it is switched on.
+        /// Share of the iterations after which the filter is switched on.
         start: f64 = 0.2 => share();
-        /// Share of the iterations after which it is taken off, and the motion learns on alone; 1: it stays to the end.
+        /// Share of the iterations after which the filter is removed and the motion continues to learn; 1: never.
         until: f64 = 1.0 => share();
-        /// Share of the motion's answer that Gaussians start with; the rest is the prediction's.
+        /// Initial share of the motion's result; the rest is the prediction.
         gain: f64 = 0.5 => inside_share();
         /// Rate of the gains' logits.
         lr: f64 = 0.01;
-        /// Frames between the two states that a velocity is taken from.
+        /// Frames between the two states that give a velocity.
         baseline: usize = 1 => within(1, MAX_BASELINE).unit("frames");
-        /// Frames of history that it runs through before every answer; 0: it predicts from the motion's own answers.
+        /// Frames of history that the filter processes for every result; 0: it predicts from the motion's results.
         history: usize = 0 => within(0, MAX_HISTORY).unit("frames");
-        /// Squared Mahalanobis distance at which a prediction is dropped; 0: never.
+        /// Squared Mahalanobis distance above which a prediction is dropped; 0: never.
         gate: f64 = 11.3;
         /// Whether the gradient stops at earlier frames.
         stop_gradient: bool = true;
-        /// Whether the finished scene keeps the filter; else the motion alone is saved, which plays faster.
+        /// Whether the saved scene includes the filter; otherwise only the motion is saved, which plays faster.
         keep: bool = false;
     }
 }

@@ -23,9 +23,9 @@ settings! {
     /// Settings of `hexplane`.
     pub struct HexplaneSettings
     when (Is("run.motion", &["hexplane"])) {
-        /// Steps of the coarse stage, in which nothing moves; 0: iterations/10.
+        /// Steps of the coarse, static stage; 0: iterations/10.
         coarse_iterations: usize = 0 => any().unit("iterations");
-        /// Features a level of the planes; a multiple of 16.
+        /// Features per level of the planes; a multiple of 16.
         plane_channels: usize = 32;
         /// Grid points of a plane along a spatial axis, at multiple 1.
         plane_resolution: usize = 64;
@@ -33,7 +33,7 @@ settings! {
         time_resolution: usize = 0;
         /// Levels of the planes, as multiples of the resolution.
         multires: Vec<usize> = vec![1, 2];
-        /// Steps of the fine stage before each further level is unlocked; 0: all at once.
+        /// Steps of the fine stage before each further level is unlocked; 0: all from the start.
         unlock_interval: usize = 0 => any().unit("iterations");
         /// Width of the networks.
         net_width: usize = 64;
@@ -61,7 +61,7 @@ settings! {
         plane_tv_weight: f64 = 1e-4;
         /// Weight of the squared second differences of the time planes along time.
         time_smoothness_weight: f64 = 0.01;
-        /// Weight of the mean distance of the time planes from 1, where nothing depends on time.
+        /// Weight of the mean distance of the time planes from 1 (1: no dependence on time).
         l1_time_planes: f64 = 1e-4;
         /// Weight of the squared first differences (total variation) of the planes over space.
         plane_variation_weight: f64 = 0.0;

@@ -1,4 +1,4 @@
-//! How motion models are learnt: a [`Program`] a model, which makes the list of [`Stage`]s that the trainer runs.
+//! How motion models are learned: one [`Program`] per model, which makes the list of [`Stage`]s that the trainer runs.
 //!
 //! `splat4d::motion::x` holds a model's mathematics, `methods::x` its stages, rates, losses and what it needs of a capture.
 
@@ -358,7 +358,7 @@ pub fn program(motion: &str) -> Result<Box<dyn Program>> {
         return Ok(make());
     }
     if BUILT_IN.contains(&motion) {
-        return Err(Error::input(format!("`{motion}` is no motion of its own: it wraps another"))
+        return Err(Error::input(format!("`{motion}` cannot be chosen: it wraps another motion model"))
             .remedy("Name the motion to be filtered, and add --set filter=geodesic"));
     }
     Err(Error::input(format!("there is no motion model `{motion}`"))

@@ -20,14 +20,14 @@ settings! {
     /// Settings of `native4d`.
     pub struct Native4dSettings
     when (Is("run.motion", &["native4d"])) {
-        /// Rate at the start of the two quaternions of its rotation: they turn space, and against each other they are
-        /// the velocity (1 is two extents a clip).
+        /// Rate at the start of the two quaternions of the rotation: together they rotate space, their difference is
+        /// the velocity (1 is two extents per clip).
         rotation_lr_init: f64 = 2.5e-3 => positive();
         /// The same at the end.
         rotation_lr_final: f64 = 2.5e-4 => positive();
         /// Blocks of spherical harmonics that change with time as cos(2πn(centre − t)/clip), 0 to 2.
         harmonics: usize = 0 => within(0, MAX_HARMONICS);
-        /// Whether the parts of a split also lie apart in time and live shorter.
+        /// Whether the parts of a split are also separated in time, with shorter lifespans.
         split_time: bool = true;
     }
 }

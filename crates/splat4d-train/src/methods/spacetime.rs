@@ -31,19 +31,19 @@ settings! {
     when (Is("run.motion", &["spacetime"])) {
         /// Order of the motion polynomial, 0 to 3.
         order: usize = 1 => within(0, 3);
-        /// Whether quaternions turn with time.
+        /// Whether rotations change with time.
         rotation_rate: bool = false;
-        /// Life's centre learns from opacity alone (STG).
+        /// The lifespan's centre learns from opacity only (STG).
         detach: bool = false => any().when(IsNot("life.kind", &["infinite"]));
-        /// Rate of velocities at the start, extents a clip.
+        /// Rate of velocities at the start, extents per clip.
         velocity_lr_init: f64 = 0.01 => positive().unit("extents/clip").when(On("spacetime.order"));
-        /// Rate of velocities at the end, extents a clip.
+        /// Rate of velocities at the end, extents per clip.
         velocity_lr_final: f64 = 1.6e-5 => positive().unit("extents/clip").when(On("spacetime.order"));
         /// Rate of quaternion rates, 1/clip.
         rotation_rate_lr: f64 = 1e-3 => any().unit("1/clip").when(On("spacetime.rotation_rate"));
-        /// Features beside the base colour, which a small network turns into colour pixel by pixel: none or full (the
-        /// full model of STG; takes the place of spherical harmonics, so that sh_degree becomes 0). Such scenes are
-        /// drawn by splat4d alone: they have no playback file and no export.
+        /// Features in addition to the base colour, which a small network turns into colour per pixel: none or full
+        /// (the full model of STG; replaces spherical harmonics, sh_degree becomes 0). Such scenes have no playback
+        /// file and no export.
         features: Features = Features::None;
         /// Rate of view features (STG, 30,000 steps: 0.0025).
         view_features_lr: f64 = 0.01 => any().when(On("spacetime.features"));

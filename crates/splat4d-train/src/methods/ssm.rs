@@ -16,11 +16,11 @@ settings! {
     /// Settings of `ssm`, whose nodes are those of `[control]`.
     pub struct SsmSettings
     when (Is("run.motion", &["ssm"])) {
-        /// Ticks of the scan over the clip; 0: one every ten distinct times, 16 to 96.
+        /// Ticks of the scan over the clip; 0: one per ten distinct times, 16 to 96.
         ticks: usize = 0;
         /// Channels.
         width: usize = 32;
-        /// Complex states a channel.
+        /// Complex states per channel.
         states: usize = 8;
         /// Residual blocks.
         blocks: usize = 2;
@@ -28,9 +28,9 @@ settings! {
         mode: Mode = Mode::Bidirectional;
         /// Absolute (poses) or twist (rates of poses, composed from tick to tick).
         output: Output = Output::Absolute;
-        /// None, frames (the model turns with the scene) or vector (and mirrors with it).
+        /// None, frames (equivariant to rotations) or vector (and to reflections).
         equivariance: Equivariance = Equivariance::None;
-        /// Share of the iterations, from the first, in which nothing moves; nodes are placed after it.
+        /// Share of the iterations, from the first, in which the scene is static; nodes are placed after it.
         warm_up: f64 = 0.0 => share();
         /// Rate of the network's maps at the start.
         lr_init: f64 = 5e-4;

@@ -21,17 +21,17 @@ const SH_REST_SLOWDOWN: f64 = 20.0;
 const MOVING: f64 = 2e-4;
 
 settings! {
-    /// Colour of Gaussians and of cameras' pictures.
+    /// Colour of Gaussians and of cameras' images.
     pub struct AppearanceSettings {
         /// Highest degree of the spherical harmonics, 0 to 3.
         sh_degree: usize = 1 => within(0, 3);
         /// Iterations before each further SH degree is unlocked; 0: iterations/10.
         sh_degree_interval: usize = 0 => any().unit("iterations").when(On("appearance.sh_degree"));
-        /// Learn a colour matrix and an offset a camera, where there are several cameras and each is named or has several
-        /// pictures; their mean stays the identity.
+        /// Learn a colour matrix and an offset per camera, if there are several cameras and each is named or has
+        /// several images; their mean stays the identity.
         exposure: bool = true;
-        /// The same for photos of one camera that chose their exposure: colours between them get truer, but for the held-out
-        /// ones' own (docs/suite.md).
+        /// The same for photos with automatic exposure: colours between them become more accurate, except those of
+        /// held-out photos (studies/records/2026-11-26-recipe-trials.md).
         exposure_single: bool = false => any().when(On("appearance.exposure"));
         /// Rate of the exposure (Luiten et al., 10,000 steps: 1e-4).
         exposure_lr: f64 = 1e-3 => any().when(On("appearance.exposure"));
@@ -41,15 +41,15 @@ settings! {
 }
 
 settings! {
-    /// Learning rates of what all Gaussians have.
+    /// Learning rates of parameters that all Gaussians have.
     pub struct RateSettings {
         /// Rate of positions at the start, of the extent.
         position_init: f64 = 2e-3 => positive().unit("extents");
         /// Rate of positions at the end, of the extent.
         position_final: f64 = 5e-5 => positive().unit("extents");
-        /// Rates that are not given two ends (colour, opacity, scale, rotation, life) fall to this share of themselves.
+        /// Share to which rates without a final value (colour, opacity, scale, rotation, lifespan) decay.
         decay: f64 = 1.0 => positive();
-        /// Rate of base colour; the higher SH degrees learn 20 times slower.
+        /// Rate of base colour; higher SH degrees learn 20 times more slowly.
         feature: f64 = 6e-3 => positive();
         /// Rate of opacity logits.
         opacity: f64 = 0.05 => positive();
@@ -61,17 +61,17 @@ settings! {
 }
 
 settings! {
-    /// The envelope of a Gaussian in time.
+    /// The lifespan of a Gaussian (temporal opacity).
     pub struct LifeSettings
     when (Any(&[IsNot("run.motion", &["still", "tracked"]), Is("life.kind", &["gauss-half", "gauss-one", "interval"])])) {
-        /// The life of a Gaussian: auto (spacetime gauss-half; control, ssm, deform-mlp and hexplane before fixed cameras
+        /// Kind of lifespan: auto (spacetime: gauss-half; control, ssm, deform-mlp and hexplane with fixed cameras:
         /// interval; else infinite), infinite, gauss-half, gauss-one, interval.
         kind: Option<LifeKind> = None => any().switch().when(IsNot("run.motion", &["still"]));
-        /// Rate of life centres, clips.
+        /// Rate of lifespan centres, clips.
         center_lr: f64 = 1e-3 => any().unit("clips");
-        /// Rate of log life widths.
+        /// Rate of log lifespan widths.
         width_lr: f64 = 0.02;
-        /// Life widths never fall below this many frames.
+        /// Smallest lifespan width, frames.
         min_frames: f64 = 0.5 => any().unit("frames");
     }
 }

@@ -42,28 +42,29 @@ settings! {
         lr_final: f64 = 4e-4 => any().unit("extents");
         /// Rate of a frame's quaternions.
         rotation_lr: f64 = 6e-3;
-        /// Rate of base colours after frame 0. Colours are shared: frames tracked before change with them.
+        /// Rate of base colours after frame 0. Colours are shared, so earlier frames change too.
         feature_lr: f64 = 0.0;
-        /// Longest step that a Gaussian carries on to the next frame, of the extent.
+        /// Longest step that a Gaussian repeats in the next frame, of the extent.
         velocity_cap: f64 = 0.05 => any().unit("extents");
-        /// Neighbours that each Gaussian is tied to.
+        /// Number of neighbours that each Gaussian is tied to.
         neighbours: usize = 20;
-        /// A neighbour at distance d counts exp(−β d²), β in 1/(scene units)²; 0: 1/median(d²).
+        /// A neighbour at distance d has weight exp(−β d²), β in 1/(scene units)²; 0: 1/median(d²).
         beta: f64 = 0.0 => any().unit("1/units²");
-        /// Weight of neighbours keeping their offsets. A quarter of this and of the next two keeps up with bodies that are fast for
-        /// the frame rate, which the paper's lose; points of slow ones are followed less closely (docs/dynamics.md).
+        /// Weight of neighbours keeping their offsets (rigidity). A quarter of this and of the next two follows bodies
+        /// that are fast for the frame rate, which the published weights lose; slow ones are followed less exactly
+        /// (studies/records/2026-11-26-dynamics.md).
         rigid: f64 = 4.0;
-        /// Weight of neighbours turning alike.
+        /// Weight of neighbours rotating alike.
         rot: f64 = 4.0;
         /// Weight of neighbours keeping frame 0's distances.
         iso: f64 = 2.0;
-        /// Weight of the background staying (with masks).
+        /// Weight of a static background (with masks).
         bg: f64 = 20.0;
-        /// Weight of masks against what Gaussians say of the foreground; 0: all is foreground.
+        /// Weight of masks against the learned foreground; 0: all is foreground.
         seg: f64 = 3.0;
-        /// Weight of colours staying as they were, where they learn.
+        /// Weight of constant colours, if they learn.
         soft_col_cons: f64 = 0.01 => any().when(On("tracked.feature_lr"));
-        /// Weight of the foreground staying above the floor.
+        /// Weight of the foreground above the floor.
         floor: f64 = 2.0 => any().when(On("tracked.floor_height"));
         /// Height of the floor along the scene's up direction, scene units; empty: no floor.
         floor_height: Option<f64> = None => finite().unit("units");

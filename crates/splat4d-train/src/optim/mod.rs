@@ -1,7 +1,7 @@
-//! Adam, sparse over the active set: rows that took no part in a step, and tables that nothing touched, rest (no decay,
+//! Adam, sparse over the active set: rows that took no part in a step, and untouched tables, do not change (no decay,
 //! no update), and the bias correction uses the row's own step count.
 //!
-//! A step reads every active number's gradient once and leaves zero in its place, so that no other pass clears it.
+//! A step reads the gradient of every active value once and zeroes it, so no other pass has to.
 
 mod adam;
 mod noise;

@@ -1,9 +1,9 @@
-//! Files and folders that commands write: nothing of the user's is lost, and no two processes write into one folder.
+//! Files and folders that commands write: no user file is lost, and no two processes write into one folder.
 //!
 //! - [`write`](mod@write): a file appears whole or not at all.
 //! - [`Owner`]: one process at a time writes into a folder. Readers take no part in it.
-//! - [`OutputFolder`]: what a command may find in its folder, which files are its own (it keeps a list), how they are
-//!   replaced, and how an unfinished command is continued.
+//! - [`OutputFolder`]: what a command may find in its folder, the list of its own files, their replacement, and the
+//!   continuation of an unfinished command.
 //!
 //! All of it is kept in the subfolder [`STATE`] of the output folder.
 

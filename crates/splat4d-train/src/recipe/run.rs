@@ -5,27 +5,27 @@ use crate::settings::{Value, among, settings};
 use splat4d::motion::MODELS;
 
 settings! {
-    /// A run: its model, its length, what it may take.
+    /// The run: model, length, memory.
     pub struct RunSettings {
-        /// Motion model: still, spacetime, deform-mlp, hexplane, tracked, native4d, control or ssm; auto: chosen by
-        /// what the capture is.
+        /// Motion model: still, spacetime, deform-mlp, hexplane, tracked, native4d, control or ssm; auto: chosen by the
+        /// capture.
         motion: MotionName = MotionName::of("spacetime");
         /// Seed of every random choice.
         seed: u64 = 0;
-        /// Training steps in all.
+        /// Total training steps.
         iterations: usize = 7000 => at_least(1);
-        /// Changes of the run's length while it went, [step, steps in all]: from that step on, what is left of the
-        /// schedule of `iterations` steps is spread over the steps that are left. `--minutes` writes them.
+        /// Changes of the run's length, [step, total steps]: from that step on, the rest of the schedule of
+        /// `iterations` steps is spread over the remaining steps. `--minutes` writes them.
         replans: Replans = Replans::default();
-        /// Views a step.
+        /// Views per step.
         batch_size: usize = 1 => at_least(1);
-        /// Share of the iterations, from the first, that see pictures at half size.
+        /// Share of the iterations, from the first, that use images at half size.
         half_size_until: f64 = 0.4 => share();
         /// Iterations between checkpoints; 0: iterations/10.
         checkpoint_interval: usize = 0 => any().unit("iterations");
-        /// Bytes of decoded images kept.
+        /// Bytes of decoded images in memory.
         image_memory: u64 = 1 << 30 => any().unit("bytes");
-        /// Bytes that training may take in all; 0: no limit. Checked before the start, then kept by the cap.
+        /// Memory limit of training; 0: no limit. Checked before the start, then enforced by the cap.
         memory_limit: u64 = 0 => any().unit("bytes");
     }
 }

@@ -212,13 +212,13 @@ fn line(key: &str, value: &toml::Value) -> String {
 }
 
 fn wrong(name: &str, value: &toml::Value, need: &str) -> Error {
-    Error::input(format!("knob `{name}` cannot be {value}")).remedy(format!("It must be {need}"))
+    Error::input(format!("setting `{name}` cannot be {value}")).remedy(format!("It must be {need}"))
 }
 
 fn unknown(name: &str) -> Error {
     let keys: Vec<String> = Recipe::knobs().iter().map(Knob::key).collect();
     let known: Vec<&str> = FLAT.iter().map(|(flat, _)| *flat).chain(keys.iter().map(String::as_str)).collect();
     let near = nearest(name, &known);
-    Error::input(format!("`{name}` is not a knob of the recipe"))
+    Error::input(format!("unknown setting `{name}`"))
         .remedy(near.map_or("`splat4d train --help-knobs` lists them".into(), |n| format!("Did you mean `{n}`?")))
 }

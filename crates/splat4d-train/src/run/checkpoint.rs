@@ -233,9 +233,7 @@ fn codec_name(stage: usize) -> String {
 
 fn metadata(file: &SafeTensors<'_>) -> Result<Value> {
     let Some(meta) = file.metadata().get(CHECKPOINT) else {
-        return Err(
-            Error::input("this is no checkpoint").remedy("Give the run's folder: its newest checkpoint is found")
-        );
+        return Err(Error::input("not a checkpoint").remedy("Give the run's folder: its newest checkpoint is found"));
     };
     let meta: Value = serde_json::from_str(meta).map_err(|e| damaged(format!("its metadata is not JSON ({e})")))?;
     match meta["version"].as_u64() {

@@ -38,7 +38,7 @@ pub fn read(run: &Path) -> Result<Option<Value>> {
     };
     let value: Value = serde_json::from_str(&text).map_err(|e| damage(format!("it is not JSON: {e}")))?;
     let sound = value["cameras"].as_array().is_some_and(|rows| rows.iter().all(|row| correction(row).is_some()));
-    if sound { Ok(Some(value)) } else { Err(damage("it is no list of corrections of cameras".into())) }
+    if sound { Ok(Some(value)) } else { Err(damage("invalid list of corrections of cameras".into())) }
 }
 
 /// A row of the list.

@@ -39,16 +39,16 @@ settings! {
     #[derive(Copy)]
     pub struct AdcSettings
     when (Is("densify.strategy", &["adc"])) {
-        /// Whether the centre of a clone's life is drawn anew from the clip (STG).
+        /// Whether the centre of a clone's lifespan is resampled from the clip (STG).
         retime_clones: bool = false;
         /// Mean 2D gradient above which a Gaussian is cloned or split (NDC units).
         grad_threshold: f64 = 2e-4;
         /// Gaussians larger than this share of the extent are split, smaller ones cloned.
         percent_dense: f64 = 0.01 => any().unit("extents");
-        /// Share of densification until the cap may be reached: the cloud grows along a parabola (Mallick et al. 2024) and
-        /// those with the largest gradients come first; 0: as fast as gradients ask for it.
+        /// Share of densification after which the cap may be reached: the number of Gaussians grows along a parabola
+        /// (Mallick et al. 2024), largest gradients first; 0: no limit before the cap.
         full_at: f64 = 0.5 => share();
-        /// A Gaussian that goes further than this within its life is split in time; 0: none is.
+        /// A Gaussian that moves further than this within its lifespan is split in time; 0: never.
         split_in_time: f64 = 1.0 => any().unit("own sizes");
     }
 }

@@ -16,13 +16,13 @@ choices! {
 }
 
 settings! {
-    /// Where Gaussians are added and removed.
+    /// Density control: how Gaussians are added and removed.
     pub struct DensifySettings {
         /// Densification: adc, mcmc or none.
         strategy: Strategy = Strategy::Adc;
-        /// Most Gaussians; 0: follows from the pixels of all distinct views, the steps and the memory, at least 30,000.
+        /// Largest number of Gaussians; 0: from the pixels of all distinct views, the steps and the memory, at least 30,000.
         max_cap: usize = 0;
-        /// Factor on the number of Gaussians that follows from the capture; without effect where `max_cap` is set.
+        /// Factor on the number of Gaussians that follows from the capture; without effect if `max_cap` is set.
         count_scale: f64 = 1.0 => positive();
         /// Iterations between densifications; 0: iterations/60, at least 50.
         interval: usize = 0
@@ -33,7 +33,7 @@ settings! {
         /// Last iteration that densifies; 0: 3/4 of iterations.
         until: usize = 0
             => any().unit("iterations").when(Any(&[On("densify.strategy"), On("relocate.interval"), On("nodes.adapt_interval")]));
-        /// Opacity below which a Gaussian is dead; 0: 0.02 for adc, 0.005 for mcmc.
+        /// Opacity below which a Gaussian is removed; 0: 0.02 for adc, 0.005 for mcmc.
         min_opacity: f64 = 0.0 => share().when(On("densify.strategy"));
     }
 }

@@ -17,14 +17,14 @@ use splat4d::scene::splats::SPLAT_OPACITY;
 use splat4d::scene::{Camera, RowEdit, Rows, Space, Time};
 
 settings! {
-    /// Removal of what hangs before a camera that does not see it.
+    /// Removal of floaters: Gaussians close to a camera that does not see them.
     #[derive(Copy)]
     pub struct FloaterSettings
     when (On("floaters.interval")) {
-        /// Iterations between removals of Gaussians that at most one camera sees and that hang before another one; 0:
+        /// Iterations between removals of Gaussians that at most one camera sees and that are close to another one; 0:
         /// never.
         interval: usize = 100 => any().unit("iterations").switch();
-        /// How near to a camera that does not see it such a Gaussian is, of the median distance at which cameras see.
+        /// Distance below which a Gaussian is close to a camera that does not see it, of the median viewing distance.
         distance: f64 = 0.4 => positive();
     }
 }

@@ -52,12 +52,12 @@ settings! {
     #[derive(Copy)]
     pub struct GuidedSettings
     when (All(&[Is("run.motion", &["spacetime"]), On("guided.from")])) {
-        /// Share of the iterations after which Gaussians are added where pictures are worst, along the rays of their
-        /// worst patches (STG); 0: never.
+        /// Share of the iterations after which Gaussians are added along the rays of the worst image patches (STG); 0:
+        /// never.
         from: f64 = 0.0 => share().switch().when(Is("run.motion", &["spacetime"]));
-        /// Times that this is done, up to the end of densification.
+        /// Number of additions, up to the end of densification.
         times: usize = 3;
-        /// Most Gaussians that each of them adds, a share of those that are there.
+        /// Largest share of Gaussians that each addition creates.
         share: f64 = 0.03 => share();
     }
 }

@@ -21,13 +21,13 @@ settings! {
     #[derive(Copy)]
     pub struct McmcSettings
     when (Is("densify.strategy", &["mcmc"])) {
-        /// Growth a densification, up to the cap.
+        /// Growth per densification, up to the cap.
         growth: f64 = 1.05 => positive();
-        /// Strength of the position noise, for an extent of 4.4 scene units; it falls with its square.
+        /// Strength of the position noise, for an extent of 4.4 scene units; inversely proportional to its square.
         noise_lr: f64 = 5e5;
         /// Weight of the mean opacity.
         opacity_reg: f64 = 0.01;
-        /// Weight of the mean scale, for an extent of 4.4 scene units; it falls with it.
+        /// Weight of the mean scale, for an extent of 4.4 scene units; inversely proportional to it.
         scale_reg: f64 = 0.01;
     }
 }

@@ -25,14 +25,14 @@ pub enum Pair {
 }
 
 settings! {
-    /// What becomes of two Gaussians in one place.
+    /// Merging of Gaussians at one position.
     #[derive(Copy)]
     pub struct MergeSettings
     when (On("merge.pair")) {
-        /// What becomes of two Gaussians in one place: none (both stay), merge (one with the moments of both), prune
-        /// (the fainter one goes).
+        /// Treatment of two Gaussians at one position: none (both stay), merge (one with the moments of both), prune
+        /// (the fainter one is removed).
         pair: Pair = Pair::None => any().switch();
-        /// Iterations between two looks for such pairs; 0: never.
+        /// Iterations between two searches for such pairs; 0: never.
         interval: usize = 500 => any().unit("iterations");
         /// Largest distance of such a pair, of the smaller one's standard deviation.
         distance: f64 = 0.3;

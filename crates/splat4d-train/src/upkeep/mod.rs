@@ -1,9 +1,9 @@
-//! Upkeep: what is done to a learner between steps. Gaussians are added, moved, merged and removed, the nodes that carry
-//! them follow, opacities are lowered, rows are put in order.
+//! Maintenance of a learner between steps: Gaussians are added, moved, merged and removed, control nodes follow,
+//! opacities are lowered, rows are sorted.
 //!
 //! A stage has a list of [`Upkeep`] operations; after every step those that are due run, in the order of [`Order`]. An
-//! operation changes rows through [`Learner::apply`] alone, so that it works for every motion model and every loss hears
-//! of it. A new one is a file here, and a line where a program adds it to a stage.
+//! operation changes rows only through [`Learner::apply`], so it works for every motion model, and losses are notified.
+//! A new one is a file here, and a line where a program adds it to a stage.
 
 pub(crate) mod adc;
 pub(crate) mod densify;

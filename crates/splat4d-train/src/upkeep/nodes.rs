@@ -17,7 +17,7 @@ use splat4d::scene::{Born, GEOMETRY, RowEdit, Space};
 const LEAST_NODES: usize = 4;
 
 settings! {
-    /// Settings of the upkeep of control nodes.
+    /// Settings of the maintenance of control nodes.
     #[derive(Copy)]
     pub struct NodeSettings
     when (Is("run.motion", &["control", "ssm"])) {
@@ -27,7 +27,7 @@ settings! {
         adapt_interval: usize = 0 => any().unit("iterations");
         /// Mean 2D gradient of a node's Gaussians above which it gets a second one (NDC units).
         threshold: f64 = 4e-4 => any().when(On("nodes.adapt_interval"));
-        /// Never more nodes than this.
+        /// Largest number of nodes.
         cap: usize = 1024 => any().when(On("nodes.adapt_interval"));
     }
 }

@@ -21,17 +21,17 @@ impl Choice for Spatial {
 }
 
 settings! {
-    /// Settings of pruning by worth in space and time while training.
+    /// Settings of pruning by importance in space and time during training.
     #[derive(Copy)]
     pub struct PruneSettings
     when (On("prune.interval")) {
-        /// Iterations between prunings by worth in space and time (4DGS-1K), whatever the strategy; 0: never.
+        /// Iterations between prunings by importance in space and time (4DGS-1K), with any strategy; 0: never.
         interval: usize = 0 => any().unit("iterations").switch();
-        /// Share of the Gaussians that each such pruning removes.
+        /// Share of the Gaussians that each pruning removes.
         ratio: f64 = 0.3 => share();
-        /// Training views that each such pruning looks at; never fewer than one at every moment of the capture.
+        /// Training views that each pruning uses; at least one per frame of the capture.
         views: usize = 60;
-        /// What such a pruning goes by: share, change, both, opacity, light-gaussian, pup or speedy.
+        /// Score of the pruning: share, change, both, opacity, light-gaussian, pup or speedy.
         spatial: Spatial = Spatial::Change;
     }
 }

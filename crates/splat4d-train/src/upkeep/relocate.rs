@@ -12,20 +12,19 @@ use crate::recipe::Recipe;
 use crate::settings::settings;
 
 settings! {
-    /// Settings of the relocation of the faintest Gaussians, whatever the strategy.
+    /// Settings of the relocation of the faintest Gaussians, with any strategy.
     #[derive(Copy)]
     pub struct RelocateSettings
     when (On("relocate.interval")) {
-        /// Iterations between relocations of the faintest Gaussians (FreeTimeGS takes 100), whatever the strategy; 0:
-        /// never.
+        /// Iterations between relocations of the faintest Gaussians (FreeTimeGS uses 100), with any strategy; 0: never.
         interval: usize = 0 => any().unit("iterations").switch();
         /// First iteration that relocates; 0: iterations/15.
         from: usize = 0 => any().unit("iterations");
         /// Opacity below which a Gaussian is relocated.
         threshold: f64 = 0.02 => share();
-        /// Most of the Gaussians that are relocated at once, a share.
+        /// Largest share of the Gaussians relocated at once.
         share: f64 = 0.015 => share();
-        /// Share of the 2D gradient (against opacity) in where relocated Gaussians go (FreeTimeGS).
+        /// Weight of the 2D gradient (against opacity) in the choice of targets (FreeTimeGS).
         gradient_share: f64 = 0.5
             => share().switch().when(Any(&[On("relocate.interval"), Is("densify.strategy", &["mcmc"])]));
     }

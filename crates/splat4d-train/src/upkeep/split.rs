@@ -26,13 +26,13 @@ pub(crate) const STILL_COLUMNS: [&str; 5] = ["means", "quats", "log_scales", "op
 pub(crate) const STILL_LAYER: &str = "still";
 
 settings! {
-    /// The split of what stands still into a layer of its own.
+    /// The split of static Gaussians into a separate layer.
     #[derive(Copy)]
     pub struct SplitSettings
     when (On("split.reach")) {
-        /// Gaussians that move less than this become a still layer of their own, of the extent; 0: never.
+        /// Gaussians that move less than this share of the extent become a static layer; 0: never.
         reach: f64 = 0.0 => any().unit("extents").switch().when(IsNot("run.motion", &["still"]));
-        /// When they do, as a share of the last stage.
+        /// Time of the split, as a share of the last stage.
         from: f64 = 0.75 => share();
     }
 }

@@ -1,4 +1,4 @@
-//! Computer vision on posed pictures: points where a capture brings none, and the lengths that follow from them.
+//! Computer vision on posed images: points for captures without any, and the scale that follows from points.
 //!
 //! Everything is measured in pixels, angles and ratios: scenes may be in millimetres or kilometres.
 

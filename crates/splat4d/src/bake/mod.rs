@@ -1,12 +1,12 @@
-//! Bakes a scene for playback: whatever moves it, it becomes kinematic primitives in a tree of time spans.
+//! Bakes a scene of any motion model for playback: kinematic primitives in a tree of time spans.
 //!
-//! Every Gaussian goes to the deepest node that holds all the time in which it can be seen. There a straight line, a
-//! steady turn, one shape, one colour and its own life are fitted to the model's time samples. Where one segment is not
-//! enough, the node is split into its halves, down to single frames, which copy the model and go straight on to the next
-//! frame (key states). Motion that is straight already is copied and not fitted.
+//! Every Gaussian goes to the deepest node that contains the time in which it is visible. There a linear path, a
+//! constant rotation rate, one shape, one colour and its own lifespan are fitted to the model's time samples. If one
+//! segment is not enough, the node is split into halves, down to single frames, which copy the model and continue
+//! linearly to the next frame (key states). Linear motion is copied and not fitted.
 //!
-//! [`Cut`] decides where to split: [`bake`] splits whatever misses by more than a tolerance in pixels. [`Bakery`] knows how
-//! many segments which error of the images costs (`rate.rs`), so that a budget can be kept.
+//! [`Cut`] decides where to split: [`bake`] splits every segment that misses by more than a tolerance in pixels.
+//! [`Bakery`] knows the curve of segments and image error (`rate.rs`), so that a budget can be met.
 //!
 //! The model is sampled in runs of rows, each at all its frames, so that memory does not grow with frames times Gaussians.
 

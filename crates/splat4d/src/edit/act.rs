@@ -155,7 +155,8 @@ fn span(from: f64, to: f64) -> Result<()> {
     if from < to {
         return Ok(());
     }
-    Err(Error::input(format!("from {from} s to {to} s is no span of time")).remedy("`from` comes before `to`"))
+    Err(Error::input(format!("invalid time range: start ({from} s) is not before end ({to} s)"))
+        .remedy("Swap `from` and `to`, or correct them"))
 }
 
 /// The rows for which `which` holds.

@@ -1,8 +1,8 @@
-//! Edits in time: a list of steps that is replayed on a scene, whichever model moves it.
+//! Edits in time: a list of steps that is replayed on a scene of any motion model.
 //!
-//! A [`Step`] is plain data: what is done, and a selection in words ([`Expr`]). [`replay`] runs the steps in order on the scene
-//! as it was trained, so that undoing one is leaving it out, and the same list works on the scene when it was trained anew.
-//! Nothing here reads a path: whoever calls brings cameras, masks and other scenes ([`Context`]).
+//! A [`Step`] is plain data: an operation and a selection as text ([`Expr`]). [`replay`] runs the steps in order on the
+//! trained scene: leaving a step out undoes it, and the same list works after another training. Nothing here reads a
+//! path: the caller provides cameras, masks and other scenes ([`Context`]).
 
 mod act;
 mod clock;

@@ -237,7 +237,7 @@ fn placement(node: &Value) -> Result<Sim3> {
         let t = numbers("translation", 3).unwrap_or(vec![0.0; 3]);
         Sim3 { scale: scale[0], rotation: quat::to_rotation(quat::normalize(q).0), translation: [t[0], t[1], t[2]] }
     };
-    if sim.is_sound() { Ok(sim) } else { Err(unsupported("its placement is no rotation with a scale above zero")) }
+    if sim.is_sound() { Ok(sim) } else { Err(unsupported("its placement is not a rotation with a scale above zero")) }
 }
 
 #[cfg(test)]

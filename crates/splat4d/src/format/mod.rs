@@ -1,8 +1,7 @@
-//! What is on disk: every reader takes bytes and every writer fills an [`std::io::Write`], so that nothing here knows
-//! a path.
+//! File formats: every reader takes bytes and every writer fills an [`std::io::Write`]; paths are unknown here.
 //!
-//! **Readers never panic, hang or allocate more than a small multiple of the bytes they were given**, whatever the
-//! bytes say: counts and lengths are compared with what is really there before anything is allocated.
+//! **Readers never panic, hang or allocate more than a small multiple of their input**: counts and lengths are compared
+//! with the bytes present before anything is allocated.
 
 pub(crate) mod arrays;
 mod bytes;

@@ -275,7 +275,7 @@ fn label_names(meta: &Value) -> Result<Vec<String>> {
     }
     let names: Option<Vec<String>> =
         meta["labels"].as_array().and_then(|l| l.iter().map(|n| n.as_str().map(str::to_owned)).collect());
-    let names = names.ok_or_else(|| broken("`labels` is no list of names".into()))?;
+    let names = names.ok_or_else(|| broken("invalid `labels`: expected a list of names".into()))?;
     scene_labels::check(&names)?;
     Ok(names)
 }
@@ -370,7 +370,7 @@ fn frame(meta: &Value) -> Result<Sim3> {
         translation: numbers(frame, "translation")?,
     };
     if !sim.is_sound() {
-        return Err(broken("its `frame` is no rotation with a scale above zero".into()));
+        return Err(broken("invalid `frame`: expected a rotation with a scale above zero".into()));
     }
     Ok(sim)
 }

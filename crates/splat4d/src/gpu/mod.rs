@@ -1,16 +1,16 @@
 //! The renderer on a GPU (feature `gpu`): the same stages as [`crate::render`] in WGSL, through `wgpu`.
 //!
-//! Stages: project and colour every splat; gather the visible ones; sort them by depth (ties by number, the order that
+//! Stages: project and colour every splat; gather the visible ones; sort them by depth (ties by index, the order that
 //! `render::bin` defines); count, sum and write pairs of tile and splat in that order; sort the pairs stably by tile;
-//! blend 16² tiles. The way back (`back.rs`): a record of sums a pair, the records of each splat added in a fixed order,
-//! the projection's VJP; colours go back on the CPU. Where the loss is L1 and D-SSIM, the picture is compared with its truth
-//! in between (`compare.rs`) and stays on the GPU. Every stage is checked against its CPU twin. The shaders stay inside
-//! WebGPU's default limits. Nothing is ever added atomically but integers, so that the same bits come out every time.
+//! blend 16² tiles. Backward pass (`back.rs`): a record of sums per pair, the records of each splat added in a fixed
+//! order, the projection's VJP; the CPU backpropagates colours. With L1 and D-SSIM, the image is compared with its
+//! truth in between (`compare.rs`) and stays on the GPU. Every stage is checked against its CPU twin. The shaders stay
+//! inside WebGPU's default limits. Only integers are added atomically, so the bits are reproducible.
 //!
-//! Memory is one arena that only grows: a steady scene allocates nothing. How many pairs there are is known only when
-//! they have been counted, so a frame runs with the room of the last one and nobody waits in it; were they more, the
-//! rest of the frame is empty dispatches, and its lists are made again with more room. A picture whose pairs or pixels
-//! would not fit into a binding is drawn in bands of tile rows, which change no bit.
+//! Memory is one arena that only grows: a steady scene allocates nothing. The number of pairs is known only after
+//! counting, so a frame uses the buffer sizes of the previous one without waiting. If there are more pairs, the rest of
+//! the frame consists of empty dispatches, and its lists are made again in larger buffers. An image whose pairs or
+//! pixels do not fit into a binding is rendered in bands of tile rows, which change no bit.
 
 mod back;
 mod buffers;

@@ -1,4 +1,5 @@
-//! A scene is a sum of layers: each a set of Gaussians with one motion model and one kind of life, all splatted together.
+//! A scene is a sum of layers, each a set of Gaussians with one motion model and one kind of lifespan, rendered
+//! together.
 
 mod convert;
 mod cross_fade;

@@ -1,7 +1,8 @@
-//! Motion models: at time t, which splats? A model never sees a pixel; it is a pure function of its parameters.
+//! Motion models: from parameters and a time to splats. A model never sees a pixel; it is a pure function of its
+//! parameters.
 //!
-//! A model has no hidden state. Sequential ones (state space, filters) do their scan in [`Motion::prepare`], add to the
-//! scan's gradient in [`Motion::backward`], and run the reverse scan in [`Motion::finish`]; pointwise ones leave those empty.
+//! A model has no hidden state. Sequential ones (state space, filters) scan in [`Motion::prepare`], add to the scan's
+//! gradient in [`Motion::backward`], and run the reverse scan in [`Motion::finish`]; pointwise ones leave those empty.
 
 pub mod arap;
 pub mod control;

@@ -1,7 +1,7 @@
 //! Learnable functions: perceptrons, positional encodings and hash grids, each with its hand-written backward.
 //!
-//! Weights are `Space::Fixed` tables of one column, so that matrix products read them as they lie. Results are the same
-//! bits for any number of threads: work is cut by sizes alone, and partial gradients are added in a fixed order.
+//! Weights are `Space::Fixed` tables of one column, which matrix products read in place. Results are the same bits for
+//! any number of threads: work is split by sizes alone, and partial gradients are added in a fixed order.
 
 pub(crate) mod encoding;
 pub(crate) mod frames;

@@ -1,17 +1,17 @@
 //! The differentiable renderer: [`Splats`](crate::scene::Splats) and a [`Camera`](crate::scene::Camera) become colour,
-//! alpha, depth and any further channels, and gradients to a picture become gradients to every input and to the camera's
+//! alpha, depth and further channels, and gradients to an image become gradients to every input and to the camera's
 //! pose.
 //!
-//! Four stages, each public with its VJP beside it: [`project`] (Gaussian → screen ellipse and the bins it touches),
-//! [`shade`] (colour along the viewing direction), [`bin`] (sorted lists), [`rasterize`] (blending). [`Renderer`] runs
-//! them over one arena that is reused from step to step. [`oracle`] is the slow f64 definition that they are tested
-//! against. The renderer never sees time.
+//! Four stages, each public with its VJP: [`project`] (Gaussian → screen ellipse and the bins it touches), [`shade`]
+//! (colour along the viewing direction), [`bin`] (sorted lists), [`rasterize`] (blending). [`Renderer`] runs them over
+//! one arena that is reused from step to step. [`oracle`] is the slow f64 definition that they are tested against. The
+//! renderer never sees time.
 //!
 //! The same bits come out for any number of threads: every floating-point sum has a fixed order, and nothing is ever
 //! added atomically.
 //!
-//! A network in [`Splats::head`](crate::scene::Splats::head) makes colours of blended channels (`head.rs`), and its
-//! gradients come with the others.
+//! A network in [`Splats::head`](crate::scene::Splats::head) makes colours of blended channels (`head.rs`), with
+//! gradients.
 
 pub(crate) mod backend;
 pub mod bin;

@@ -1,4 +1,4 @@
-//! Parts of a scene: tables of Gaussians, the instant they are looked at, and the cameras that look.
+//! Parts of a scene: tables of Gaussians, their state at one time, and cameras.
 
 pub mod camera;
 pub mod features;

@@ -173,7 +173,7 @@ fn verdicts(ours: &Ran, folder: &Path) -> Result<Vec<String>> {
     };
     let verdict = |path: &std::path::PathBuf| {
         let theirs: Ran = serde_json::from_str(&files::read_text(path)?)
-            .map_err(|e| Error::input(format!("it is no run of another program: {e}")).at(path.display()))?;
+            .map_err(|e| Error::input(format!("invalid run of another program: {e}")).at(path.display()))?;
         Ok(match apart(ours, &theirs) {
             Some(why) => format!("{}: void, {why}", theirs.program),
             None => format!(

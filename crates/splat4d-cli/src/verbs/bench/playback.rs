@@ -88,7 +88,7 @@ fn cells(rows: &[Played]) -> Vec<Vec<String>> {
         ("as 32-bit floats", &|s| human_bytes(s.float_bytes)),
         ("Mbit/s", &|s| number(s.mbit_per_s, 1)),
         ("PSNR, dB", &|s| number(s.psnr, 2)),
-        ("where things move, dB", &|s| number(s.psnr_dynamic, 2)),
+        ("dynamic regions, dB", &|s| number(s.psnr_dynamic, 2)),
         ("frames/s, end to end", &|s| number(Some(s.fps), 1)),
         ("frames/s, blend alone", &|s| number(Some(s.raster_fps), 1)),
         ("pairs tested, million", &|s| number(Some(1e-6 * s.pairs), 2)),
@@ -145,7 +145,7 @@ mod tests {
         let rows = [row("runs/a", 20.0, Some(31.254)), row("a.s4d", 50.0, None)];
         let text = table(&rows);
         assert!(text.starts_with("800x600") && text.contains("150,000") && text.contains("2.50x"), "{text}");
-        assert!(text.contains("31.25") && !text.contains("where things move"), "{text}");
+        assert!(text.contains("31.25") && !text.contains("dynamic regions"), "{text}");
         assert!(text.lines().all(|l| l.chars().count() == text.lines().next().unwrap().chars().count()), "{text}");
         let page = markdown(&rows);
         assert!(page.lines().all(|l| l.matches('|').count() == 4), "{page}");

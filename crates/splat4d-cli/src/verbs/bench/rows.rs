@@ -70,7 +70,7 @@ pub(super) fn json(rows: &[Row]) -> String {
 pub(super) fn read(path: &Path) -> Result<Vec<Row>> {
     let text = files::read_text(path)?;
     let broken = |what: String| {
-        Error::input(format!("it is no result of `splat4d bench`: {what}"))
+        Error::input(format!("invalid result of `splat4d bench`: {what}"))
             .at(path.display())
             .remedy("Make one with `splat4d bench --save FILE`.")
     };

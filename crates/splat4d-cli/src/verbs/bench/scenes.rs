@@ -23,7 +23,7 @@ const CAMERA_STEP: usize = 7;
 /// Which scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub(super) enum Name {
-    /// 500,000 Gaussians with spherical harmonics of degree 3, standing still, 1280x720
+    /// 500,000 static Gaussians with spherical harmonics of degree 3, 1280x720
     #[value(name = "S")]
     S,
     /// The bundled capture's scene, 30,000 moving Gaussians, 400x400

@@ -1,8 +1,8 @@
-//! Evidence that poses can be right: initial points in front of the cameras and in their images, their colours there,
-//! features of neighbouring images on each other's epipolar lines, and foregrounds that look at one place.
+//! Evidence for poses: initial points in front of the cameras and inside their images, their colours there, features of
+//! neighbouring images on each other's epipolar lines, and foregrounds at one position.
 //!
-//! Each is measured for the poses as they are read, and as they would be in the other conventions that files of the layout
-//! are found in. A finding needs a convention that fits clearly better; nothing else is an alarm.
+//! Each is measured for the poses as read, and as they would be in other conventions of the layout. A finding needs a
+//! convention that fits clearly better; nothing else raises a warning.
 
 mod look;
 mod motion;

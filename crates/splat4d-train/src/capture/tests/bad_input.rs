@@ -103,7 +103,7 @@ fn bad_poses_and_focal_lengths() {
         message(&sample)
     };
     assert_says(&own(|c| c["fx"] = json!(0)), &["camera cam01", "focal length"]);
-    assert_says(&own(|c| c["world_to_camera"][1][2] = json!(null)), &["cam01", "world_to_camera", "no finite number"]);
+    assert_says(&own(|c| c["world_to_camera"][1][2] = json!(null)), &["cam01", "world_to_camera", "not finite"]);
     let mirrored = own(|c| {
         let row = c["world_to_camera"][0].clone();
         c["world_to_camera"][0] = c["world_to_camera"][1].clone();

@@ -241,7 +241,7 @@ fn broken_transforms_say_what_and_where() {
     assert_says(&broken(&|v| v["frames"][3]["fl_y"] = json!(-2)), &["frames[3]", "focal length", "-2"]);
     assert_says(
         &broken(&|v| v["frames"][2]["transform_matrix"][0][3] = json!(null)),
-        &["frames[2].transform_matrix", "no finite number"],
+        &["frames[2].transform_matrix", "not finite"],
     );
     assert_says(&broken(&|v| drop(v.as_object_mut().unwrap().remove("fl_x"))), &["frames[0]", "camera_angle_x"]);
     let sample = samples::photos(9, cam, None);

@@ -1,8 +1,8 @@
-//! Fine-tuning on the numbers of the file: pictures are drawn from what a reader of the file would see, and what learns
-//! are the numbers before they are rounded (straight-through estimation: Bengio et al. 2013).
+//! Fine-tuning through the file's quantisation: images are rendered from the decoded file, and the values before
+//! rounding learn (straight-through estimation: Bengio et al. 2013).
 //!
-//! From the first step of such a stage the scene *is* the file: a layer a page, rows in the file's order. Spherical
-//! harmonics above degree 0 belong to no row: they are entries of a palette, whose gradient is the sum over their rows.
+//! From the first step of such a stage the scene *is* the file: a layer per page, rows in the file's order. Spherical
+//! harmonics above degree 0 are entries of a palette, whose gradient is the sum over their rows.
 
 mod shared;
 mod state;

@@ -1,5 +1,5 @@
-//! Losses on a rendered picture, each an [`ImageTerm`]: photometric, total variation, frequencies, masks, entropy of alpha,
-//! agreement of depth and normals, known depth, flow.
+//! Losses on a rendered image, each an [`ImageTerm`]: photometric, total variation, frequencies, masks, entropy of
+//! alpha, agreement of depth and normals, known depth, flow.
 //!
 //! Each *adds* `weight` times its gradient and returns `weight` times its value, and gives the same bits with any number
 //! of threads. `terms` is the list of those that a recipe asks for.

@@ -1,4 +1,4 @@
-//! The contract of stages, layers and motion models, proven by made-up models: each is trained a few steps by the
+//! The contract of stages, layers and motion models, proven by synthetic models: each is trained a few steps by the
 //! ordinary trainer and checked against f64 finite differences through the whole chain, the oracle as the forward.
 
 mod channels;

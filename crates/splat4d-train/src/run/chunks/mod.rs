@@ -1,10 +1,10 @@
-//! Long takes in chunks: what stands still is learnt once, what moves chunk by chunk, each a run folder of its own, so that
-//! memory does not grow with the take, and any number of workers on one folder may share the work.
+//! Long captures in chunks: the static part is trained once, the dynamic part chunk by chunk, each in its own run
+//! folder. Memory does not grow with the capture, and any number of workers on one folder can share the work.
 //!
-//! Order: the shared layer; then even chunks, which know nothing of each other; then odd ones, which start from both neighbours
-//! and are tied to them where they overlap. A chunk is a function of the capture, the recipe and the files before it, so that
-//! who does which and when changes nothing. Source: methods of overlapping chunks in 4DGaussians' and STG's practice (50 to 60
-//! frames); the cross-fade and the order are ours.
+//! Order: the shared layer; then even chunks, independent of each other; then odd ones, which start from both
+//! neighbours and are tied to them in the overlap. A chunk is a function of the capture, the recipe and the files
+//! before it, so the schedule of workers changes nothing. Source: overlapping chunks in the practice of 4DGaussians and
+//! STG (50 to 60 frames); the cross-fade and the order are ours.
 
 mod budget;
 mod join;
@@ -58,15 +58,15 @@ const SCENE: &str = "scene.safetensors";
 pub(super) const MADE_BY: &str = "train --chunk";
 
 settings! {
-    /// Long takes in chunks.
+    /// Long captures in chunks.
     #[derive(Copy)]
     pub struct ChunkSettings {
-        /// Frames of a chunk: a longer take is learnt chunk by chunk. 0: 60 where fixed cameras film more than 300 frames and
-        /// nothing is asked for that chunks cannot have, else the take is learnt at once. Iterations are those of a chunk.
+        /// Frames per chunk; longer captures train chunk by chunk. 0: 60 if fixed cameras have more than 300 frames and
+        /// the recipe supports chunks, otherwise no chunks. Iterations are those of a chunk.
         frames: usize = 0 => any().unit("frames");
-        /// Frames that neighbouring chunks share, in which they fade into each other; an even number.
+        /// Frames that neighbouring chunks share and in which they cross-fade; an even number.
         overlap: usize = 16 => any().unit("frames");
-        /// Weight of the difference (L1) between an odd chunk's pictures and its neighbours' where they overlap.
+        /// Weight of the difference (L1) between an odd chunk's renders and its neighbours' in the overlap.
         consistency: f64 = 2.0;
     }
 }
@@ -149,7 +149,7 @@ impl Chunked {
     pub fn open(run: &Path) -> Result<Self> {
         let path = run.join(FOLDER).join(PLAN);
         let plan: ChunkPlan = serde_json::from_str(&read_text(&path)?)
-            .map_err(|e| Error::input(format!("it is no plan of chunks: {e}")).at(path.display()))?;
+            .map_err(|e| Error::input(format!("invalid plan of chunks: {e}")).at(path.display()))?;
         plan.check().map_err(|e| e.at(path.display()))?;
         let file = run.join("recipe.toml");
         let recipe = Recipe::from_toml(&read_text(&file)?).map_err(|e| e.at(file.display()))?;

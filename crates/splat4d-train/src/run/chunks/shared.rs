@@ -111,7 +111,7 @@ pub(super) fn read(folder: &Path) -> Result<Shared> {
         if let Some(table) = file.get("exposure") {
             let rows = table.as_f32()?;
             let names: Vec<String> = serde_json::from_slice(&read_file(&folder.join(CAPTURE).join("cameras.json"))?)
-                .map_err(|e| Error::input(format!("it is no list of names: {e}")).at(folder.display()))?;
+                .map_err(|e| Error::input(format!("invalid list of names: {e}")).at(folder.display()))?;
             exposures = names.into_iter().zip(rows.as_chunks::<12>().0.iter().copied()).collect();
             bytes.extend(bytemuck::cast_slice::<f32, u8>(&rows));
         }

@@ -1,7 +1,7 @@
-//! Worth: which Gaussians are worth keeping ([`score()`], [`prune`]) and which are worth drawing when (`key_masks`).
+//! Importance of Gaussians: which to keep ([`score()`], [`prune`]) and which to render when (`key_masks`).
 //!
-//! After 4DGS-1K (Yuan et al. 2025), for every layer whatever its motion model: a Gaussian's worth is what it adds to
-//! the training pictures, and what is known of its life. Nothing is learnt here; a scene recovers by further training.
+//! After 4DGS-1K (Yuan et al. 2025), for layers of any motion model: the importance of a Gaussian is its effect on the
+//! training images, combined with its lifespan. Nothing is learned here; a scene recovers by further training.
 
 mod masks;
 mod score;

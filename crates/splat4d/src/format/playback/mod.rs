@@ -1,8 +1,8 @@
-//! The playback file `.s4d`: a moving scene, small, readable in parts, checked. docs/format.md is its specification.
+//! The playback file `.s4d`: a dynamic scene, small, readable in parts, checked. docs/format.md is its specification.
 //!
-//! [`write()`] takes a [`Draft`] (floats, sorted into time spans by whoever bakes it), orders, quantises and packs it.
-//! [`Index::parse`] understands the start of a file, `decode_page` and [`decode_palette`] any section of it by itself,
-//! and [`read()`] a whole file as a scene of one layer a page.
+//! [`write()`] takes a [`Draft`] (floats, sorted into time spans by the baker), orders, quantises and packs it.
+//! [`Index::parse`] reads the start of a file, `decode_page` and [`decode_palette`] any section by itself, and
+//! [`read()`] a whole file as a scene of one layer per page.
 
 mod block;
 mod cluster;

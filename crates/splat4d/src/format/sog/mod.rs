@@ -1,7 +1,7 @@
-//! SOG version 2 (PlayCanvas), read: Gaussians as lossless WebP pictures, in a zip file or in a folder.
+//! SOG version 2 (PlayCanvas), read: Gaussians as lossless WebP images, in a zip file or in a folder.
 //!
-//! `meta.json` has `version` 2, `count` and for each group the picture's `files` and a range or a codebook. Pixel i of a
-//! picture belongs to Gaussian i. means_l, means_u: low and high bytes of 16 bits between mins and maxs of
+//! `meta.json` has `version` 2, `count` and for each group the image's `files` and a range or a codebook. Pixel i of a
+//! image belongs to Gaussian i. means_l, means_u: low and high bytes of 16 bits between mins and maxs of
 //! sign(x)·ln(1 + |x|). quats: three parts (b/255·2 − 1)/√2, the fourth byte 252 + index of the largest of (w, x, y, z).
 //! scales: three codes of a codebook of 256 log scales. sh0: three codes of a codebook of f_dc, and opacity. shN: labels of
 //! 16 bits; label l has its coefficients at row l/64, columns (l mod 64)·K on of the centroids, codes of a codebook.

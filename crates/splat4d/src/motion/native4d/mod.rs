@@ -1,11 +1,13 @@
 //! `native4d`: Gaussians of space and time, sliced at t (Yang et al. 2024, "Real-time 4DGS").
 //!
-//! A Gaussian has a mean (μ, μ_t), scales in space and time and a rotation of four dimensions, a pair of quaternions:
-//! X ↦ l X r̄ (`quats` holds l). Its slice at t is an ordinary Gaussian that moves at constant velocity; its opacity is
-//! o·exp(−½(t − μ_t)²/Σ_tt): the model has a life of its own, which [`Motion::life`] shows. Two quaternions that are equal
-//! turn space alone: it then stands still. See `slice` for the mathematics, [`crate::layers::to_spacetime`] for the same motion in other numbers.
+//! A Gaussian has a mean (μ, μ_t), scales in space and time and a rotation of four dimensions, a pair of quaternions: X
+//! ↦ l X r̄ (`quats` holds l). Its slice at t is an ordinary Gaussian that moves at constant velocity; its opacity is
+//! o·exp(−½(t − μ_t)²/Σ_tt): the model has its own lifespan, which [`Motion::life`] returns. Two equal quaternions
+//! rotate only space: the Gaussian is then static. See `slice` for the mathematics, [`crate::layers::to_spacetime`] for
+//! the same motion in another parametrisation.
 //!
-//! Colour may change with time: block n of the spherical harmonics counts cos(2πn(μ_t − t)/T) (the same source, §4.2).
+//! Colour may change with time: block n of the spherical harmonics has the factor cos(2πn(μ_t − t)/T) (the same source,
+//! §4.2).
 
 mod slice;
 mod sliced;

@@ -1,4 +1,4 @@
-//! Scores, pruning and masks on made-up scenes, and on the bundled capture.
+//! Scores, pruning and masks on synthetic scenes, and on the bundled capture.
 
 mod flicker;
 mod scores;
