@@ -203,7 +203,7 @@ impl Console {
                 "step {iteration} was not finite ({what}); training went back to step {to} and continues with \
                  smaller steps"
             )),
-            Event::Finished { iteration, seconds, gaussians, peak_memory } => {
+            Event::Finished { iteration, seconds, gaussians, peak_memory, advice } => {
                 self.clear();
                 let memory = match peak_memory {
                     0 => String::new(),
@@ -215,6 +215,7 @@ impl Console {
                     human_seconds(*seconds),
                     grouped(*gaussians)
                 ));
+                advice.iter().for_each(|advice| self.say(advice));
             }
             _ => {}
         }

@@ -150,5 +150,7 @@ pub enum Event {
         gaussians: usize,
         /// Peak resident memory of the process, bytes; 0 where the system does not tell.
         peak_memory: u64,
+        /// What would improve the result, if the run ended too early or with too few Gaussians.
+        advice: Option<String>,
     },
 }

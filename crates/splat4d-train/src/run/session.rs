@@ -366,10 +366,9 @@ impl Session<'_> {
             for message in priors::after(self.opened, &trainer.shown(), self.recipe)? {
                 listen(&Event::Warning { message });
             }
-            if let Some(message) = under_fitted(gaussians, self.recipe.densify.max_cap, psnr(state.smooth[1])) {
-                listen(&Event::Warning { message });
-            }
-            listen(&Event::Finished { iteration, seconds: state.seconds, gaussians, peak_memory: peak_memory() });
+            let advice = under_fitted(gaussians, self.recipe.densify.max_cap, psnr(state.smooth[1]));
+            let (seconds, peak_memory) = (state.seconds, peak_memory());
+            listen(&Event::Finished { iteration, seconds, gaussians, peak_memory, advice });
         }
         Ok(Outcome { run: self.run.to_owned(), iteration, gaussians, seconds: state.seconds, interrupted: !done })
     }
