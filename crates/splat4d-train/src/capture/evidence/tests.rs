@@ -176,10 +176,10 @@ fn named(capture: &Capture, conventions: &[Convention]) -> (usize, usize) {
 
 /// A film of the scene by one camera that moves; `speed`: the ball turns by so many radians from frame to frame.
 fn film(speed: f64) -> (Sample, Capture) {
-    const FRAMES: usize = 24;
+    const FRAMES: usize = 13;
     let sample = Sample::new(&["transforms.json"]);
     let pose = |i: usize| {
-        let angle = (2.0 * i as f64).to_radians();
+        let angle = (4.0 * i as f64).to_radians();
         Se3::look_at([4.0 * angle.cos(), 4.0 * angle.sin(), 1.5], [0.1, 0.0, -0.2], [0.0, 0.0, 1.0])
     };
     let mut frames = Vec::new();
