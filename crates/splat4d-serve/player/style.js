@@ -147,12 +147,16 @@ kbd{font:inherit;font-size:.88em;background:var(--raised);border:1px solid var(-
 @keyframes spin{to{transform:rotate(1turn)}}
 .toast{position:absolute;left:50%;top:clamp(8px,1.2em,28px);transform:translateX(-50%);padding:.45em 1.1em;
  pointer-events:none;opacity:0;transition:opacity .2s;max-width:calc(100% - 2em);z-index:3;text-align:center}
-.toast.on{opacity:1}
+.toast.on,.hint.on{opacity:1}
+.hint{position:absolute;left:0;right:0;bottom:7.2em;margin:auto;width:fit-content;max-width:calc(100% - 2em);padding:.5em 1.1em;
+ pointer-events:none;opacity:0;transition:opacity .4s;text-align:center;border-radius:2em}
 .field.narrow,.wrap.narrow{display:none}
 @container (max-width:760px){.wide{display:none!important}.field.narrow,.wrap.narrow{display:flex}
  .panel{width:100%;max-height:60cqh}
  .tool{width:2.85em;height:2.85em}}
-@container (max-width:420px){.time .of{display:none}.stats{font-size:.8em}}
+@container (max-width:420px){.tool{width:2.6em}.stats{font-size:.8em}.time{padding:0 .2em}.speed{width:3.5em;padding:0 0 0 .2em}}
+@container (max-width:379px){.speed{display:none!important}}
+@container (max-width:340px){.time .of{display:none}}
 @container (max-width:1000px){.roomy{display:none!important}}
 @container (min-width:1001px){.panel .cramped{display:none}}
 @container (max-height:300px){.panel{max-height:calc(100cqh - 5.6em)}.live canvas{display:none}}

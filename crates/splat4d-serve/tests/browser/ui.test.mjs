@@ -360,7 +360,7 @@ test('errors say what, where and what to do; the page recovers', options, async 
 });
 
 test('a narrow window holds everything without scrolling sideways', options, async () => {
-  for (const size of [[360, 640], [640, 360], [320, 568]]) {
+  for (const size of [[390, 844], [360, 640], [640, 360], [320, 568]]) {
     const { page, ask, done } = await open('', { size, hasTouch: true });
     const check = async what => {
       const out = await ask(e => [...e.shadowRoot.querySelectorAll('button, select, .card')]
@@ -383,6 +383,44 @@ test('a narrow window holds everything without scrolling sideways', options, asy
     await check('the help');
     await done();
   }
+});
+
+test('a phone upright sees the subject larger, with duration and speed; the hint comes once', options, async () => {
+  const { page, ask, done } = await open('', { size: [390, 844], hasTouch: true, isMobile: true });
+  const seen = await ask(e => {
+    const p = e.player, shown = name => e.shadowRoot.querySelector(name).checkVisibility();
+    const f = (w, h) => p.camera.view(w, h).fx / w;
+    const out = { tall: f(390, 844), square: f(400, 400), wide: p.camera.view(800, 400).fx / 400, shown: ['.of', '.speed'].map(shown) };
+    const before = p.camera.view(390, 844).fx;
+    p.camera.loosen(390, 844);
+    return { ...out, moved: p.camera.view(390, 844).fx / before, hint: e.shadowRoot.querySelector('.hint.on')?.textContent };
+  });
+  near(seen.tall / seen.square, 4 / 3);
+  near(seen.wide, seen.square);
+  near(seen.moved, 1);
+  assert.deepEqual(seen.shown, [true, true]);
+  assert.match(seen.hint, /Drag to turn/);
+  await page.getByRole('button', { name: 'View and settings' }).click();
+  assert.ok(await page.getByRole('radio', { name: 'Depth' }).isVisible(), 'the channel is in the view panel');
+  await page.touchscreen.tap(200, 200);
+  assert.equal(await ask(e => e.shadowRoot.querySelector('.hint.on')), null, 'a touch ends the hint');
+  await page.reload();
+  await page.waitForFunction(() => document.querySelector('splat-4d')?.player?.state === 'ready');
+  assert.equal(await ask(e => e.shadowRoot.querySelector('.hint.on')), null, 'it was shown before');
+  // The third camera of the capture is shown whole.
+  assert.ok(await ask(e => { e.player.controls.swing = false; e.player.view(2); return e.player.camera.view(390, 844).fx / 900 * 800 <= 390.01; }));
+  await done();
+});
+
+test('a page without the leave to edit fetches no editor', options, async () => {
+  const asked = [];
+  const { page, done } = await open('', {});
+  page.on('request', r => asked.push(r.url()));
+  await page.reload();
+  await page.waitForFunction(() => document.querySelector('splat-4d')?.player?.state === 'ready');
+  assert.ok(asked.length > 10);
+  assert.deepEqual(asked.filter(url => /\/edit/.test(url)), []);
+  await done();
 });
 
 test('controls rest while it plays and come back; reduced motion does not play by itself', options, async () => {
