@@ -509,18 +509,22 @@ test('training is followed: late join, new snapshots, lost connections', options
   const step = i => site.say({ kind: 'step', step: 10 * i, of: 500, psnr: 15 + i / 10, loss: 0.3 - i / 1000,
     gaussians: 9000 + i, left_s: 120 - i });
   site.history = [];
+  site.pages['/scene.s4d'] = 'the bytes of a scene';
   for (let i = 1; i <= 20; i++) step(i);
   site.say({ kind: 'snapshot', version: 7 });
   const config = { title: 'learning', scene: 'scene.s4d', live: true, autoplay: false };
   const { page, ask, done } = await open('', { config, wrong: true });
   const card = page.getByRole('region', { name: 'Training' });
-  await card.getByText('200').waitFor();
+  await card.getByText('200of 500').waitFor();
   const text = await card.innerText();
   for (const part of ['Training', 'of 500 steps', '17.00', '9,020', '2 min left']) {
     assert.ok(text.includes(part), `${part} in ${text}`);
   }
   assert.match(await page.getByRole('img', { name: /PSNR from/ }).getAttribute('aria-label'), /from 15\.1 to 17\.0 dB/);
   const opened = () => page.evaluate(() => globalThis.mockOpened.map(u => new URL(u).search));
+  for (const part of ['PSNR of training views, dB', 'Loss', '17.0', '15.1', '0.299', '0.280', '10', 'steps']) {
+    assert.ok(text.includes(part), `the chart has ${part}: ${text}`);
+  }
   assert.deepEqual(await opened(), ['?v=7'], 'one scene, the newest');
   await ask(e => { e.camera = { position: [2, 1, 3], target: [0, 1, 0] }; e.seek(3); });
   await settle(page);
@@ -534,12 +538,22 @@ test('training is followed: late join, new snapshots, lost connections', options
   site.cut();
   await card.getByText('Reconnecting').waitFor();
   step(21);
-  await card.getByText('210').waitFor({ timeout: 10000 });
+  await card.getByText('210of 500').waitFor({ timeout: 10000 });
   assert.ok(site.joined > joined, 'it came back by itself');
   assert.deepEqual(await opened(), ['?v=7', '?v=8'], 'what is known is not loaded again');
   step(50);
   site.say({ kind: 'done' });
   await card.getByText('Training finished').waitFor();
+  await card.getByRole('button', { name: 'Save the scene' }).waitFor();
+  assert.equal(await ask(e => e.player.file.name), 'bytes', 'the page has the scene itself');
+  // The server may end now: the page asks for nothing more.
+  const [last, answered] = [site.joined, []];
+  page.on('request', r => answered.push(r.url()));
+  site.cut();
+  await page.waitForTimeout(1200);
+  assert.deepEqual([site.joined, answered], [last, []]);
+  const [file] = await Promise.all([page.waitForEvent('download'), card.getByRole('button', { name: 'Save the scene' }).click()]);
+  assert.equal(file.suggestedFilename(), 'scene.s4d');
   await done();
 });
 
