@@ -11,6 +11,29 @@ export interface CameraState {
 
 export type Channel = 'color' | 'depth' | 'alpha' | 'flow';
 
+/** Attributes, as frameworks write them. */
+export interface Splat4DAttributes {
+  src?: string;
+  autoplay?: boolean;
+  /** 'false' plays once. */
+  loop?: 'true' | 'false';
+  time?: number | string;
+  speed?: number | string;
+  /** 'x,y,z tx,ty,tz fov' */
+  camera?: string;
+  channel?: Channel;
+  /** '#rrggbb'; the scene's own where left out. */
+  background?: string;
+  backend?: 'auto' | 'webgpu' | 'webgl2';
+  resolution?: 'auto' | number;
+  controls?: 'none';
+  embed?: boolean;
+  poster?: string;
+  theme?: 'auto' | 'light' | 'dark';
+  heading?: string;
+  page?: boolean;
+}
+
 export interface Splat4DEventMap extends HTMLElementEventMap {
   load: CustomEvent<{ meta: Record<string, unknown>; milliseconds: number }>;
   timeupdate: CustomEvent<{ time: number }>;

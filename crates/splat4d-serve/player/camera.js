@@ -8,6 +8,8 @@ export const NEAR = 0.01;
 const FOV_DEFAULT = 45;
 /** Widest and narrowest picture, degrees: wider is a fisheye's business, narrower shows single Gaussians. */
 export const FOV_RANGE = [5, 120];
+/** In a window taller than the scene was seen, the first view shows this share of its width, so that less of what no camera saw is shown. */
+const TALL_SHARE = 0.75;
 /** Below this a cross product has no direction: eye, target and up are on one line. */
 const PARALLEL = 1e-9;
 
@@ -93,6 +95,8 @@ export class Camera {
   up = [0, 1, 0];
   /** A dataset camera's exact lens ({width, height, fx, fy, cx, cy} px) until the viewer moves. */
   lens = null;
+  /** 1: a first view, which comes nearer in a tall window, until the viewer moves; 0: not; between, on the way to it. */
+  first = 0;
 
   get right() { return quatTurn(this.quat, [1, 0, 0]); }
   get down() { return quatTurn(this.quat, [0, 1, 0]); }
@@ -103,6 +107,7 @@ export class Camera {
 
   set({ position, quat, target, distance, fov, up }) {
     this.lens = null;
+    this.first = 0;
     if (up && norm(up) > PARALLEL) this.up = normalize(up);
     if (position) this.position = position.slice();
     if (quat) this.quat = quatNormal(quat);
@@ -132,6 +137,7 @@ export class Camera {
     c.distance = lerp(a.distance, b.distance, u);
     c.position = add(target, c.forward, -c.distance);
     c.fov = lerp(a.fov, b.fov, u);
+    c.first = lerp(a.first, b.first, u);
     return c;
   }
 
@@ -146,19 +152,23 @@ export class Camera {
     const view = { cameraFromWorld: out, width, height };
     if (this.lens) {
       // All of the dataset camera's picture is shown, centred, with more of the world where the window is wider.
-      const l = this.lens, k = Math.min(width / l.width, height / l.height);
+      const l = this.lens, k = Math.min(width / l.width, height / l.height) * this.#nearer(width / l.width, height / l.height);
       return { ...view, fx: l.fx * k, fy: l.fy * k,
         cx: width / 2 + (l.cx - l.width / 2) * k, cy: height / 2 + (l.cy - l.height / 2) * k };
     }
-    const f = Math.min(width, height) / 2 / Math.tan(this.fov * DEGREE / 2);
+    const f = Math.min(width, height) / 2 / Math.tan(this.fov * DEGREE / 2) * this.#nearer(width, height);
     return { ...view, fx: f, fy: f, cx: width / 2, cy: height / 2 };
   }
 
-  /** Turns an exact lens into a field of view, before a movement. */
+  /** How much larger a first view is where the window is taller than wide, each measured in what was seen. */
+  #nearer(across, down) { return clamp(down / across, 1, 1 / TALL_SHARE) ** this.first; }
+
+  /** Turns an exact lens and a first view into a field of view, before a movement. */
   loosen(width, height) {
-    if (!this.lens) return;
+    if (!this.lens && !this.first) return;
     const { fy } = this.view(width, height);
     this.lens = null;
+    this.first = 0;
     this.fov = clamp(2 * Math.atan(Math.min(width, height) / 2 / fy) / DEGREE, ...FOV_RANGE);
   }
 
@@ -176,7 +186,9 @@ export function bounds(meta) {
 }
 
 /** The first view: the file's own, else its first dataset camera, else the whole box from the front. */
-export function firstCamera(meta) {
+export const firstCamera = meta => Object.assign(viewpoint(meta), { first: 1 });
+
+function viewpoint(meta) {
   const camera = new Camera();
   const { center, radius } = bounds(meta);
   camera.up = normalize(vector(meta?.up) ?? [0, 1, 0]);

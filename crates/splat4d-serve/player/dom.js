@@ -38,7 +38,7 @@ export function segments(label, options, onpick, props = {}) {
   const inputs = new Map();
   const node = h('div', { role: 'radiogroup', 'aria-label': label, ...props, class: `seg ${props.class ?? ''}` },
     ...options.map(([value, text, title]) => {
-      const own = { type: 'radio', name, value, 'aria-label': title ?? text };
+      const own = { type: 'radio', name, value, 'aria-label': text };
       const input = h('input', { ...own, onchange: () => onpick(value) });
       inputs.set(value, input);
       return h('label', { title }, input, h('span', {}, text));

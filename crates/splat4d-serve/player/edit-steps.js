@@ -154,6 +154,17 @@ export const nameOf = step => NAMES[step.do] ?? step.do;
 export const ready = steps => steps.filter(s => s.do !== 'drag' || s.handles.length);
 
 /** What was done, undone and can be done again. */
+const BOX = /\bbox\(([^()]*)\)(?![^]*\bbox\()/;
+/** The last box of a selection in words, {low, high}; null where there is none, or it is not six numbers. */
+export function boxOf(text) {
+  const n = (BOX.exec(text)?.[1] ?? '').split(/[\s,]+/).filter(Boolean).map(Number);
+  if (n.length !== 6 || !n.every(isFinite)) return null;
+  const [a, b] = [n.slice(0, 3), n.slice(3)];
+  return { low: a.map((x, k) => Math.min(x, b[k])), high: a.map((x, k) => Math.max(x, b[k])) };
+}
+/** The words with another box in its place. */
+export const withBox = (text, { low, high }) => text.replace(BOX, `box(${low.map(round)}, ${high.map(round)})`);
+
 export class History {
   #past = [];
   #future = [];

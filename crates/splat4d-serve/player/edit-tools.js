@@ -26,6 +26,8 @@ export class Overlay extends EventTarget {
   /** Places of selected Gaussians, and the similarity that they have been moved by. */
   points = [];
   place = null;
+  /** The box of the selection, {low, high}, whose faces can be pulled. */
+  box = null;
   /** Nodes: where they are, and of them {node, by} pulled and numbers pinned. */
   nodes = [];
   pulled = [];
@@ -116,7 +118,7 @@ export class Overlay extends EventTarget {
   }
 
   #down(e) {
-    if (!this.tool) return;
+    if (!this.tool && !this.box) return;
     const g = this.#gesture;
     if (g) {
       // A second finger moves the camera, and takes the first along.
@@ -130,8 +132,8 @@ export class Overlay extends EventTarget {
     }
     if (e.button !== 0 || e.shiftKey || e.altKey) return;
     const at = this.#at(e), reach = NEAR[e.pointerType] ?? NEAR.mouse;
-    const own = DRAWING.includes(this.tool) ? { kind: 'draw', path: [at] }
-      : this.tool === 'move' ? this.#grip(at, reach) : this.#grab(at, reach);
+    const own = this.#face(at, reach) ?? (!this.tool ? null : DRAWING.includes(this.tool) ? { kind: 'draw', path: [at] }
+      : this.tool === 'move' ? this.#grip(at, reach) : this.#grab(at, reach));
     if (!own) return;
     e.stopImmediatePropagation();
     e.preventDefault();
@@ -229,6 +231,36 @@ export class Overlay extends EventTarget {
     return null;
   }
 
+  /** Middles of the box's faces on the picture: [axis, 'low' or 'high', place, [x, y, depth]]. */
+  #faces() {
+    if (!this.box || ['move', 'bend'].includes(this.tool)) return [];
+    const { low, high } = this.box, view = this.view;
+    return [0, 1, 2].flatMap(k => ['low', 'high'].map(end => {
+      const place = low.map((x, i) => (i === k ? this.box[end][k] : (x + high[i]) / 2));
+      return [k, end, place, this.project(place, view)];
+    })).filter(face => face[3]);
+  }
+
+  #face(at, reach) {
+    const found = this.#faces().filter(face => far(at, face[3]) <= reach).sort((a, b) => a[3][2] - b[3][2])[0];
+    if (!found) return null;
+    const [k, end, place, c] = found, before = this.box, unit = c[2] / this.view.fx;
+    const tip = this.project(add(place, AXES[k], ARROW * unit)), way = tip && [tip[0] - c[0], tip[1] - c[1]];
+    // A face that is seen from straight ahead cannot be pulled along.
+    if (!tip || Math.hypot(...way) < reach) return null;
+    return {
+      kind: 'face', undo: () => { this.box = before; this.#emit('boxing', { box: before }); },
+      follow: ([x, y]) => {
+        const by = ARROW * unit * ((x - at[0]) * way[0] + (y - at[1]) * way[1]) / (way[0] ** 2 + way[1] ** 2);
+        const to = before[end][k] + by, limit = before[end === 'low' ? 'high' : 'low'][k];
+        const put = end === 'low' ? Math.min(to, limit) : Math.max(to, limit);
+        this.box = { ...before, [end]: before[end].map((v, i) => (i === k ? put : v)) };
+        this.#emit('boxing', { box: this.box });
+      },
+      end: () => this.#emit('boxed', { box: this.box }),
+    };
+  }
+
   #grab(at, reach) {
     const view = this.view;
     let best = null;
@@ -267,6 +299,7 @@ export class Overlay extends EventTarget {
     g.clearRect(0, 0, w, h);
     if (this.#picture) g.drawImage(this.#picture, 0, 0, w, h);
     if (this.tool !== 'bend') this.#dots(g);
+    this.#drawBox(g);
     if (this.tool === 'move') this.#drawGizmo(g);
     if (this.tool === 'bend') this.#drawNodes(g);
     this.#drawShape(g);
@@ -285,6 +318,26 @@ export class Overlay extends EventTarget {
     g.fill(halo);
     g.fillStyle = SELECTED;
     g.fill(ink);
+  }
+
+  #drawBox(g) {
+    const faces = this.#faces();
+    if (!faces.length) return;
+    const { low, high } = this.box, view = this.view;
+    const corner = n => this.project(low.map((x, k) => (n >> k & 1 ? high[k] : x)), view);
+    g.beginPath();
+    for (let n = 0; n < 8; n++) {
+      for (let k = 0; k < 3; k++) {
+        const [a, b] = n >> k & 1 ? [] : [corner(n), corner(n | 1 << k)];
+        // An edge that passes the camera is left out.
+        if (a && b) { g.moveTo(a[0], a[1]); g.lineTo(b[0], b[1]); }
+      }
+    }
+    for (const [style, wide] of [['rgba(0,0,0,.5)', 3], ['#fff', 1.2]]) {
+      Object.assign(g, { strokeStyle: style, lineWidth: wide });
+      g.stroke();
+    }
+    for (const [k, , , c] of faces) disc(g, c, 5, COLORS[k]);
   }
 
   #drawGizmo(g) {

@@ -1,8 +1,8 @@
 // Editing: a panel over the player, and what it asks of the program that serves the page. The list of edits is the page's;
 // the program replays it, and only it knows how a scene is changed: nothing here touches a Gaussian.
 
-import { History, combined, easedKey, factorAt, fadedTo, keyed, keysOf, movedTo, nameOf, placeAt, pulledAt, pulledTo, quatOf,
-  ready, round, shiftedKey, turnOf, withKey, withoutKey } from './edit-steps.js';
+import { History, boxOf, combined, easedKey, factorAt, fadedTo, keyed, keysOf, movedTo, nameOf, placeAt, pulledAt, pulledTo, quatOf,
+  ready, round, shiftedKey, turnOf, withBox, withKey, withoutKey } from './edit-steps.js';
 import { Overlay } from './edit-tools.js';
 import { button, choice, clock, field, h, segments, tool } from './dom.js';
 import { clamp } from './camera.js';
@@ -18,8 +18,18 @@ const GRIP = 0.12;
 
 const TOOLS = [['', 'Look'], ['box', 'Box'], ['sphere', 'Sphere'], ['lasso', 'Lasso'], ['color', 'Colour']];
 const HOW = [['new', 'New'], ['add', 'Add'], ['remove', 'Remove'], ['within', 'Within']];
-const WORDS = [['all', 'Everything'], ['size(0.1, 99)', 'Size …'], ['speed(0.1, 99)', 'Speed …'], ['opacity(0, 0.1)', 'Opacity …'],
-  ['life(0, 0.1)', 'Life …'], ['color(1,0,0, 0.2)', 'Colour …'], ['sphere(0,0,0, 1)', 'Sphere …'], ['box(-1,-1,-1, 1,1,1)', 'Box …']];
+const PLAIN = [['size(0.1, 99)', 'Size', 'By size: size(least, most), scene units'],
+  ['speed(0.1, 99)', 'Speed', 'By speed: speed(least, most), scene units a second'],
+  ['life(0, 0.1)', 'Lifespan', 'By lifespan: life(least, most), seconds']];
+const WORDS = [['all', 'Everything'], ['opacity(0, 0.1)', 'Opacity …'], ['color(1,0,0, 0.2)', 'Colour …'], ['sphere(0,0,0, 1)', 'Sphere …'], ['box(-1,-1,-1, 1,1,1)', 'Box …']];
+
+const ACTS = { Delete: 'Take the selection out', 'Keep only': 'Take everything else out', Hide: 'Take it out from now on',
+  Colour: 'Exposure, saturation, tint', Opacity: 'Fade it, also over time', Move: 'Shift, turn and scale it, also over time',
+  Bend: 'Pull it into another pose' };
+const TOOL_TITLES = { '': 'Turn and move the camera', box: 'Drag a box over the picture', sphere: 'Drag from a middle outwards',
+  lasso: 'Draw around something', color: 'Tap a colour' };
+const HOW_TITLES = { new: 'In place of the selection', add: 'As well as the selection', remove: 'Out of the selection',
+  within: 'Only what both have' };
 
 const STYLE = `
 .edit-overlay{position:absolute;inset:0;width:100%;height:100%;pointer-events:none}
@@ -28,6 +38,7 @@ const STYLE = `
 .edit .row{gap:.35em;flex-wrap:wrap}
 .edit textarea{width:100%;font:.85em/1.45 ui-monospace,"DejaVu Sans Mono",monospace;color:inherit;background:var(--raised);
  border:1px solid var(--line);border-radius:.6em;padding:.5em .6em;resize:vertical;min-height:3.6em}
+.edit [aria-label=Box] input{width:4.4em}
 .edit textarea:focus-visible{outline:2px solid var(--accent);outline-offset:1px}
 .edit .said{min-height:1.3em;overflow-wrap:anywhere}
 .edit .said.bad{color:var(--bad)}
@@ -150,8 +161,8 @@ export class Editing {
     this.redoTool = tool('redo', 'Redo (Ctrl+Y)', () => this.redo());
     this.saveTool = tool('save', 'Save (Ctrl+S)', () => this.save());
     this.stateText = h('span', { class: 'state', role: 'status' });
-    this.tools = segments('Select with', TOOLS, t => this.setTool(t || null));
-    this.hows = segments('Combine', HOW, v => { this.how = v; });
+    this.tools = segments('Select with', TOOLS.map(([v, text]) => [v, text, TOOL_TITLES[v]]), t => this.setTool(t || null));
+    this.hows = segments('Combine', HOW.map(([v, text]) => [v, text, HOW_TITLES[v]]), v => { this.how = v; });
     this.through = h('input', { type: 'checkbox' });
     this.now = h('input', { type: 'checkbox' });
     const layers = this.about.layers.map(name => [`layer("${name}")`, `Layer ${name}`]);
@@ -162,6 +173,11 @@ export class Editing {
     this.area = h('textarea', { 'aria-label': 'Selection in words', rows: 2, spellcheck: 'false',
       placeholder: 'Draw over the picture, or write: box(…) and not layer(sky)',
       onchange: () => { this.text = this.area.value; this.#changedSelection(); } });
+    this.boxed = h('div', { class: 'row', role: 'group', 'aria-label': 'Box', hidden: true }, ...'xyz'.split('').map((axis, k) => h('span', {},
+      `${axis} `, ...['low', 'high'].map((end, i) => number(`Box ${axis} ${['from', 'to'][i]}`, 0, v => {
+        const box = boxOf(this.text);
+        if (box) this.#setBox({ ...box, [end]: box[end].map((x, j) => (j === k ? v : x)) });
+      })))));
     this.said = h('p', { class: 'note said', role: 'status', 'aria-live': 'polite' });
     const act = (label, make, props) => button(label, () => make(), props);
     this.acts = h('div', { class: 'acts', role: 'group', 'aria-label': 'With the selection' },
@@ -179,10 +195,11 @@ export class Editing {
     this.panel = h('section', { class: 'card panel edit', role: 'dialog', 'aria-label': 'Edit', hidden: true },
       h('div', { class: 'head' }, h('h2', {}, 'Edit', this.stateText), h('div', { class: 'row' }, this.undoTool, this.redoTool,
         this.saveTool, tool('close', 'Close', () => this.toggle(false)))),
-      h('div', { class: 'row choose' }, this.tools, this.more), h('div', { class: 'row choose' }, this.hows,
+      h('div', { class: 'row choose' }, this.tools), h('div', { class: 'row choose' },
+        ...PLAIN.map(([words, text, title]) => button(text, () => this.#pick(words), { title })), this.more), h('div', { class: 'row choose' }, this.hows,
         check(this.through, 'Through', 'Also what lies behind what is seen'),
         this.about.moving ? check(this.now, 'Now', 'What is there at this moment, instead of most of its life') : null),
-      this.area, this.said, this.acts, this.list, this.props);
+      this.area, this.boxed, this.said, this.acts, this.list, this.props);
     ui.dock.insertBefore(this.panel, ui.bar);
     ui.help.querySelector('dl')?.append(...[['Edit', 'X'], ['Undo, redo', 'Ctrl + Z', 'Y'], ['Save the edits', 'Ctrl + S'], ['Delete the selection', 'Del']]
       .map(([what, ...keys]) => h('div', { class: 'pair' }, h('dt', {}, what), h('dd', {}, ...keys.map(k => h('kbd', {}, k))))));
@@ -194,6 +211,8 @@ export class Editing {
   #listen() {
     const p = this.player, o = this.overlay;
     o.addEventListener('drawn', e => this.#drawn(e.detail));
+    o.addEventListener('boxing', e => this.#numbers(e.detail.box));
+    o.addEventListener('boxed', e => this.#setBox(e.detail.box));
     o.addEventListener('moving', () => this.#moving());
     o.addEventListener('moved', e => this.#set(movedTo(this.step, this.time, e.detail.place)));
     o.addEventListener('pulling', () => this.#pulling());
@@ -228,6 +247,7 @@ export class Editing {
     this.panel.hidden = !on;
     this.opener.setAttribute('aria-expanded', String(on));
     this.overlay.canvas.hidden = !on;
+    this.overlay.box = on && this.active < 0 ? boxOf(this.text) : null;
     if (!on) this.setTool(null);
     this.#diamonds();
     this.ui.wake();
@@ -264,6 +284,8 @@ export class Editing {
     this.undoTool.disabled = !history.undoable;
     this.redoTool.disabled = !history.redoable;
     this.saveTool.disabled = !history.dirty;
+    this.#numbers(this.overlay.box = this.active < 0 && this.open ? boxOf(this.text) : null);
+    this.overlay.redraw();
     this.list.hidden = !this.steps.length;
     this.list.replaceChildren(...this.steps.map((s, i) => h('li', { 'aria-current': String(i === this.active) },
       button('', () => this.activate(i === this.active ? -1 : i), { 'aria-label': `Set edit ${i + 1}: ${nameOf(s)}`, class: '' }),
@@ -273,7 +295,9 @@ export class Editing {
     if (this.area !== this.ui.focused()) this.area.value = this.text;
     const some = this.#told?.gaussians > 0 && this.active < 0;
     for (const b of this.acts.children) {
-      if (b.textContent !== 'Floaters' && !(b.textContent === 'Bend' && !this.about.drag)) b.disabled = !some;
+      if (b.textContent === 'Floaters' || (b.textContent === 'Bend' && !this.about.drag)) continue;
+      b.disabled = !some;
+      b.title = some ? ACTS[b.textContent] : this.active < 0 ? 'Select something first' : 'Finish the edit that is being set first';
     }
     this.#properties();
     this.#diamonds();
@@ -377,6 +401,20 @@ export class Editing {
   #pick(words) {
     if (this.active >= 0) this.activate(-1);
     this.text = combined(this.text, words, this.how);
+    this.#changedSelection();
+  }
+
+  /** The box that a selection in words ends with: its numbers in the panel. */
+  #numbers(box) {
+    this.boxed.hidden = !box;
+    if (!box) return;
+    [...this.boxed.querySelectorAll('input')].forEach((input, i) => {
+      if (input !== this.ui.focused()) input.value = round((i % 2 ? box.high : box.low)[i >> 1]);
+    });
+  }
+
+  #setBox(box) {
+    this.text = withBox(this.text, box);
     this.#changedSelection();
   }
 

@@ -1,6 +1,6 @@
 // A scene that is still being learned: the server's events, the curve of its quality, and the newest snapshot.
 
-import { h } from './dom.js';
+import { button, h, save } from './dom.js';
 
 /** Milliseconds before another try to reach the server, doubled up to the second. */
 const RETRY = [500, 8000];
@@ -81,9 +81,15 @@ export class Training {
     this.left = h('small');
     this.figures = h('div', { class: 'figures' });
     this.canvas = h('canvas', { role: 'img', 'aria-label': 'Quality over the steps' });
+    const axis = name => h('small', { class: name });
+    this.axes = { psnr: [axis('high psnr'), axis('low psnr')], loss: [axis('high loss'), axis('low loss')], step: [axis(), axis()] };
+    this.plot = h('div', { class: 'plot', hidden: true },
+      h('div', { class: 'names' }, h('small', { class: 'psnr' }, 'PSNR of training views, dB'), h('small', { class: 'loss' }, 'Loss')),
+      h('div', { class: 'area' }, this.canvas, ...this.axes.psnr, ...this.axes.loss),
+      h('div', { class: 'names' }, this.axes.step[0], h('small', {}, 'steps'), this.axes.step[1]));
     this.card = h('section', { class: 'card live', 'aria-label': 'Training' },
       h('div', { class: 'row' }, this.dot, this.state, h('span', { class: 'space' }), this.left),
-      this.canvas, this.figures);
+      this.plot, this.figures);
     ui.left.append(this.card);
     ui.root.addEventListener('themechange', () => this.#draw());
     this.resizes = new ResizeObserver(() => this.#draw());
@@ -95,11 +101,12 @@ export class Training {
       this.timer = setTimeout(() => {
         if (number === newest) return;
         newest = number;
-        const address = new URL(src, document.baseURI);
-        address.searchParams.set('v', number);
-        reload(address.href);
+        this.address = new URL(src, document.baseURI);
+        this.address.searchParams.set('v', number);
+        reload(this.address.href);
       }, TOGETHER);
     };
+    this.reload = reload;
     if (version != null) show(version);
     const past = () => metrics && fetch(metrics).then(r => (r.ok ? r.text() : '')).then(text => text
       && this.#merge(readMetrics(text))).catch(() => { /* The curve then begins with what arrives. */ });
@@ -123,10 +130,23 @@ export class Training {
       : { connecting: this.last ? 'Reconnecting' : 'Connecting', live: 'Training', away: 'Reconnecting' }[state];
   }
 
-  #finish() {
+  /** The server may end with the run: the page keeps the scene, and asks for nothing more. */
+  async #finish() {
+    if (this.over) return;
     this.over = true;
     this.left.textContent = '';
+    this.feed.close();
     this.#show(this.link);
+    // The last snapshot may have come together with the end.
+    await new Promise(done => setTimeout(done, 2 * TOGETHER));
+    if (!this.address) return;
+    try {
+      const answer = await fetch(this.address);
+      if (!answer.ok) return;
+      const scene = await answer.blob();
+      this.reload(scene);
+      this.card.append(button('Save the scene', () => save(scene, 'scene.s4d'), {}, 'save'));
+    } catch { /* What has been loaded still plays. */ }
   }
 
   #step(data) {
@@ -156,6 +176,7 @@ export class Training {
   /** PSNR in the accent colour, the loss behind it; each over its own range. */
   #draw() {
     const { canvas } = this, box = canvas.getBoundingClientRect(), ratio = devicePixelRatio || 1;
+    this.plot.hidden = this.#points.length < 2;
     if (!box.width || this.#points.length < 2) return;
     canvas.width = Math.round(box.width * ratio);
     canvas.height = Math.round(box.height * ratio);
@@ -165,6 +186,8 @@ export class Training {
     const curve = (key, colour, width) => {
       const points = this.#points.filter(p => isFinite(p[key]));
       const [low, high] = [Math.min(...points.map(p => p[key])), Math.max(...points.map(p => p[key]))];
+      const digits = key === 'psnr' ? 1 : 3;
+      this.axes[key].forEach((label, i) => { label.textContent = points.length ? [high, low][i].toFixed(digits) : ''; });
       g.beginPath();
       for (const p of points) {
         g.lineTo(edge + w * (p.step - first) / (last - first || 1),
@@ -173,7 +196,8 @@ export class Training {
       Object.assign(g, { strokeStyle: colour, lineWidth: width * ratio, lineJoin: 'round', lineCap: 'round' });
       g.stroke();
     };
-    curve('loss', style.getPropertyValue('--line'), 1.5);
+    this.axes.step.forEach((label, i) => { label.textContent = [first, last][i].toLocaleString('en-GB'); });
+    curve('loss', style.getPropertyValue('--muted'), 1.5);
     curve('psnr', style.getPropertyValue('--accent'), 2);
     const psnr = this.#points.map(p => p.psnr);
     canvas.setAttribute('aria-label', `Quality over the steps: PSNR from ${psnr[0].toFixed(1)} to ${

@@ -28,8 +28,9 @@ const GLIDE = 0.5;
 /** Longest step of the clock, s: a page that was blocked for longer goes on where it was. */
 const STEP_MAX = 1;
 /**
- * An image at rest is rendered at full resolution: at once when the clock stops, so long after the last move, ms. Where one
- * frame would take longer than `AT_ONCE`, a quick one of `FIRST_STEP` comes first, and the next so long after it, ms.
+ * An image at rest is rendered at full resolution: with the next frame when the clock stops, so long after the camera's last
+ * move, ms. Where one frame would take longer than `AT_ONCE`, a camera that may move on gets a quick one of `FIRST_STEP`
+ * first, and the next so long after it, ms.
  */
 const REST = 150, AT_ONCE = 1000, FIRST_STEP = 400, NEXT_STEP = 300;
 /** What changed: only what is shown, or that something moves as well, which then counts as not at rest. */
@@ -390,7 +391,8 @@ export class Player extends EventTarget {
     if (!this.seeking) this.clock = this.time;
     this.#epoch++;
     this.#movedAt = -Infinity;
-    this.redraw(CONTENT);
+    // A step of the clock that is not rendered yet is none any more.
+    this.#dirty = CONTENT;
   }
 
   toggle() { this.playing ? this.pause() : this.play(); }
@@ -609,7 +611,9 @@ export class Player extends EventTarget {
   /** Share of the screen's pixels for an image that stands still. */
   #restScale(now) {
     const { scale } = this;
-    if (this.resolution !== 'auto' || now - this.#movedAt < REST) return scale;
+    if (this.resolution !== 'auto') return scale;
+    if (this.#movedAt === -Infinity) return 1;
+    if (now - this.#movedAt < REST) return scale;
     const least = Math.max(scale, this.#paintedScale);
     if (this.#cost.at(1) <= AT_ONCE) return 1;
     if (this.#quick) return now - this.#drawnAt < NEXT_STEP ? this.#paintedScale : 1;

@@ -32,7 +32,8 @@ button{border:0;background:none;border-radius:.6em;cursor:pointer;padding:.45em 
  align-items:center;justify-content:center;gap:.5em;white-space:nowrap;transition:background .12s}
 button:hover{background:var(--raised)}
 button:active{background:var(--press)}
-button[disabled]{opacity:.4;pointer-events:none}
+button[disabled]{opacity:.4;cursor:default;background:none}
+button.soft[disabled]{background:var(--raised)}
 :is(button,select,input,.scrub,a):focus-visible{outline:2px solid var(--accent);outline-offset:2px}
 .tool{width:2.6em;height:2.6em;padding:0;flex:none}
 .tool[aria-pressed=true],.tool[aria-expanded=true]{color:var(--accent)}
@@ -111,6 +112,12 @@ h3{font-size:.8em;margin:.2em 0 -.4em;font-weight:600;color:var(--muted);letter-
 .stats dd{margin:0;text-align:right}
 .live{padding:.75em .95em;width:19em;max-width:100%;pointer-events:auto;display:flex;flex-direction:column;gap:.5em}
 .live canvas{width:100%;height:5em;display:block}
+.live .names{display:flex;justify-content:space-between}
+.live .area{position:relative;margin:.15em 0;padding:0 3.2em}
+.live .area small{position:absolute}
+.live .high{top:0}.live .low{bottom:0}
+.live .area .psnr{left:0}.live .area .loss{right:0}
+.live small.psnr{color:var(--accent)}
 .live .figures{display:flex;justify-content:space-between;gap:.8em;font-variant-numeric:tabular-nums;
  white-space:nowrap}
 .live small{color:var(--muted);font-size:.85em}
@@ -147,15 +154,19 @@ kbd{font:inherit;font-size:.88em;background:var(--raised);border:1px solid var(-
 @keyframes spin{to{transform:rotate(1turn)}}
 .toast{position:absolute;left:50%;top:clamp(8px,1.2em,28px);transform:translateX(-50%);padding:.45em 1.1em;
  pointer-events:none;opacity:0;transition:opacity .2s;max-width:calc(100% - 2em);z-index:3;text-align:center}
-.toast.on{opacity:1}
+.toast.on,.hint.on{opacity:1}
+.hint{position:absolute;left:0;right:0;bottom:7.2em;margin:auto;width:fit-content;max-width:calc(100% - 2em);padding:.5em 1.1em;
+ pointer-events:none;opacity:0;transition:opacity .4s;text-align:center;border-radius:2em}
 .field.narrow,.wrap.narrow{display:none}
 @container (max-width:760px){.wide{display:none!important}.field.narrow,.wrap.narrow{display:flex}
  .panel{width:100%;max-height:60cqh}
  .tool{width:2.85em;height:2.85em}}
-@container (max-width:420px){.time .of{display:none}.stats{font-size:.8em}}
+@container (max-width:420px){.tool{width:2.6em}.stats{font-size:.8em}.time{padding:0 .2em}.speed{width:3.5em;padding:0 0 0 .2em}}
+@container (max-width:379px){.speed{display:none!important}}
+@container (max-width:340px){.time .of{display:none}}
 @container (max-width:1000px){.roomy{display:none!important}}
 @container (min-width:1001px){.panel .cramped{display:none}}
-@container (max-height:300px){.panel{max-height:calc(100cqh - 5.6em)}.live canvas{display:none}}
+@container (max-height:300px){.panel{max-height:calc(100cqh - 5.6em)}.live .plot{display:none}}
 @media (prefers-reduced-motion:reduce){*,*::before,*::after{transition:none!important;animation:none!important}}
 @media (forced-colors:active){.rail>.done,.knob{background:Highlight}.card{border:1px solid CanvasText}}
 .sr{position:absolute;width:1px;height:1px;overflow:hidden;clip-path:inset(50%)}

@@ -11,6 +11,8 @@ const IDLE_PLAYING = 2.5;
 const IDLE_STILL = 8;
 /** Milliseconds that a short notice stays. */
 const TOAST = 1800;
+/** Milliseconds that the hint stays that a scene can be turned, and where a page remembers that it was shown. */
+const HINT = 6000, HINTED = 'splat4d-hinted';
 /** A loading that is shorter shows no sign of itself, ms. */
 const QUICK = 250;
 /** Milliseconds between two readings of the figures. */
@@ -46,7 +48,7 @@ export class Interface {
     this.now = h('b', {}, '0:00.00');
     this.end = h('span', { class: 'of' }, ' / 0:00.00');
     this.timeLabel = h('div', { class: 'time', 'aria-hidden': 'true' }, this.now, this.end);
-    this.speed = choice('Speed', SPEEDS.map(s => [s, `${s}×`]), s => { p.speed = +s; }, { class: 'wide' });
+    this.speed = choice('Speed', SPEEDS.map(s => [s, `${s}×`]), s => { p.speed = +s; }, { class: 'speed' });
     this.channel = segments('Picture', CHANNELS.map(c => [c, CHANNEL_NAMES[c]]), c => p.setChannel(c),
       { class: 'roomy' });
     const opener = (name, label, id) => tool(name, label, () => this.open(this.#panel === id ? null : id),
@@ -75,8 +77,9 @@ export class Interface {
     this.ring = h('div', { class: 'card load', role: 'status', hidden: true },
       h('div', { class: 'ring' }), h('span'));
     this.toastBox = h('div', { class: 'card toast', role: 'status', 'aria-live': 'polite' });
+    this.hint = h('div', { class: 'card hint', role: 'status' });
     this.posterBox = h('img', { class: 'poster', alt: '' });
-    this.face = h('div', { class: 'ui' }, h('div', { class: 'top' }, this.left), this.ring, this.dock,
+    this.face = h('div', { class: 'ui' }, h('div', { class: 'top' }, this.left), this.ring, this.hint, this.dock,
       this.notice, this.help, this.toastBox);
     this.root.append(this.posterBox, this.face);
   }
@@ -148,6 +151,7 @@ export class Interface {
       tap = e.pointerType === 'touch' && this.stage.contains(e.target)
         ? { x: e.clientX, y: e.clientY, idle: this.root.classList.contains('idle') } : null;
       this.wake();
+      this.#endHint();
       if (this.stage.contains(e.target)) this.open(null, false);
     });
     this.root.addEventListener('pointerup', e => {
@@ -246,7 +250,10 @@ export class Interface {
       this.busySince ||= performance.now();
       setTimeout(() => this.#progress(), QUICK + 20);
     }
-    if (state === 'ready') this.setPoster(null);
+    if (state === 'ready') {
+      this.setPoster(null);
+      this.#showHint();
+    }
     this.#progress();
     this.refresh();
   }
@@ -295,6 +302,20 @@ export class Interface {
     this.toastBox.classList.add('on');
     clearTimeout(this.#timers.toast);
     this.#timers.toast = setTimeout(() => this.toastBox.classList.remove('on'), ms);
+  }
+
+  /** Once: nothing else shows that the scene is more than a video. */
+  #showHint() {
+    if (this.embed || this.hiddenControls || this.player.film || known(this.page)) return;
+    const touch = matchMedia('(pointer: coarse)').matches;
+    this.hint.textContent = touch ? 'Drag to turn · pinch to come nearer' : 'Drag to turn · scroll to come nearer';
+    this.hint.classList.add('on');
+    this.#timers.hint = setTimeout(() => this.#endHint(), HINT);
+  }
+
+  #endHint() {
+    clearTimeout(this.#timers.hint);
+    this.hint.classList.remove('on');
   }
 
   /** Opens a panel by name, or closes what is open. */
@@ -536,6 +557,18 @@ export class Interface {
       t: () => this.setTheme(this.dark ? 'light' : 'dark'), h: () => this.toggleHelp(), '?': () => this.toggleHelp(),
     };
   }
+}
+
+let hinted = false;
+/** Whether the hint was shown before, on this page or, where the page is the player's own, an earlier one. Now it was. */
+function known(page) {
+  let before = hinted;
+  hinted = true;
+  if (page) try {
+    before ||= !!localStorage.getItem(HINTED);
+    localStorage.setItem(HINTED, '1');
+  } catch { /* Storage may be shut; then it is shown once a page. */ }
+  return before;
 }
 
 /** Whether a control wants this key for itself. */

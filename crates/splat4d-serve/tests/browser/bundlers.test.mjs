@@ -1,9 +1,9 @@
-// The package in the hands of bundlers: Vite (its development server and its build), webpack and esbuild. Each page must play
+// The package in the hands of TypeScript and of bundlers: Vite (its development server and its build), webpack and esbuild. Each page must play
 // with both workers; a bundler that does not find them leaves all work to the main thread, and says nothing. Needs npm, and vite,
 // webpack and esbuild beside playwright-core (`.ci/run`).
 
 import assert from 'node:assert/strict';
-import { execFileSync } from 'node:child_process';
+import { execFileSync, spawnSync } from 'node:child_process';
 import { cpSync, existsSync, mkdirSync, mkdtempSync, readdirSync, readFileSync, rmSync, writeFileSync } from 'node:fs';
 import { createRequire } from 'node:module';
 import { tmpdir } from 'node:os';
@@ -113,4 +113,34 @@ test('esbuild, with the workers beside its output', options, async () => {
   for (const file of readdirSync(player).filter((f) => f.endsWith('.worker.js'))) cpSync(path.join(player, file), path.join(out, file));
   assert.ok(existsSync(path.join(out, 'sort.worker.js')));
   await built(out, '/main.js');
+});
+
+/// React's block of the package's README, and what its types refuse.
+const TSX = () => /```tsx\n([\s\S]*?)```/.exec(readFileSync(path.join(PACKAGE, 'README.md'), 'utf8'))[1] + `
+// @ts-expect-error: there is no such channel
+export const wrong = <splat-4d channel="colour" />;
+// @ts-expect-error: loop is text, because React leaves an attribute out that is false
+export const once = <splat-4d loop={false} />;
+`;
+
+const tsc = (() => {
+  try {
+    return path.join(path.dirname(from.resolve('typescript/package.json')), 'bin/tsc');
+  } catch (e) {
+    if (process.env.REQUIRE_BUNDLERS === '1') throw e;
+    return null;
+  }
+})();
+test('the example for React has types', { skip: browser && tsc ? false : 'needs typescript and @types/react' }, () => {
+  const folder = path.join(work, 'typed');
+  mkdirSync(folder);
+  writeFileSync(path.join(folder, 'take.tsx'), TSX());
+  const compilerOptions = {
+    strict: true, noEmit: true, target: 'es2022', module: 'esnext', moduleResolution: 'bundler', jsx: 'react-jsx', types: [],
+    paths: { react: [path.join(path.dirname(from.resolve('@types/react/package.json')), 'index.d.ts')],
+      'react/jsx-runtime': [path.join(path.dirname(from.resolve('@types/react/package.json')), 'jsx-runtime.d.ts')] },
+  };
+  writeFileSync(path.join(folder, 'tsconfig.json'), JSON.stringify({ compilerOptions, include: ['take.tsx'] }));
+  const { stdout, status } = spawnSync(process.execPath, [tsc, '-p', folder], { encoding: 'utf8' });
+  assert.equal(status, 0, stdout);
 });

@@ -8,7 +8,7 @@ import { tmpdir } from 'node:os';
 import path from 'node:path';
 import test from 'node:test';
 import { fileURLToPath } from 'node:url';
-import { combined, easedKey, History, keysOf, movedTo, placeAt, shiftedKey, turnOf, quatOf, withKey, withoutKey }
+import { boxOf, combined, easedKey, History, keysOf, movedTo, placeAt, shiftedKey, turnOf, quatOf, withBox, withKey, withoutKey }
   from '../../player/edit-steps.js';
 import { launch } from './browser.mjs';
 
@@ -50,6 +50,13 @@ test('a move gets keys, and is between them where it was set', () => {
   assert.deepEqual(keysOf(shiftedKey(step, 2, 1.5)).map((k) => k.t), [0, 1.5]);
   const last = withoutKey(withoutKey(step, 2), 0);
   assert.deepEqual([last.keys, last.to], [undefined, { shift: [1, 0, 0], about: [0, 0, 1] }]);
+});
+
+test('the last box of a selection is read and replaced', () => {
+  const text = 'box(0,0,0, 1,1,1) and not box(2, -1,0 3,1e0,-5)';
+  assert.deepEqual(boxOf(text), { low: [2, -1, -5], high: [3, 1, 0] });
+  assert.equal(withBox(text, { low: [0, 0, 0], high: [1, 2, 3] }), 'box(0,0,0, 1,1,1) and not box(0,0,0, 1,2,3)');
+  for (const words of ['', 'all', 'box(1,2)', 'box(1,2,3, 4,5,x)', 'sandbox(0,0,0,1,1,1)']) assert.equal(boxOf(words), null);
 });
 
 test('what was done is undone and done again', () => {
@@ -254,4 +261,31 @@ test('without the token a page only looks, and other origins cannot ask', option
   assert.equal(outcome, 'TypeError');
   await page.close();
   await foreign.close();
+});
+
+test('the box of a selection has numbers and faces that can be pulled', options, async () => {
+  const e = await edit(await view(KNIGHT, path.join(work, 'box.toml'))), { page, panel } = e;
+  const area = panel.getByLabel('Selection in words'), text = () => page.evaluate(() => document.querySelector('splat-4d').face.editing.text);
+  assert.equal(await panel.getByRole('group', { name: 'Box' }).isVisible(), false);
+  assert.equal(await panel.getByRole('button', { name: 'Delete', exact: true }).getAttribute('title'), 'Select something first');
+  await area.fill('box(-1,0,-1, 1,2,1)');
+  await area.blur();
+  await e.idle();
+  const top = panel.getByLabel('Box y to');
+  assert.equal(await top.inputValue(), '2');
+  await top.fill('1.5');
+  await top.blur();
+  assert.equal(await text(), 'box(-1,0,-1, 1,1.5,1)');
+  // The middle of the upper face, pulled upwards.
+  const at = await page.evaluate(() => document.querySelector('splat-4d').face.editing.overlay.project([0, 1.5, 0]));
+  const camera = await page.evaluate(() => document.querySelector('splat-4d').camera.position);
+  await e.drag(at.slice(0, 2), [at[0], at[1] - 40]);
+  await e.idle();
+  const height = Number(await top.inputValue());
+  assert.ok(height > 1.6, `${height}`);
+  assert.match(await text(), new RegExp(`^box\\(-1,0,-1, 1,${height},1\\)$`));
+  assert.deepEqual(await page.evaluate(() => document.querySelector('splat-4d').camera.position), camera, 'the camera stays');
+  if (process.env.SHOTS) await page.screenshot({ path: `${process.env.SHOTS}/box.png` });
+  assert.deepEqual(e.errors, []);
+  await page.close();
 });

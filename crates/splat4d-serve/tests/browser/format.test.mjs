@@ -3,7 +3,7 @@
 import assert from 'node:assert/strict';
 import test from 'node:test';
 import { deflateRawSync } from 'node:zlib';
-import { at, gaussian } from '../../player/motion.js';
+import { at, gaussian } from './motion.js';
 import { SceneError } from '../../player/errors.js';
 import { SceneFile } from '../../player/scene-file.js';
 import { moved } from './reference.mjs';

@@ -3,7 +3,7 @@
 import assert from 'node:assert/strict';
 import test from 'node:test';
 import { labelColor, painted } from '../../player/labels.js';
-import { gaussian } from '../../player/motion.js';
+import { gaussian } from './motion.js';
 import { SceneFile } from '../../player/scene-file.js';
 import { layout, sample } from './sample.mjs';
 

@@ -360,7 +360,7 @@ test('errors say what, where and what to do; the page recovers', options, async 
 });
 
 test('a narrow window holds everything without scrolling sideways', options, async () => {
-  for (const size of [[360, 640], [640, 360], [320, 568]]) {
+  for (const size of [[390, 844], [360, 640], [640, 360], [320, 568]]) {
     const { page, ask, done } = await open('', { size, hasTouch: true });
     const check = async what => {
       const out = await ask(e => [...e.shadowRoot.querySelectorAll('button, select, .card')]
@@ -383,6 +383,44 @@ test('a narrow window holds everything without scrolling sideways', options, asy
     await check('the help');
     await done();
   }
+});
+
+test('a phone upright sees the subject larger, with duration and speed; the hint comes once', options, async () => {
+  const { page, ask, done } = await open('', { size: [390, 844], hasTouch: true, isMobile: true });
+  const seen = await ask(e => {
+    const p = e.player, shown = name => e.shadowRoot.querySelector(name).checkVisibility();
+    const f = (w, h) => p.camera.view(w, h).fx / w;
+    const out = { tall: f(390, 844), square: f(400, 400), wide: p.camera.view(800, 400).fx / 400, shown: ['.of', '.speed'].map(shown) };
+    const before = p.camera.view(390, 844).fx;
+    p.camera.loosen(390, 844);
+    return { ...out, moved: p.camera.view(390, 844).fx / before, hint: e.shadowRoot.querySelector('.hint.on')?.textContent };
+  });
+  near(seen.tall / seen.square, 4 / 3);
+  near(seen.wide, seen.square);
+  near(seen.moved, 1);
+  assert.deepEqual(seen.shown, [true, true]);
+  assert.match(seen.hint, /Drag to turn/);
+  await page.getByRole('button', { name: 'View and settings' }).click();
+  assert.ok(await page.getByRole('radio', { name: 'Depth' }).isVisible(), 'the channel is in the view panel');
+  await page.touchscreen.tap(200, 200);
+  assert.equal(await ask(e => e.shadowRoot.querySelector('.hint.on')), null, 'a touch ends the hint');
+  await page.reload();
+  await page.waitForFunction(() => document.querySelector('splat-4d')?.player?.state === 'ready');
+  assert.equal(await ask(e => e.shadowRoot.querySelector('.hint.on')), null, 'it was shown before');
+  // The third camera of the capture is shown whole.
+  assert.ok(await ask(e => { e.player.controls.swing = false; e.player.view(2); return e.player.camera.view(390, 844).fx / 900 * 800 <= 390.01; }));
+  await done();
+});
+
+test('a page without the leave to edit fetches no editor', options, async () => {
+  const asked = [];
+  const { page, done } = await open('', {});
+  page.on('request', r => asked.push(r.url()));
+  await page.reload();
+  await page.waitForFunction(() => document.querySelector('splat-4d')?.player?.state === 'ready');
+  assert.ok(asked.length > 10);
+  assert.deepEqual(asked.filter(url => /\/edit/.test(url)), []);
+  await done();
 });
 
 test('controls rest while it plays and come back; reduced motion does not play by itself', options, async () => {
@@ -471,18 +509,22 @@ test('training is followed: late join, new snapshots, lost connections', options
   const step = i => site.say({ kind: 'step', step: 10 * i, of: 500, psnr: 15 + i / 10, loss: 0.3 - i / 1000,
     gaussians: 9000 + i, left_s: 120 - i });
   site.history = [];
+  site.pages['/scene.s4d'] = 'the bytes of a scene';
   for (let i = 1; i <= 20; i++) step(i);
   site.say({ kind: 'snapshot', version: 7 });
   const config = { title: 'learning', scene: 'scene.s4d', live: true, autoplay: false };
   const { page, ask, done } = await open('', { config, wrong: true });
   const card = page.getByRole('region', { name: 'Training' });
-  await card.getByText('200').waitFor();
+  await card.getByText('200of 500').waitFor();
   const text = await card.innerText();
   for (const part of ['Training', 'of 500 steps', '17.00', '9,020', '2 min left']) {
     assert.ok(text.includes(part), `${part} in ${text}`);
   }
   assert.match(await page.getByRole('img', { name: /PSNR from/ }).getAttribute('aria-label'), /from 15\.1 to 17\.0 dB/);
   const opened = () => page.evaluate(() => globalThis.mockOpened.map(u => new URL(u).search));
+  for (const part of ['PSNR of training views, dB', 'Loss', '17.0', '15.1', '0.299', '0.280', '10', 'steps']) {
+    assert.ok(text.includes(part), `the chart has ${part}: ${text}`);
+  }
   assert.deepEqual(await opened(), ['?v=7'], 'one scene, the newest');
   await ask(e => { e.camera = { position: [2, 1, 3], target: [0, 1, 0] }; e.seek(3); });
   await settle(page);
@@ -496,12 +538,22 @@ test('training is followed: late join, new snapshots, lost connections', options
   site.cut();
   await card.getByText('Reconnecting').waitFor();
   step(21);
-  await card.getByText('210').waitFor({ timeout: 10000 });
+  await card.getByText('210of 500').waitFor({ timeout: 10000 });
   assert.ok(site.joined > joined, 'it came back by itself');
   assert.deepEqual(await opened(), ['?v=7', '?v=8'], 'what is known is not loaded again');
   step(50);
   site.say({ kind: 'done' });
   await card.getByText('Training finished').waitFor();
+  await card.getByRole('button', { name: 'Save the scene' }).waitFor();
+  assert.equal(await ask(e => e.player.file.name), 'bytes', 'the page has the scene itself');
+  // The server may end now: the page asks for nothing more.
+  const [last, answered] = [site.joined, []];
+  page.on('request', r => answered.push(r.url()));
+  site.cut();
+  await page.waitForTimeout(1200);
+  assert.deepEqual([site.joined, answered], [last, []]);
+  const [file] = await Promise.all([page.waitForEvent('download'), card.getByRole('button', { name: 'Save the scene' }).click()]);
+  assert.equal(file.suggestedFilename(), 'scene.s4d');
   await done();
 });
 

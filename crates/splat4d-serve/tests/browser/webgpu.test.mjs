@@ -3,7 +3,7 @@
 
 import assert from 'node:assert/strict';
 import test from 'node:test';
-import { at, gaussian } from '../../player/motion.js';
+import { at, gaussian } from './motion.js';
 import { launch, open } from './browser.mjs';
 import { psnr, render } from './reference.mjs';
 import { PLAYER, serve } from './server.mjs';

@@ -74,8 +74,14 @@ impl Snapshots {
 
     fn bytes(&self, scene: &Scene<f32>) -> Result<Vec<u8>> {
         // Without a tolerance nothing is split: one look at every frame, one piece a Gaussian.
-        let options =
-            Options { tolerance: f64::INFINITY, looks: 0.0, cameras: self.poses.clone(), ..Options::default() };
+        // A page that follows a run has the whole file at once: nothing is ranked.
+        let options = Options {
+            tolerance: f64::INFINITY,
+            looks: 0.0,
+            cameras: self.poses.clone(),
+            rank: false,
+            ..Options::default()
+        };
         let baked = bake(scene, &options, &mut |_, _| {})?;
         let meta = Meta {
             clip: baked.clip,

@@ -3,6 +3,7 @@
 use super::fit::{Fitter, Piece, Subject, seen};
 use super::life::Lives;
 use super::lookout::Lookout;
+use super::rank::rank;
 use super::rate::{PRICES, Rate, Sums, price};
 use super::repeat::Rounds;
 use super::sample::{self, Framed, Row, Samples};
@@ -265,6 +266,9 @@ impl<'a> Bakery<'a> {
             cut(Node { from: tree.border(span[0]), to: tree.border(span[1]), primitives }, tally.windows[window])
         };
         let mut nodes = in_order(spans.into_iter().filter_map(node).chain(pages).collect());
+        if options.rank {
+            rank(&mut nodes, self.scene, options);
+        }
         let mut clip = self.scene.clip;
         if options.repeat > 1 {
             let one: usize = nodes.iter().map(|n| n.primitives.len()).sum();

@@ -15,6 +15,7 @@ mod compare;
 mod fit;
 mod life;
 mod lookout;
+mod rank;
 mod rate;
 mod repeat;
 mod sample;
@@ -63,6 +64,8 @@ pub struct Options {
     pub cameras: Vec<Camera>,
     /// Times and poses of a camera that moves: its pixels count at these times. Times rise.
     pub path: Vec<(f64, Camera)>,
+    /// Whether renders decide which Gaussians come first in a file, and not their sizes alone.
+    pub rank: bool,
 }
 
 impl Default for Options {
@@ -75,6 +78,7 @@ impl Default for Options {
             repeat: 1,
             cameras: Vec::new(),
             path: Vec::new(),
+            rank: true,
         }
     }
 }

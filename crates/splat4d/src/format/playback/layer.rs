@@ -1,10 +1,10 @@
 //! A page as a layer of a scene, so that everything that draws scenes draws playback files; and such a layer as a page.
 
-use super::block::{Columns, NO_WIDTH, SHARPEST, Words};
+use super::block::{Columns, NO_WIDTH, SHARPEST, Words, encode_page};
 use super::index::broken;
 use super::page::{self, Header, at, half_width, lives_through, reach};
 use super::page::{FOR_EVER as FULL_LIFE, FULL8, FULL10, HALF10, LEVELS8, LEVELS16, MAX_LOG, THINNEST, WIDTH_LEVELS};
-use super::{BLOCK_GAUSSIANS, PAGE_WORDS, Page, Palette};
+use super::{BLOCK_GAUSSIANS, Depths, Entry, Kind, MAX_PAGE_GAUSSIANS, Node, PAGE_WORDS, Page, Palette};
 use crate::Result;
 use crate::format::quant;
 use crate::layers::Layer;
@@ -386,4 +386,22 @@ pub(crate) fn primitives(layer: &Layer<f32>) -> Vec<super::Primitive> {
         }
     };
     (0..p.len()).map(one).collect()
+}
+
+/// Nodes as layers in their base colours, as the default depths hold them, and of each layer its node and the place of its
+/// first row in that.
+pub(crate) fn as_layers(nodes: &[Node]) -> (Vec<Layer<f32>>, Vec<(usize, usize)>) {
+    let (mut layers, mut places) = (Vec::new(), Vec::new());
+    for (i, node) in nodes.iter().enumerate() {
+        let span = [node.from, node.to];
+        for (k, part) in node.primitives.chunks(MAX_PAGE_GAUSSIANS).enumerate() {
+            let rows: Vec<_> = part.iter().map(|p| (p, 0)).collect();
+            let body = encode_page(&rows, span, &Depths::default());
+            let entry = Entry { count: part.len() as u32, span, ..Entry::plain(Kind::Page, &[]) };
+            let page = page::parse_page(&body, &entry).expect("a page that was just encoded");
+            layers.push(page.layer(None).expect("a page without a palette"));
+            places.push((i, k * MAX_PAGE_GAUSSIANS));
+        }
+    }
+    (layers, places)
 }

@@ -33,7 +33,7 @@ pub(crate) use features::of_layer as features_of;
 pub use grow::{Growing, finish};
 pub use index::{Codec, Entry, Index, Kind};
 pub(crate) use labels::of_layer as labels_of;
-pub(crate) use layer::{is_page, primitives};
+pub(crate) use layer::{as_layers, is_page, primitives};
 pub(crate) use mask::decode_masks;
 pub use meta::{Meta, NamedCamera, PathKey, Viewpoint};
 pub(crate) use page::{Page, decode_page};

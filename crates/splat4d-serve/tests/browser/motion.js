@@ -1,6 +1,6 @@
 // docs/format.md in f64: one Gaussian of a page, and where it is at a time. The shaders are its twins.
 
-import './sort.worker.js';
+import '../../player/sort.worker.js';
 
 const { ALPHA_MIN, lerp, path, signed10 } = globalThis.splat4dSort;
 
