@@ -62,6 +62,11 @@ const SPARE: f64 = 2.0;
 /// Of the seconds that are left for baking, what the first sampling of the model may take. Sampling between frames, fitting,
 /// packing and comparing take the rest.
 const SAMPLING: f64 = 0.25;
+/// The same of renders that measure how strongly images react to errors, of cameras that stand still and of one that moves; and
+/// how many ordinary renders one of them takes.
+const WEIGHING: f64 = 0.1;
+/// See [`WEIGHING`].
+const WEIGHING_RENDERS: f64 = 3.0;
 /// Seconds in which a primitive is fitted and packed, on a slow machine; and the share of what is left that may go into it.
 const SECONDS_A_PRIMITIVE: f64 = 4e-5;
 const FITTING: f64 = 0.4;
@@ -137,7 +142,7 @@ pub(crate) fn pack_scene(
     kitchen.pack(&bakery, curve.as_ref(), price)
 }
 
-/// The options with the source's cameras, and as many samples of the model as the time allows.
+/// The options with the source's cameras, and as many samples and renders of the model as the time allows.
 fn options(scene: &Scene<f32>, baking: &Baking, views: &[View]) -> Options {
     let Cameras { still, path } = Cameras::of(views);
     let cameras = still.iter().map(|v| v.camera.clone()).collect();
@@ -154,6 +159,13 @@ fn options(scene: &Scene<f32>, baking: &Baking, views: &[View]) -> Options {
         let seconds = (deadline.now() - began).max(f64::MIN_POSITIVE);
         let most = SAMPLING * deadline.left().max(0.0) / seconds * scene.len() as f64;
         options.samples = options.samples.min(most as usize);
+        if let Some(view) = views.first() {
+            let mut painter = Painter::new(scene, scene.background, false, false);
+            let began = deadline.now();
+            painter.draw(&view.camera, view.time);
+            let each = WEIGHING_RENDERS * (deadline.now() - began).max(f64::MIN_POSITIVE);
+            options.renders = options.renders.min((WEIGHING * deadline.left().max(0.0) / each) as usize);
+        }
     }
     options
 }

@@ -7,12 +7,17 @@ use crate::{film, finish};
 use serde_json::json;
 use splat4d::Result;
 use splat4d_train::event::Event;
-use splat4d_train::run::chunks::{Chunked, Joined, Outlook, Part};
+use splat4d_train::run::chunks::{Chunked, Joined, Outlook, Part, Seams};
 use splat4d_train::run::{self, Outcome, TrainOptions};
 use std::path::Path;
 use std::str::FromStr;
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
+
+/// Of the time that is left, the share that baking may take, over all parts that are not in the file yet.
+const BAKING: f64 = 0.25;
+/// The same of measuring how chunks meet.
+const SEAMS: f64 = 0.25;
 
 /// The value of `--chunk`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -37,7 +42,7 @@ impl FromStr for Wanted {
 
 /// The plan in a line.
 pub(crate) fn in_words(outlook: &Outlook) -> String {
-    let Outlook { recipe, plan, seconds, memory } = outlook;
+    let Outlook { recipe, plan, seconds, memory, .. } = outlook;
     let longest = (0..plan.len()).map(|c| plan.frames(c).len()).max().unwrap_or(0);
     let mut words = format!(
         "{} chunks of at most {longest} frames and {} Gaussians, {} frames shared by neighbours, {} steps each, and a shared \
@@ -54,7 +59,8 @@ pub(crate) fn in_words(outlook: &Outlook) -> String {
     words
 }
 
-/// Does what is wanted of a take, and appends what is finished to its playback file. `None`: nothing was to do.
+/// Does what is wanted of a take, and appends what is finished to its playback file, within the options' minutes. `None`: nothing
+/// was to do.
 pub(crate) fn work(
     run: &Path,
     chunked: &Chunked,
@@ -64,9 +70,10 @@ pub(crate) fn work(
     console: &Console,
     listen: &mut dyn FnMut(&Event),
 ) -> Result<Option<Outcome>> {
+    let deadline = Deadline::of(options.clock.clone(), options.minutes);
     // What goes wrong with it never costs a chunk, and is made good at the join.
     let append = || {
-        if let Err(e) = film::append(run, chunked, stop, console) {
+        if let Err(e) = film::append(run, chunked, &baking(chunked, &deadline), stop, console) {
             console.warn(&format!("the playback file does not grow: {e:#}"));
         }
     };
@@ -86,12 +93,19 @@ pub(crate) fn work(
     Ok(outcome)
 }
 
+/// The end of baking what is finished: parts that are still to be trained have as much.
+fn baking(chunked: &Chunked, deadline: &Deadline) -> Deadline {
+    let open = chunked.parts().into_iter().filter(|p| !chunked.is_done(*p)).count();
+    deadline.part(BAKING / (1 + open) as f64)
+}
+
 /// Puts the chunks of a run together, measures how they meet, and does what follows training.
 pub(crate) fn join(
     run: &Path,
     chunked: &Chunked,
     no_eval: bool,
     measure: &finish::Measure,
+    deadline: &Deadline,
     stop: &AtomicBool,
     console: &Console,
 ) -> anyhow::Result<()> {
@@ -103,7 +117,7 @@ pub(crate) fn join(
         human_bytes(peak_memory)
     ));
     let path = run.join("scene.safetensors");
-    let seams = chunked.seams(&mut |event| console.event(event))?;
+    let seams = seams(chunked, &deadline.part(SEAMS), console)?;
     console.clear();
     if let Some(seams) = &seams {
         let whose = if seams.held_out { "held-out" } else { "training" };
@@ -115,7 +129,7 @@ pub(crate) fn join(
     finish::amend(run, [("seams".into(), json!(seams)), ("chunk_peak_memory".into(), json!(peak_memory))])?;
     console.say(&format!("wrote {}", path.display()));
     let started = Instant::now();
-    let bytes = film::complete(run, chunked, stop, console)?;
+    let bytes = film::complete(run, chunked, &baking(chunked, deadline), stop, console)?;
     console.say(&format!("the playback file has {}", human_bytes(bytes)));
     finish::amend(
         run,
@@ -125,5 +139,25 @@ pub(crate) fn join(
             ("join_peak_memory".into(), json!(run::peak_memory())),
         ],
     )?;
-    if no_eval { Ok(()) } else { finish::all(run, measure, &Deadline::default(), console) }
+    if no_eval { Ok(()) } else { finish::all(run, measure, deadline, console) }
+}
+
+/// How chunks meet, at as many cuts as the time allows: the next one takes about as long as the last one.
+fn seams(chunked: &Chunked, deadline: &Deadline, console: &Console) -> Result<Option<Seams>> {
+    let (mut began, mut ended) = (deadline.now(), None);
+    let found = chunked.seams(
+        &mut |done| {
+            let now = deadline.now();
+            let last = if done > 0 { now - began } else { 0.0 };
+            began = now;
+            let fits = deadline.left() > last;
+            ended = (!fits).then_some(done);
+            fits
+        },
+        &mut |event| console.event(event),
+    )?;
+    if let Some(done) = ended {
+        console.say(&format!("the flicker where chunks meet is measured at {done} cuts: no more fits into --minutes"));
+    }
+    Ok(found)
 }

@@ -23,6 +23,11 @@ impl Deadline {
         Self { clock, end: minutes.map_or(f64::INFINITY, |m| 60.0 * m) }
     }
 
+    /// The end of what may take this share of what is left.
+    pub(crate) fn part(&self, share: f64) -> Self {
+        Self { clock: self.clock.clone(), end: self.now() + share * self.left().max(0.0) }
+    }
+
     /// Whether there is one.
     pub(crate) fn is_set(&self) -> bool {
         self.end.is_finite()
@@ -36,5 +41,18 @@ impl Deadline {
     /// Seconds that are left; infinite where there is no end, negative where it is over.
     pub(crate) fn left(&self) -> f64 {
         self.end - self.now()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_part_ends_within_what_is_left() {
+        let clock = Stopwatch::of(|| 30.0);
+        assert_eq!(Deadline::of(clock.clone(), Some(1.0)).part(0.2).left(), 6.0);
+        assert_eq!(Deadline::of(clock.clone(), Some(0.25)).part(0.2).left(), 0.0, "it is over");
+        assert!(!Deadline::of(clock, None).part(0.2).is_set());
     }
 }

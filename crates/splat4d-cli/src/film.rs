@@ -3,6 +3,7 @@
 
 use crate::baking::{self, Baking, Outline, bake_like, poster};
 use crate::console::Console;
+use crate::deadline::Deadline;
 use crate::files::{cannot_read, human_bytes};
 use crate::playable::FILE;
 use crate::run_folder::Run;
@@ -21,31 +22,50 @@ use std::sync::atomic::AtomicBool;
 const AGAIN: &str = ".scene.again.s4d";
 
 /// Appends all parts that are finished and not in the file yet. Nothing happens to a file that is finished.
-pub(crate) fn append(run: &Path, chunked: &Chunked, stop: &AtomicBool, console: &Console) -> anyhow::Result<()> {
+pub(crate) fn append(
+    run: &Path,
+    chunked: &Chunked,
+    deadline: &Deadline,
+    stop: &AtomicBool,
+    console: &Console,
+) -> anyhow::Result<()> {
     let _turn = chunked.turn(stop)?;
     let path = run.join(FILE);
     if path.is_file() && !grows(&path)? {
         return Ok(());
     }
-    append_to(&path, run, chunked, false, console).map(|_| ())
+    append_to(&path, run, chunked, false, deadline, console).map(|_| ())
 }
 
 /// Appends what is missing and finishes the file. Returns its length, bytes.
-pub(crate) fn complete(run: &Path, chunked: &Chunked, stop: &AtomicBool, console: &Console) -> anyhow::Result<u64> {
+pub(crate) fn complete(
+    run: &Path,
+    chunked: &Chunked,
+    deadline: &Deadline,
+    stop: &AtomicBool,
+    console: &Console,
+) -> anyhow::Result<u64> {
     let _turn = chunked.turn(stop)?;
     let path = run.join(FILE);
     // Of a take that was joined before, chunks may have been trained again.
     let again = path.is_file() && !grows(&path)?;
     let growing = if again { run.join(AGAIN) } else { path.clone() };
-    let done = complete_from(&growing, &path, run, chunked, console);
+    let done = complete_from(&growing, &path, run, chunked, deadline, console);
     if again {
         let _ = std::fs::remove_file(&growing);
     }
     done
 }
 
-fn complete_from(growing: &Path, path: &Path, run: &Path, chunked: &Chunked, console: &Console) -> anyhow::Result<u64> {
-    let meta = append_to(growing, run, chunked, true, console)?;
+fn complete_from(
+    growing: &Path,
+    path: &Path,
+    run: &Path,
+    chunked: &Chunked,
+    deadline: &Deadline,
+    console: &Console,
+) -> anyhow::Result<u64> {
+    let meta = append_to(growing, run, chunked, true, deadline, console)?;
     let first = opened(run, chunked.some(0..1)?)?;
     let poster = poster(&first.scene, &first.stage(&first.views()?), antialias(&first));
     let mut source = File::open(growing).map_err(|e| cannot_read(growing, e))?;
@@ -66,8 +86,15 @@ fn grows(path: &Path) -> Result<bool> {
     Ok(Index::place(&header).is_err() || Index::grows(&header))
 }
 
-/// Appends what is missing; `thorough`: and looks whether what is there is of the chunks that are there.
-fn append_to(path: &Path, run: &Path, chunked: &Chunked, thorough: bool, console: &Console) -> anyhow::Result<Meta> {
+/// Appends what is missing, in time; `thorough`: and looks whether what is there is of the chunks that are there.
+fn append_to(
+    path: &Path,
+    run: &Path,
+    chunked: &Chunked,
+    thorough: bool,
+    deadline: &Deadline,
+    console: &Console,
+) -> anyhow::Result<Meta> {
     let done: Vec<Part> = chunked.parts().into_iter().filter(|p| chunked.is_done(*p)).collect();
     let place = |e: std::io::Error| Error::io("the playback file cannot be opened", e).at(path.display());
     let known = File::options().read(true).write(true).open(path).ok().and_then(|file| Growing::open(file).ok());
@@ -82,7 +109,7 @@ fn append_to(path: &Path, run: &Path, chunked: &Chunked, thorough: bool, console
         growing = Some(file).filter(|_| same);
     }
     let mut meta = growing.as_ref().map(|g| g.index().meta.clone());
-    for part in &done {
+    for (number, part) in done.iter().enumerate() {
         if meta.as_ref().is_some_and(|m| in_it(m, part).is_some()) {
             continue;
         }
@@ -97,7 +124,8 @@ fn append_to(path: &Path, run: &Path, chunked: &Chunked, thorough: bool, console
         let last = if *part == Part::Shared { whole[0] } else { scene.clip[1] };
         let source = opened(run, scene)?;
         let title = source.run.as_ref().map(Run::name).unwrap_or_default();
-        let baking = Baking { poster: false, ..Baking::default() };
+        let deadline = deadline.part(1.0 / (done.len() - number) as f64);
+        let baking = Baking { poster: false, deadline, ..Baking::default() };
         let (bytes, theirs) = if source.scene.is_empty() {
             (None, Meta::default())
         } else {

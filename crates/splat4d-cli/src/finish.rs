@@ -162,7 +162,8 @@ impl Times {
             orbit_seconds(scene.clip[1] - scene.clip[0]) * if have_ffmpeg() { ORBIT_FPS } else { ORBIT_FPS_PNG };
         Ok(Self {
             scores: step * HELD_STEPS * held as f64,
-            playback: step * BAKE_STEPS,
+            // That of a long take is made by then.
+            playback: if Chunked::is(&run.path) { 0.0 } else { step * BAKE_STEPS },
             film: step * FILM_STEPS * frames,
         })
     }

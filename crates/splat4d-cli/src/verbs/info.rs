@@ -171,7 +171,7 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
     let (times, sizes) = (capture.times(), sizes(&capture));
     let capture = Arc::new(capture);
     let mut listen = |event: &Event| console.event(event);
-    let outlook = Outlook::new(&capture, &recipe, None, true, &Stopwatch::start(), &mut listen)?;
+    let outlook = Outlook::new(&capture, &recipe, None, 0.0, true, &Stopwatch::start(), &mut listen)?;
     console.clear();
     let memory = outlook.as_ref().map_or_else(|| memory_estimate(&capture, &recipe), |o| o.memory);
     let checked = capture.check_poses();

@@ -2,6 +2,7 @@
 
 use crate::chunked;
 use crate::console::Console;
+use crate::deadline::Deadline;
 use crate::{finish, interrupt};
 use splat4d_train::output::OutputFolder;
 use splat4d_train::run::chunks::Chunked;
@@ -31,5 +32,5 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let stop = interrupt::flag("stopping");
     let chunked = Chunked::open(&args.run)?;
     let _folder = OutputFolder::amend(&args.run, "join")?;
-    chunked::join(&args.run, &chunked, args.no_eval, &args.measure, &stop, console)
+    chunked::join(&args.run, &chunked, args.no_eval, &args.measure, &Deadline::default(), &stop, console)
 }

@@ -246,7 +246,11 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         };
         let outlook = match at_once {
             true => None,
-            false => Outlook::new(&capture, &recipe, minutes, false, &clock, &mut |event| console.event(event))?,
+            false => {
+                let finish = finish::steps(&capture, &recipe, args.no_eval);
+                let listen = &mut |event: &Event| console.event(event);
+                Outlook::new(&capture, &recipe, minutes, finish, false, &clock, listen)?
+            }
         };
         console.clear();
         if let Some(outlook) = outlook {
@@ -267,7 +271,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             console.say(&chunked::in_words(&outlook));
             let watch = watch(&capture.name);
             let begun = Chunked::begin(&capture, &outlook.recipe, &run, &mut |event| listen(event, &watch))?;
-            let chunked = begun.expect("a take that has a plan is learnt by it");
+            let chunked = begun.expect("a take that has a plan is learnt by it").paced(outlook.pacing);
             let _folder = match folder {
                 Ok(own) => {
                     files::write(&run.join("cameras.json"), &serde_json::to_vec(&cameras_json(&once(&capture)))?)?;
@@ -368,7 +372,8 @@ fn in_chunks(
 ) -> anyhow::Result<()> {
     let options = TrainOptions {
         device: device::to_train(args.device, console),
-        clock,
+        clock: clock.clone(),
+        minutes: args.minutes,
         snapshots: watch.is_on().then_some(SNAPSHOT_INTERVAL),
         ..TrainOptions::default()
     };
@@ -388,7 +393,8 @@ fn in_chunks(
         None => {
             // The other workers are done with it, or wait for the same.
             let _owner = Owner::wait(run, JOIN, &mut |_| !stop.load(Ordering::Relaxed))?;
-            chunked::join(run, chunked, args.no_eval, &args.measure, stop, console)?;
+            let deadline = Deadline::of(clock, args.minutes);
+            chunked::join(run, chunked, args.no_eval, &args.measure, &deadline, stop, console)?;
             console.emit(&json!({"type": "done", "run": run.to_string_lossy()}));
         }
     }

@@ -93,6 +93,7 @@ pub fn compress(
             recipe: job.recipe.clone().with(|r| r.densify.strategy = Strategy::None),
             exposure: None,
             identity: job.settings.to_toml(),
+            budget: None,
         },
         dir,
         options,

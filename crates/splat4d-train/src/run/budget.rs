@@ -27,7 +27,7 @@ pub(super) const PROBES: f64 = 0.06;
 
 /// The time that a run may take. It stands in run.json, so that a resumed run keeps it.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct Budget {
+pub(crate) struct Budget {
     /// From the command's start to its end.
     pub minutes: f64,
     /// Seconds of it that were over before the first step.
@@ -87,6 +87,8 @@ pub(super) struct Replanned {
 #[derive(Clone, Debug)]
 pub(super) struct Planner {
     budget: Budget,
+    /// Seconds between two looks.
+    interval: f64,
     /// Seconds since the command's start at the last look.
     looked: f64,
     /// Seconds of steps since then: taken, and as they were timed before the run.
@@ -101,7 +103,9 @@ impl Planner {
     /// Begins at so many seconds of the command, behind these plans.
     pub(super) fn new(budget: Budget, now: f64, replans: &[Replan]) -> Self {
         let last = replans.last().map_or(0, |row| row.at);
-        Self { budget, looked: now, taken: [0.0; 2], slowness: None, last }
+        // A part that begins late in a command is looked at as often as one that begins at once.
+        let interval = (60.0 * budget.minutes - now).max(0.0) / LOOKS;
+        Self { budget, interval, looked: now, taken: [0.0; 2], slowness: None, last }
     }
 
     /// The time that the run is kept to.
@@ -119,7 +123,7 @@ impl Planner {
     pub(super) fn look(&mut self, now: f64, place: &Place<'_>) -> Option<Replanned> {
         let all = 60.0 * self.budget.minutes;
         let at = place.progress.iteration;
-        if now - self.looked < all / LOOKS || at <= self.last || self.taken[1] <= 0.0 {
+        if now - self.looked < self.interval || at <= self.last || self.taken[1] <= 0.0 {
             return None;
         }
         let measured = self.taken[0] / self.taken[1];

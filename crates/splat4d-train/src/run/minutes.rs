@@ -32,7 +32,7 @@ const ITERATIONS: std::ops::RangeInclusive<usize> = 50..=1_000_000;
 
 /// The duration of a run's steps by what they do.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub(super) struct Timing {
+pub(crate) struct Timing {
     /// In the first stage, and in those after it.
     stages: [Steps; 2],
     /// Seconds until the first scene is made.

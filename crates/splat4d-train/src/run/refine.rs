@@ -3,12 +3,14 @@
 #[cfg(test)]
 mod tests;
 
+use super::budget::Budget;
 use super::checkpoint;
 use super::dataset::Dataset;
 use super::identity::identity;
 use super::memory::memory_estimate;
 use super::open::OpenCapture;
 use super::session::{Outcome, Session, TrainOptions};
+use super::start::read_text;
 use crate::event::Event;
 use crate::learner::Exposure;
 use crate::methods::Stage;
@@ -37,6 +39,8 @@ pub(crate) struct Refine {
     /// All else that the result depends on, as text: settings and a fingerprint of the scene. A run is only continued
     /// with the same.
     pub identity: String,
+    /// The time that it is to keep to.
+    pub budget: Option<Budget>,
 }
 
 /// The result of a refinement.
@@ -65,18 +69,20 @@ pub(crate) fn refine(
         return Err(Error::input("there is not one stage to run").remedy("Ask for at least one step"));
     }
     let total: usize = job.stages.iter().map(|s| s.iterations).sum();
+    let begun = !checkpoint::list(run).is_empty();
+    // What a run that was begun followed; not what was followed by the run that the scene comes from.
+    let replans = if begun { followed(run)? } else { Replans::default() };
     let recipe = job
         .recipe
         .with(|r| {
             r.run.iterations = total.max(1);
-            // Those of the run that the scene comes from.
-            r.run.replans = Replans::default();
+            r.run.replans = replans;
         })
         .resolve();
     let opened = OpenCapture::with(job.frames).on(options.device);
     let plan = opened.plan(&recipe);
     let held = recipe.clone().with(|r| r.densify.max_cap = job.scene.len().max(1));
-    let session = Session {
+    let mut session = Session {
         run,
         opened: &opened,
         recipe: &recipe,
@@ -85,20 +91,31 @@ pub(crate) fn refine(
         estimate: memory_estimate(&opened.capture, &held),
         snapshots: options.snapshots,
         clock: options.clock.clone(),
-        budget: None,
+        budget: job.budget,
         own_loss: false,
         stop,
     };
     let mut trainer = opened.trainer_of(&plan, job.scene, job.stages);
+    trainer.replan(recipe.run.replans.rows());
     if job.exposure.is_some() {
         trainer.learner.exposure = job.exposure;
     }
-    let state = if checkpoint::list(run).is_empty() {
+    let state = if begun {
+        let state = session.restore(&mut trainer, listen)?;
+        // The budget is that of this command: what was trained before it does not count.
+        let before = options.clock.seconds() - state.seconds;
+        session.budget = session.budget.map(|b| Budget { before, ..b });
+        state
+    } else {
         trainer.check_not_empty()?;
         session.begin(&trainer, listen)?
-    } else {
-        session.restore(&mut trainer, listen)?
     };
     let outcome = session.drive(&mut trainer, state, listen)?;
     Ok(Refined { outcome, scene: trainer.learner.into_scene() })
+}
+
+/// The changes of plan that a run in a folder has followed. Errors: its recipe cannot be read.
+fn followed(run: &Path) -> Result<Replans> {
+    let file = run.join("recipe.toml");
+    Ok(Recipe::from_toml(&read_text(&file)?).map_err(|e| e.at(file.display()))?.run.replans)
 }

@@ -185,7 +185,8 @@ impl<'a> Bakery<'a> {
             return Ok(None);
         }
         let Options { cameras, path, .. } = self.options;
-        self.weights = Some(Weights::measure(self.scene, cameras, path, &mut |_, _| progress(0, total)));
+        let renders = self.options.renders;
+        self.weights = Some(Weights::measure(self.scene, cameras, path, renders, &mut |_, _| progress(0, total)));
         self.refine(&layers)?;
         let numbers = |l: &Cow<'_, Layer<f32>>| {
             let curved = Curved::new(l, &self.tree);

@@ -43,6 +43,9 @@ pub const SEGMENT: f64 = 1.0;
 pub const LOOKS: f64 = 30.0;
 /// Most rounds of [`Options::repeat`].
 pub const MAX_REPEAT: usize = 10_000;
+/// Default of [`Options::renders`]: as many as are worth their time.
+pub const RENDERS: usize =
+    if weights::STILL_RENDERS > weights::PATH_RENDERS { weights::STILL_RENDERS } else { weights::PATH_RENDERS };
 /// Default of [`Options::samples`]: 30,000 Gaussians at 27 seconds of 30 frames a second.
 pub const SAMPLES: usize = 24_000_000;
 
@@ -58,6 +61,9 @@ pub struct Options {
     /// Most samples of Gaussians at a time, over all Gaussians whose motion is not straight: bounds the time of baking.
     /// At least the clip's ends are sampled.
     pub samples: usize,
+    /// Most renders each, of cameras that stand still and of one that moves, that measure how strongly images react to errors:
+    /// bounds the time as well.
+    pub renders: usize,
     /// The take is played so many times over.
     pub repeat: usize,
     /// The cameras whose pixels count, at all times. No camera and no path: a 1080p image that the scene fills.
@@ -75,6 +81,7 @@ impl Default for Options {
             segment: SEGMENT,
             looks: LOOKS,
             samples: SAMPLES,
+            renders: RENDERS,
             repeat: 1,
             cameras: Vec::new(),
             path: Vec::new(),

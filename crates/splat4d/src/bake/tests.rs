@@ -358,12 +358,16 @@ fn a_file_is_as_good_and_can_be_baked_again() {
         write(&draft, &WriteConfig::default(), &mut bytes).unwrap();
         read(&bytes).unwrap()
     };
-    let like = |file: &Scene<f32>| {
-        let times: Vec<f64> = (0..57).step_by(5).map(|k| f64::from(k) / FPS).collect();
+    let like_at = |file: &Scene<f32>, times: &[f64]| {
         let mut cpu = device::cpu(RenderConfig::default());
-        compare(&scene, Shown::File(file), &shots(&times), cpu.as_mut(), &mut |_, _| true).unwrap().unwrap()
+        compare(&scene, Shown::File(file), &shots(times), cpu.as_mut(), &mut |_, _| true).unwrap().unwrap()
     };
+    let times: Vec<f64> = (0..57).step_by(5).map(|k| f64::from(k) / FPS).collect();
+    let like = |file: &Scene<f32>| like_at(file, &times);
     let played = file(&first);
+    // A held-out view may lie before the first training frame or after the last one, where a player shows the clip's ends.
+    let beyond = like_at(&played, &[scene.clip[0] - 0.5, scene.clip[1] + 0.5]);
+    assert!(beyond.worst_psnr > 38.0, "{beyond:?}");
     assert!(like(&played).psnr > 40.0, "{:?} {:?}", like(&played), likeness(&scene, &first));
     let again = baked(&played, &options(0.25));
     let pages = again.report.primitives as f64 / first.report.primitives as f64;
@@ -434,6 +438,20 @@ fn segments_go_to_when_a_moving_camera_looks() {
     let moving = like(&Options { path: path.clone(), ..Options::default() });
     let anywhere = like(&options(0.25));
     assert!(moving > anywhere + 1.0, "{moving} dB on the path, {anywhere} dB when it is not known");
+}
+
+/// Renders that weigh errors take time: there are no more than the options allow.
+#[test]
+fn renders_that_weigh_errors_are_bounded() {
+    let scene = leaps(20, 6.0);
+    let path: Vec<_> = (0..6).map(|k| (f64::from(k) / FPS, cameras().remove(0))).collect();
+    for (renders, taken) in [(0, 0), (2, 4), (4, 7)] {
+        let options = Options { renders, path: path.clone(), ..options(0.25) };
+        let mut calls = 0;
+        let mut bakery = Bakery::new(&scene, &options).unwrap();
+        bakery.measure(&mut |done, _| calls += usize::from(done == 0)).unwrap();
+        assert_eq!(calls, taken, "{renders} renders each");
+    }
 }
 
 /// The curve tells of what is baked.

@@ -15,9 +15,9 @@ use crate::scene::{Camera, Time};
 
 /// Renders of cameras that stand still, and of one that moves: enough that a rig and a clip are covered; each costs about
 /// three ordinary ones.
-const STILL_RENDERS: usize = 12;
+pub(super) const STILL_RENDERS: usize = 12;
 /// See [`STILL_RENDERS`].
-const PATH_RENDERS: usize = 32;
+pub(super) const PATH_RENDERS: usize = 32;
 /// Longer side of these renders, pixels.
 const SIDE: usize = 480;
 /// Share of an error that counts in every direction, also along a line of sight that no render looked across.
@@ -88,20 +88,23 @@ impl Weight {
 }
 
 impl Weights {
-    /// Renders the model as `cameras` see it at all times and as a moving camera does at its own (rising), and measures.
+    /// Renders the model as `cameras` see it at all times and as a moving camera does at its own (rising), each at most `most`
+    /// times, and measures.
     pub(super) fn measure(
         scene: &Scene<f32>,
         cameras: &[Camera],
         path: &[(f64, Camera)],
+        most: usize,
         progress: &mut dyn FnMut(usize, usize),
     ) -> Self {
-        let renders = if cameras.is_empty() { 0 } else { STILL_RENDERS };
+        let renders = if cameras.is_empty() { 0 } else { STILL_RENDERS.min(most) };
         let still = |i: usize| {
             let [from, to] = scene.clip;
             (from + (to - from) * (i as f64 + 0.5) / renders as f64, &cameras[i * cameras.len() / renders])
         };
-        let stride = path.len().div_ceil(PATH_RENDERS).max(1);
-        let moving: Vec<(f64, &Camera)> = path.iter().step_by(stride).map(|(t, c)| (*t, c)).collect();
+        let poses = PATH_RENDERS.min(most);
+        let stride = path.len().div_ceil(poses.max(1)).max(1);
+        let moving: Vec<(f64, &Camera)> = path.iter().step_by(stride).take(poses).map(|(t, c)| (*t, c)).collect();
         let shots: Vec<(f64, &Camera)> = (0..renders).map(still).chain(moving.iter().copied()).collect();
         let mut out = Self {
             seen: scene.layers.iter().map(|l| vec![Seen::default(); l.params.len()]).collect(),

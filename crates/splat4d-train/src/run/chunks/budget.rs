@@ -1,11 +1,12 @@
 //! What a take in chunks costs before it is begun, and the plan that stays within a memory limit and a time: shorter chunks of
-//! fewer Gaussians, and the steps of a chunk.
+//! fewer Gaussians, and the steps of a chunk. [`Pacing`] keeps the parts to that time while they are trained.
 
 use super::shared::STEPS;
 use super::{ChunkPlan, beginning, check, chosen};
 use crate::capture::Capture;
 use crate::event::Event;
 use crate::recipe::Recipe;
+use crate::run::budget::Budget;
 use crate::run::clock::Stopwatch;
 use crate::run::memory::memory_estimate;
 use crate::run::minutes::Timing;
@@ -39,18 +40,44 @@ pub struct Outlook {
     pub seconds: Option<f64>,
     /// Estimated memory of a part at most, bytes.
     pub memory: u64,
+    /// Keeps the parts to the minutes, where there are any.
+    pub pacing: Option<Pacing>,
+}
+
+/// The time of training: each part gets its share of what is left when it begins, so that a slow part or a slow machine
+/// costs later parts steps and not the user minutes.
+#[derive(Clone, Copy, Debug)]
+pub struct Pacing {
+    /// Of a chunk.
+    timing: Timing,
+    /// Seconds of the clock at which training ends.
+    end: f64,
+}
+
+impl Pacing {
+    /// Seconds of the clock at which a part ends that begins now and is this share of the work that is left.
+    pub(super) fn due(&self, now: f64, share: f64) -> f64 {
+        now + share * (self.end - now).max(0.0)
+    }
+
+    /// The time of a chunk that begins now and ends by `due`.
+    pub(super) fn budget(&self, now: f64, due: f64) -> Budget {
+        Budget { minutes: due / 60.0, before: now, finish: 0.0, timing: self.timing }
+    }
 }
 
 impl Outlook {
     /// Looks at a take as `train` would before its first step, of which at least [`look_ahead`](super::look_ahead) is listed.
-    /// Within `minutes`, if there are any, from the start of `clock` on, and within the recipe's memory limit. `timed`: steps
-    /// are timed even without `minutes`. `None`: the take is learnt at once.
+    /// Within `minutes`, if there are any, from the start of `clock` on, and within the recipe's memory limit. What the caller
+    /// does after training takes as long as `finish` steps at its end. `timed`: steps are timed even without `minutes`.
+    /// `None`: the take is learnt at once.
     ///
     /// Errors: what the recipe asks for cannot be had in chunks, or not within these limits; pictures that cannot be read.
     pub fn new(
         capture: &Arc<Capture>,
         recipe: &Recipe,
         minutes: Option<f64>,
+        finish: f64,
         timed: bool,
         clock: &Stopwatch,
         listen: &mut dyn FnMut(&Event),
@@ -62,7 +89,7 @@ impl Outlook {
         recipe.check()?;
         check(&recipe)?;
         let (mut recipe, plan, memory) = within_memory(capture, recipe, plan)?;
-        let mut seconds = None;
+        let (mut seconds, mut pacing) = (None, None);
         if minutes.is_some() || timed {
             let parts = (plan.len() + STEPS) as f64;
             let one = Arc::new(longest(capture, &plan));
@@ -70,13 +97,16 @@ impl Outlook {
             let probes = minutes.map_or(PREDICTION, |m| 60.0 * PROBES * m);
             let timing = Timing::measure(&opened, &recipe, clock, probes, &mut listen)?;
             if let Some(minutes) = minutes {
-                let left = (1.0 - JOIN) * (60.0 * minutes - clock.seconds());
+                let now = clock.seconds();
+                let [_, last] = timing.of(&opened, &recipe)?;
+                let left = (1.0 - JOIN) * (60.0 * minutes - now) - finish * last;
                 recipe = timing.fit(&opened, &recipe, left / parts - timing.scene, 0.0)?;
+                pacing = Some(Pacing { timing, end: now + left });
             }
             let [steps, _] = timing.of(&opened, &recipe)?;
             seconds = Some(parts * (steps + timing.scene));
         }
-        Ok(Some(Self { recipe, plan, seconds, memory }))
+        Ok(Some(Self { recipe, plan, seconds, memory, pacing }))
     }
 }
 

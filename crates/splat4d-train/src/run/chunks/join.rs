@@ -184,13 +184,18 @@ impl Chunked {
     }
 
     /// How well chunks meet, by cameras that stand still: those that training never saw, where there are any. `None`: there
-    /// is no such camera. Errors: chunks or pictures that cannot be read.
-    pub fn seams(&self, listen: &mut dyn FnMut(&Event)) -> Result<Option<Seams>> {
+    /// is no such camera, or no time. Before each cut `go_on` is asked; it hears how many are done. Errors: chunks or pictures that
+    /// cannot be read.
+    pub fn seams(&self, go_on: &mut dyn FnMut(usize) -> bool, listen: &mut dyn FnMut(&Event)) -> Result<Option<Seams>> {
         let antialias = if self.recipe.appearance.antialias { Antialias::On } else { Antialias::Off };
         let config = RenderConfig { antialias, ..RenderConfig::default() };
         let cuts: Vec<usize> = spread(self.plan.cuts.len(), MEASURED).collect();
-        let (mut sums, mut held_out) = ([[0.0; 2]; 2], false);
+        let (mut sums, mut held_out, mut measured) = ([[0.0; 2]; 2], false, 0);
         for (done, &cut) in cuts.iter().enumerate() {
+            if !go_on(done) {
+                break;
+            }
+            measured = done + 1;
             listen(&Event::Phase { name: "how chunks meet".into(), done, total: cuts.len() });
             let seam = self.plan.shared(cut);
             // The step into the overlap and the one out of it are part of it.
@@ -224,7 +229,7 @@ impl Chunked {
             return Ok(None);
         }
         let [across, inside] = sums.map(|[total, pairs]| total / pairs);
-        Ok(Some(Seams { across, inside, cuts: cuts.len(), held_out }))
+        Ok(Some(Seams { across, inside, cuts: measured, held_out }))
     }
 }
 

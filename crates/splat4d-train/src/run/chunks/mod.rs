@@ -15,7 +15,7 @@ mod tests;
 mod tie;
 mod train;
 
-pub use budget::Outlook;
+pub use budget::{Outlook, Pacing};
 pub use join::{Joined, Seams};
 pub use plan::ChunkPlan;
 
@@ -98,6 +98,8 @@ pub struct Chunked {
     source: PathBuf,
     recipe: Recipe,
     plan: ChunkPlan,
+    /// Keeps what this worker does to its minutes.
+    pacing: Option<Pacing>,
 }
 
 impl Chunked {
@@ -132,7 +134,7 @@ impl Chunked {
         let source = std::fs::canonicalize(&capture.root).unwrap_or_else(|_| capture.root.clone());
         let plan = stated.at_rest(&|frames| open_frames(&source, &recipe, vec![frames]), listen)?;
         write_atomically(&run.join("recipe.toml"), recipe.to_toml().as_bytes())?;
-        let begun = Self { run: run.to_owned(), source, recipe, plan };
+        let begun = Self { run: run.to_owned(), source, recipe, plan, pacing: None };
         begun.write_info(&capture.name, None)?;
         // Last: whoever finds it finds the others.
         let text = serde_json::to_string_pretty(&begun.plan).expect("a plan is plain data");
@@ -163,7 +165,12 @@ impl Chunked {
         let source = info["capture"].as_str().map(of_text).ok_or_else(|| {
             Error::input("it does not name its capture").at(run.join("run.json").display()).remedy("Train again")
         })?;
-        Ok(Self { run: run.to_owned(), source, recipe, plan })
+        Ok(Self { run: run.to_owned(), source, recipe, plan, pacing: None })
+    }
+
+    /// The same, with parts that are planned anew while they are trained, so that training ends on time.
+    pub fn paced(self, pacing: Option<Pacing>) -> Self {
+        Self { pacing, ..self }
     }
 
     /// The recipe that its chunks were planned for.
@@ -340,6 +347,15 @@ impl Chunked {
             Part::Chunk(c) => Some(train::train(self, c, options, stop, &mut listen)?),
         };
         Ok(outcome)
+    }
+
+    /// The pacing of a part that begins now: its start and its end, seconds of the clock.
+    fn pace(&self, part: Part, options: &TrainOptions) -> Option<(Pacing, [f64; 2])> {
+        let work = |part: &Part| if *part == Part::Shared { shared::STEPS } else { 1 };
+        let left: usize = self.parts().iter().filter(|p| !self.is_done(**p)).map(work).sum();
+        let now = options.clock.seconds();
+        let share = work(&part) as f64 / left.max(1) as f64;
+        self.pacing.map(|pacing| (pacing, [now, pacing.due(now, share)]))
     }
 
     /// The pictures of some frames of the take, as the recipe opens them.

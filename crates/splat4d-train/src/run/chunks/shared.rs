@@ -84,7 +84,8 @@ pub(super) fn train(
         medians(&opened, &looked_at, &source, &mut listen)?;
     }
     let recipe = of_medians(&chunked.recipe);
-    let own = TrainOptions { device: options.device, clock: options.clock.clone(), ..TrainOptions::default() };
+    let minutes = chunked.pace(super::Part::Shared, options).map(|(_, [_, due])| due / 60.0);
+    let own = TrainOptions { device: options.device, minutes, clock: options.clock.clone(), ..TrainOptions::default() };
     let outcome = if checkpoint::list(&folder).is_empty() {
         let capture = Arc::new(open_capture(&source, &recipe)?);
         train_run(capture, recipe, &folder, &own, stop, &mut listen)?

@@ -75,7 +75,9 @@ fn the_scene_does_not_depend_on_who_does_which_chunk_when_and_how_often_they_are
         assert_eq!((&own.params[GEOMETRY], &own.params[SH]), (&still.params[GEOMETRY], &still.params[SH]), "chunk {c}");
         assert!(chunk.len() <= recipe.densify.max_cap && !chunk.layers[0].params.is_empty());
     }
-    let seams = one.seams(&mut |_| {}).unwrap().unwrap();
+    let seams = |cuts: usize| one.seams(&mut |done| done < cuts, &mut |_| {}).unwrap();
+    assert!(seams(0).is_none() && seams(1).unwrap().cuts == 1, "it ends when there is no time");
+    let seams = seams(9).unwrap();
     assert!(seams.cuts == 2 && seams.held_out && seams.across.is_finite() && seams.inside > 0.0, "{seams:?}");
 }
 
@@ -180,12 +182,61 @@ fn the_tie_is_the_mean_difference_to_the_neighbour_where_both_are() {
     assert!((0..108).all(|i| (f64::from(d[i]) - 0.5 / 108.0 * off(i).signum()).abs() < 1e-9));
 }
 
+/// A clock on which every reading takes so many seconds: a step that is timed takes one, a step of a run some more.
+fn ticking(seconds: f64) -> Stopwatch {
+    let ticks = std::sync::atomic::AtomicUsize::new(0);
+    Stopwatch::of(move || ticks.fetch_add(1, Ordering::Relaxed) as f64 * seconds)
+}
+
+#[test]
+fn the_parts_end_on_time_on_a_machine_that_is_slower_than_it_was_timed() {
+    let (place, recipe, never) = (Place::of(MOMENTS), of_chunks(&[]), AtomicBool::new(false));
+    let minutes = 0.04;
+    let replans = |folder: &Path| {
+        let text = read_text(&folder.join("recipe.toml")).unwrap();
+        Recipe::from_toml(&text).unwrap().run.replans.rows().to_vec()
+    };
+    // Seconds of all parts, and the run.
+    let trained = |name: &str, paced: bool| {
+        let clock = ticking(4e-3);
+        let capture = place.open(&recipe);
+        let outlook = Outlook::new(&capture, &recipe, Some(minutes), 0.0, false, &clock, &mut |_| {}).unwrap().unwrap();
+        let begun = Chunked::begin(&capture, &outlook.recipe, &place.run(name), &mut |_| {}).unwrap().unwrap();
+        let run = begun.paced(outlook.pacing.filter(|_| paced));
+        let options = TrainOptions { clock: clock.clone(), ..TrainOptions::default() };
+        // Stopped once, after a chunk was planned anew: it goes on with the plans that it followed.
+        let (stop, mut stopped) = (AtomicBool::new(false), false);
+        let first = run.folder(Part::Chunk(0));
+        let mut hear = |event: &Event| {
+            if let Event::Checkpoint { path, .. } = event
+                && !stopped
+                && path.starts_with(&first)
+                && !replans(&first).is_empty()
+            {
+                stopped = true;
+                stop.store(true, Ordering::Relaxed);
+            }
+        };
+        if let Some(outcome) = run.work_all(&options, &stop, &mut || Ok(()), &mut hear).unwrap() {
+            assert!(paced && outcome.interrupted);
+            run.work_all(&options, &never, &mut || Ok(()), &mut |_| {}).unwrap();
+        }
+        (clock.seconds(), run)
+    };
+    let (late, _) = trained("late", false);
+    assert!(late > 1.5 * 60.0 * minutes, "{late} s: the machine is not slow");
+    let (seconds, run) = trained("paced", true);
+    assert!(seconds <= 60.0 * minutes, "{seconds} s of {}", 60.0 * minutes);
+    assert!(!replans(&run.folder(Part::Chunk(1))).is_empty(), "it was planned anew");
+    run.join().unwrap();
+}
+
 #[test]
 fn a_plan_keeps_to_its_memory_and_its_minutes() {
     let place = Place::of(MOMENTS);
     let outlook = |changes: &[&str], minutes: Option<f64>| {
         let recipe = of_chunks(changes);
-        Outlook::new(&place.open(&recipe), &recipe, minutes, false, &Stopwatch::start(), &mut |_| {})
+        Outlook::new(&place.open(&recipe), &recipe, minutes, 0.0, false, &ticking(1e-3), &mut |_| {})
     };
     let free = outlook(&["max_cap=20000"], None).unwrap().unwrap();
     let limit = free.memory - (4 << 20);
@@ -198,6 +249,10 @@ fn a_plan_keeps_to_its_memory_and_its_minutes() {
     let steps = [0.02, 0.2].map(|m| outlook(&[], Some(m)).unwrap().unwrap());
     assert!(steps[0].recipe.run.iterations < steps[1].recipe.run.iterations);
     assert!(steps[1].seconds.unwrap() <= 60.0 * 0.2);
+    // What follows training takes its steps from it.
+    let recipe = of_chunks(&[]);
+    let finish = Outlook::new(&place.open(&recipe), &recipe, Some(0.2), 2000.0, false, &ticking(1e-3), &mut |_| {});
+    assert!(finish.unwrap().unwrap().recipe.run.iterations < steps[1].recipe.run.iterations);
     assert!(outlook(&["chunks.frames=20"], None).unwrap().is_none(), "it is learnt at once");
 }
 

@@ -40,6 +40,7 @@ pub(super) fn train(
     listen: &mut dyn FnMut(&Event),
 ) -> Result<Outcome> {
     let mut listen = listen;
+    let pace = chunked.pace(Part::Chunk(chunk), options);
     let folder = chunked.folder(Part::Chunk(chunk));
     let recipe = of_frames(&chunked.recipe, chunked.plan.frames(chunk));
     let capture = Arc::new(open_frames(&chunked.source, &recipe, vec![chunked.plan.frames(chunk)])?);
@@ -76,7 +77,8 @@ pub(super) fn train(
     }
     let exposure = shared.exposure(&opened.capture);
     let frames = opened.frames.clone();
-    let job = Refine { made_by: MADE_BY.into(), scene, stages, frames, recipe, exposure, identity };
+    let budget = pace.map(|(pacing, [now, due])| pacing.budget(now, due));
+    let job = Refine { made_by: MADE_BY.into(), scene, stages, frames, recipe, exposure, identity, budget };
     Ok(refine(job, &folder, options, stop, listen)?.outcome)
 }
 

@@ -118,7 +118,11 @@ impl Bed {
         stages.iter_mut().for_each(|s| s.params.extend(meddle()));
         let (frames, recipe) = (self.frames.clone(), self.recipe.clone().with(|r| r.run.checkpoint_interval = 10));
         let (scene, made_by, identity) = (self.source.clone(), "compress".into(), "a third".into());
-        Job { refine: Refine { made_by, scene, stages, frames, recipe, exposure: None, identity }, codec, begun }
+        Job {
+            refine: Refine { made_by, scene, stages, frames, recipe, exposure: None, identity, budget: None },
+            codec,
+            begun,
+        }
     }
 
     fn run(&self, name: &str, job: Refine, stop: &AtomicBool, listen: &mut dyn FnMut(&Event)) -> Result<Refined> {
