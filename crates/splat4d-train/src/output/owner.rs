@@ -198,6 +198,16 @@ impl Drop for Owner {
     }
 }
 
+/// Refuses to write a file into a folder that another process owns. Errors: who that is.
+pub fn check_free(file: &Path) -> Result<()> {
+    let folder = file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let own = |who: &Standing| who.process == std::process::id() && who.machine == machine();
+    match Owner::holder(folder) {
+        Some(who) if !who.as_ref().is_some_and(own) => Err(in_use(folder, who.as_ref())),
+        _ => Ok(()),
+    }
+}
+
 pub(super) fn in_use(folder: &Path, who: Option<&Standing>) -> Error {
     let who = who.map_or_else(|| "another process".to_owned(), ToString::to_string);
     Error::new(crate::ErrorKind::Io, format!("is in use by {who}"))
