@@ -96,11 +96,11 @@ pub(crate) struct Args {
     #[arg(long, value_name = "N", requires = "near", value_parser = clap::value_parser!(u32).range(1..))]
     count: Option<u32>,
 
-    /// Write one page with the player and the scene in it; it needs no network and no server
+    /// Write one page with the player and the scene in it; it needs no network and no server. The ending .html says it too
     #[arg(long, conflicts_with_all = ["time", "sequence"], requires = "output")]
     html: bool,
     /// Keep the page's scene in this file, in the page's folder or below: for web servers, which can send parts of it
-    #[arg(long, value_name = "FILE", requires = "html")]
+    #[arg(long, value_name = "FILE", requires = "output")]
     link: Option<PathBuf>,
 
     #[arg(short = 'm', long = "model-path", alias = "model_path", hide = true, conflicts_with = "source")]
@@ -134,6 +134,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
                 .into());
         }
         return page(path, args, console);
+    }
+    if args.link.is_some() {
+        return Err(Error::input("--link is of a page").remedy("Add -o NAME.html.").into());
     }
     let mut source = Source::open(path)?;
     if let Some(name) = args.label.as_ref().filter(|_| args.tracks.is_none()) {
@@ -285,6 +288,11 @@ fn tracks(scene: &Scene<f32>, args: &Args, out: &Path, console: &Console) -> any
 /// Writes the page, and the scene beside it where that is wanted.
 fn page(path: &Path, args: &Args, console: &Console) -> anyhow::Result<()> {
     let out = args.output.as_ref().expect("clap asks for an output");
+    if !["html", "htm"].iter().any(|e| out.extension().is_some_and(|own| own.eq_ignore_ascii_case(e)))
+        && !out.starts_with("/dev")
+    {
+        return Err(Error::input("a page's name ends in .html").at(out.display()).remedy("Use -o NAME.html.").into());
+    }
     let run = Run::is(path).then(|| Run::open(path)).transpose()?;
     keep(path, run.as_ref(), out, &[])?;
     if let Some(link) = args.link.as_ref().filter(|link| !is_named(link)) {

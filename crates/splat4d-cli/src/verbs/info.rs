@@ -5,7 +5,7 @@ mod playback;
 
 use crate::chunked;
 use crate::console::Console;
-use crate::files::{grouped, human_bytes, human_seconds};
+use crate::files::{self, grouped, human_bytes, human_seconds};
 use crate::run_folder::Run;
 use crate::source::{Source, bundle, cloud};
 use serde_json::{Value, json};
@@ -167,6 +167,8 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
     }
     if args.doctor {
         check_apart(&args.output, &[Input::new(&capture.root, "the capture")])?;
+        // Before the pictures are looked at, which takes a while.
+        files::make_folder(&args.output)?;
         return doctor::of(&capture, &args.output, console);
     }
     let (first, last) = capture.time_range();
