@@ -4,6 +4,7 @@
 #
 #   examples/check-dialects.sh                 made-up Gaussians
 #   examples/check-dialects.sh FILE...         these as well: anything that splat4d opens
+#   SPLAT4D=PROGRAM examples/check-dialects.sh without building
 #
 # For every format: what we write, both programs read, and must read alike; what they write likewise. The last column is
 # the difference of pictures against the original, in dB.
@@ -12,10 +13,13 @@ here="$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)"
 work="$(mktemp -d)"
 trap 'rm -rf "$work"' EXIT
 
-cargo build --release --manifest-path "$here/../Cargo.toml" -p splat4d-cli
-target="$(cargo metadata --format-version 1 --no-deps --manifest-path "$here/../Cargo.toml" |
-    node -e 'process.stdout.write(JSON.parse(require("fs").readFileSync(0)).target_directory)')"
-ours="$target/release/splat4d"
+ours="${SPLAT4D:-}"
+if [ -z "$ours" ]; then
+    cargo build --release --manifest-path "$here/../Cargo.toml" -p splat4d-cli
+    target="$(cargo metadata --format-version 1 --no-deps --manifest-path "$here/../Cargo.toml" |
+        node -e 'process.stdout.write(JSON.parse(require("fs").readFileSync(0)).target_directory)')"
+    ours="$target/release/splat4d"
+fi
 (cd "$work" && npm init -y >/dev/null && npm install --silent --no-fund --no-audit node@22 @playcanvas/splat-transform@3 gsplat@1)
 node="$work/node_modules/.bin/node"
 theirs() { "$node" "$work/node_modules/@playcanvas/splat-transform/bin/cli.mjs" -q -w "$@" >/dev/null; }

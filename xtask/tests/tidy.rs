@@ -610,6 +610,30 @@ fn paths_in_documents_exist() {
 }
 
 #[test]
+fn tests_that_hold_promises_exist() {
+    let all: String = sources().iter().map(|path| read(path)).collect();
+    let (mut troubles, mut names) = (Vec::new(), 0);
+    let promises = read("SECURITY.md");
+    for row in promises.lines().filter(|l| l.starts_with("| ")) {
+        let held_by = row.trim_end_matches([' ', '|']).rsplit('|').next().expect("a split has a last part");
+        for name in held_by.split('`').skip(1).step_by(2).filter(|n| n.chars().all(|c| is_word(c) || c == ':')) {
+            names += 1;
+            let last = name.rsplit("::").next().expect("a split has a last part");
+            let is_there = match last {
+                // A module's tests, all of them.
+                "tests" => name.split("::").all(|part| part == "tests" || all.contains(&format!("mod {part};"))),
+                test => all.contains(&format!("fn {test}()")),
+            };
+            if !is_there {
+                troubles.push(format!("SECURITY.md: there is no test {name}"));
+            }
+        }
+    }
+    assert!(names > 0, "SECURITY.md names the tests that hold its promises");
+    report(troubles, "Name the test that holds the promise.");
+}
+
+#[test]
 fn the_code_maps_are_complete() {
     let mut troubles = Vec::new();
     let manifests = [files("crates", "toml"), files("studies", "toml")].concat();

@@ -192,9 +192,7 @@ impl Work {
     ) -> anyhow::Result<Compressed> {
         let unpruned = if self.order.unpruned { Some(self.train_unpruned(original, stop, console)?) } else { None };
         let smooth = antialias(original.recipe.appearance.antialias);
-        let read = |path: &Path| -> Result<Arc<[u8]>> {
-            Ok(std::fs::read(path).map_err(|e| files::cannot_read(path, e))?.into())
-        };
+        let read = |path: &Path| -> Result<Arc<[u8]>> { Ok(files::read(path)?.into()) };
         let file = read(&self.dir.join(playable::FILE))?;
         let plain = playable::of_run(&self.order.source);
         let plain = if plain.is_file() { Some(read(&plain)?) } else { None };

@@ -4,7 +4,7 @@
 use crate::baking::{self, Baking, Outline, bake_like, poster};
 use crate::console::Console;
 use crate::deadline::Deadline;
-use crate::files::{cannot_read, human_bytes};
+use crate::files::{self, cannot_read, human_bytes};
 use crate::playable::FILE;
 use crate::run_folder::Run;
 use crate::source::Source;
@@ -68,7 +68,7 @@ fn complete_from(
     let meta = append_to(growing, run, chunked, true, deadline, console)?;
     let first = opened(run, chunked.some(0..1)?)?;
     let poster = poster(&first.scene, &first.stage(&first.views()?), antialias(&first));
-    let mut source = File::open(growing).map_err(|e| cannot_read(growing, e))?;
+    let mut source = files::open(growing)?;
     let mut length = 0;
     write_atomically_with(path, &mut |out| {
         length = finish(&mut source, meta.clone(), poster.as_deref(), out)?;
@@ -81,7 +81,7 @@ fn complete_from(
 /// Whether a playback file is one that grows, or none that anybody could play.
 fn grows(path: &Path) -> Result<bool> {
     let mut header = Vec::new();
-    let file = File::open(path).map_err(|e| cannot_read(path, e))?;
+    let file = files::open(path)?;
     file.take(HEADER_BYTES as u64).read_to_end(&mut header).map_err(|e| cannot_read(path, e))?;
     Ok(Index::place(&header).is_err() || Index::grows(&header))
 }

@@ -22,6 +22,19 @@ const MARKERS: [&str; 4] = ["recipe.toml", "run.json", "scene.safetensors", "che
 pub(crate) const COMPRESS: &str = "compress.json";
 /// File that holds the settings `compress` was asked for.
 pub(crate) const ORDER: &str = "compress.toml";
+/// Files and folders of a run that no output of another command may replace; what is baked, rendered or reported is made again.
+const KEPT: [&str; 9] = [
+    "recipe.toml",
+    "run.json",
+    "cameras.json",
+    "metrics.csv",
+    "results.json",
+    "per_view.json",
+    "scene.safetensors",
+    "checkpoints",
+    ORDER,
+];
+
 /// One row of `metrics.csv`.
 #[derive(Clone, Debug, Default)]
 pub struct Metrics {
@@ -75,6 +88,15 @@ impl Run {
     /// Whether this folder is a run.
     pub fn is(path: &Path) -> bool {
         path.is_dir() && MARKERS.iter().any(|m| path.join(m).exists())
+    }
+
+    /// Whether a file is one that a run cannot do without.
+    pub(crate) fn needs(file: &Path) -> bool {
+        let real = file.canonicalize().or_else(|_| std::path::absolute(file)).unwrap_or_else(|_| file.to_owned());
+        let is_kept = |path: &Path| {
+            path.parent().is_some_and(Self::is) && path.file_name().is_some_and(|n| KEPT.iter().any(|k| n == *k))
+        };
+        real.ancestors().take(2).any(is_kept)
     }
 
     /// Whether this run has trained to its end.

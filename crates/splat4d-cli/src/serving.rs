@@ -161,7 +161,7 @@ impl Watch {
     /// Shows a finished run's playback file, where there is one.
     pub(crate) fn show(&self, run: &Path, iteration: usize) {
         let Some(running) = &self.running else { return };
-        if let Ok(bytes) = std::fs::read(playable::of_run(run)) {
+        if let Ok(bytes) = crate::files::read(&playable::of_run(run)) {
             running.set_scene(bytes.into(), &json!({ "iteration": iteration }));
         }
     }

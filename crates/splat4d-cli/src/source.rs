@@ -14,6 +14,7 @@ use splat4d::layers::{Layer, Scene};
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, GEOMETRY};
 use splat4d::{Error, Result, format};
+use splat4d_train::output::{Input, check_file, check_free};
 use std::path::Path;
 
 /// Share of a cloud, outermost first, that does not count for its size: a few far Gaussians must not shrink the rest.
@@ -44,6 +45,22 @@ pub struct Source {
     pub dialect: Option<Dialect>,
     /// Warnings about parts that could not be read, or had to be assumed.
     pub warnings: Warnings,
+}
+
+/// Refuses an output that would replace what is read (the scene, a file of its run's capture, or one of `others`) or what any run
+/// needs, and one in a folder that another process owns.
+pub(crate) fn keep(path: &Path, run: Option<&Run>, output: &Path, others: &[&Path]) -> Result<()> {
+    let capture = run.and_then(Run::capture);
+    let mut inputs = vec![Input { may_hold: run.is_some(), ..Input::new(path, "what is read,") }];
+    inputs.extend(capture.iter().map(|c| Input::new(c, "the run's capture")));
+    inputs.extend(others.iter().map(|file| Input::new(file, "what is read,")));
+    check_file(output, &inputs)?;
+    if Run::needs(output) {
+        return Err(Error::input("the output would replace a file that its run needs")
+            .at(output.display())
+            .remedy("Choose another name."));
+    }
+    check_free(output)
 }
 
 impl Source {
@@ -113,6 +130,11 @@ impl Source {
     pub(crate) fn own(scene: Scene<f32>) -> Self {
         let warnings = Warnings::default();
         Self { scene, run: None, ply: None, playback: None, provenance: None, dialect: None, warnings }
+    }
+
+    /// Refuses an output that would replace what was read.
+    pub(crate) fn keep(&self, path: &Path, output: &Path, others: &[&Path]) -> Result<()> {
+        keep(path, self.run.as_ref(), output, others)
     }
 
     /// The data set's cameras; those that a playback file brings along; empty for other bare files.

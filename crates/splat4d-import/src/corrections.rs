@@ -212,10 +212,9 @@ impl Corrections {
     /// Errors: no TOML, unknown keys, numbers that are none, cameras that there are not.
     pub fn read(folder: &Path, names: &[String]) -> Result<Self> {
         let path = folder.join(FILE);
-        let mut found = match std::fs::read_to_string(&path) {
-            Ok(text) => Self::parse(&text).map_err(|e| e.at(path.display()))?,
-            Err(e) if e.kind() == std::io::ErrorKind::NotFound => Self::default(),
-            Err(e) => return Err(Error::io("cannot be read", e).at(path.display())),
+        let mut found = match path.exists() {
+            true => Self::parse(&splat4d_train::files::read_text(&path)?).map_err(|e| e.at(path.display()))?,
+            false => Self::default(),
         };
         if let Some(unknown) = found.cameras.iter().find(|c| !names.contains(&c.name)) {
             return Err(Error::input(format!("there is no camera \"{:.80}\"", unknown.name))

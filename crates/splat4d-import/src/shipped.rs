@@ -107,7 +107,7 @@ fn side(info: &Info) -> usize {
 
 /// Extraction takes minutes: poses of another number of cameras are told before.
 fn check_poses(path: &Path, videos: &[PathBuf]) -> Result<()> {
-    let bytes = std::fs::read(path).map_err(|e| Error::io("cannot be read", e).at(path.display()))?;
+    let bytes = splat4d_train::files::read(path)?;
     let rows = Npy::read(&bytes).map_err(|e| e.at(path.display()))?.shape.first().copied().unwrap_or(0);
     if rows == videos.len() {
         return Ok(());

@@ -5,11 +5,16 @@ use splat4d::{Error, Result};
 use std::fs::File;
 use std::path::Path;
 
+/// What to do about a file that cannot be read.
+const CHECK: &str = "Check that the file exists and may be read by you.";
+
 /// Opens a file to read. Errors: none is there; a folder, pipe or device, on which reading could wait or never end.
 pub fn open(path: &Path) -> Result<File> {
-    let fail = |e| {
-        Error::io("cannot be read", e).at(path.display()).remedy("Check that the file exists and may be read by you.")
-    };
+    open_with(path, CHECK)
+}
+
+fn open_with(path: &Path, remedy: &str) -> Result<File> {
+    let fail = |e| Error::io("cannot be read", e).at(path.display()).remedy(remedy);
     // Before it is opened: that alone waits, where a pipe has no writer.
     if !std::fs::metadata(path).map_err(fail)?.is_file() {
         return Err(Error::input("is not a regular file, but a folder, pipe or device")
@@ -21,15 +26,25 @@ pub fn open(path: &Path) -> Result<File> {
 
 /// Reads a file. Errors: those of [`open`]; the disk's.
 pub fn read(path: &Path) -> Result<Vec<u8>> {
+    read_with(path, CHECK)
+}
+
+/// The same, with what to do about a file that is not there.
+pub(crate) fn read_with(path: &Path, remedy: &str) -> Result<Vec<u8>> {
     let mut bytes = Vec::new();
-    let length = std::io::Read::read_to_end(&mut open(path)?, &mut bytes);
+    let length = std::io::Read::read_to_end(&mut open_with(path, remedy)?, &mut bytes);
     length.map_err(|e| Error::io("cannot be read", e).at(path.display()))?;
     Ok(bytes)
 }
 
 /// Reads a text file, with or without byte-order mark. Errors: those of [`read`] and of [`text::decode`].
 pub fn read_text(path: &Path) -> Result<String> {
-    let bytes = read(path)?;
+    read_text_with(path, CHECK)
+}
+
+/// The same, with what to do about a file that is not there.
+pub(crate) fn read_text_with(path: &Path, remedy: &str) -> Result<String> {
+    let bytes = read_with(path, remedy)?;
     Ok(text::decode(&bytes).map_err(|e| e.at(path.display()))?.into_owned())
 }
 

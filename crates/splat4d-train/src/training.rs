@@ -80,9 +80,7 @@ impl Trained {
     /// The learnt scene. Errors: the run was stopped before its last step; its file cannot be read.
     pub fn scene(&self) -> Result<Scene<f32>> {
         let path: PathBuf = self.outcome.run.join("scene.safetensors");
-        let bytes = std::fs::read(&path).map_err(|e| {
-            crate::Error::io("the run has no scene yet", e).at(path.display()).remedy("Resume it to its last step")
-        })?;
+        let bytes = crate::files::read_with(&path, "Resume the run to its last step, which writes its scene")?;
         format::scene::read(&bytes).map_err(|e| e.at(path.display()))
     }
 

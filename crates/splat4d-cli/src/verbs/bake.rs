@@ -65,6 +65,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     }
     let source = Source::open(&args.source)?;
     not_empty(&source.scene, &args.source)?;
+    for file in std::iter::once(out).chain(&args.report) {
+        source.keep(&args.source, file, &[])?;
+    }
     let baking = Baking {
         options: Options {
             tolerance: args.tolerance.unwrap_or(TOLERANCE),

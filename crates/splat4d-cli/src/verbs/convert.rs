@@ -225,6 +225,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     asked(args)?;
     let mut source = Source::open_at(&args.input, args.fps.unwrap_or(DEFAULT_FPS))?.finite();
     not_empty(&source.scene, &args.input)?;
+    if !args.frames {
+        source.keep(&args.input, &args.output, &[])?;
+    }
     read_linear(&mut source, &args.linear);
     source.warnings.lines().iter().for_each(|w| console.warn(&format!("{w}.")));
     write(args, source, console)

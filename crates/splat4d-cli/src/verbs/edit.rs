@@ -9,7 +9,7 @@ use crate::source::{Source, not_empty};
 use serde_json::json;
 use splat4d::edit::{Context, Edits, Expr, Step, count, replay};
 use splat4d::{Error, Result};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Moments of the clip for which --count tells how many can be seen.
 const MOMENTS: usize = 5;
@@ -91,11 +91,17 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     if let Some(output) = &args.output {
         convert::check_output(output)?;
     }
-    let listed = args.edits.as_deref().map(editing::read).transpose()?.unwrap_or_default();
-    let edits = editing::with_steps(listed, args.steps());
+    let list = args.edits.as_deref().map(editing::read).transpose()?.unwrap_or_default();
+    let edits = editing::with_steps(list, args.steps());
     let mut source = Source::open(&args.scene)?.finite();
     not_empty(&source.scene, &args.scene)?;
     source.warnings.lines().iter().for_each(|w| console.warn(&format!("{w}.")));
+    let listed: Vec<&Path> = args.edits.iter().map(PathBuf::as_path).collect();
+    for file in args.output.iter().chain(&args.save) {
+        // A list may be saved with more steps in its own place.
+        let others = if args.save.as_ref() == Some(file) { &[] } else { &listed[..] };
+        source.keep(&args.scene, file, others)?;
+    }
     let title = title(&source, &args.scene);
     edits.check(&title)?;
     if edits.steps.is_empty() && args.count.is_none() {

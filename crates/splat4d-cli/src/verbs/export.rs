@@ -4,9 +4,10 @@
 use crate::asked::{self, Answer};
 use crate::console::Console;
 use crate::files;
-use crate::playable::Playable;
+use crate::playable::{Playable, is_named};
+use crate::run_folder::Run;
 use crate::sequence;
-use crate::source::{Source, not_empty};
+use crate::source::{Source, keep, not_empty};
 use serde_json::json;
 use splat4d::flow::tracks::{Tracks, every, nearest};
 use splat4d::layers::Scene;
@@ -95,11 +96,11 @@ pub(crate) struct Args {
     #[arg(long, value_name = "N", requires = "near", value_parser = clap::value_parser!(u32).range(1..))]
     count: Option<u32>,
 
-    /// Write one HTML page with player and scene; it needs no network and no server
+    /// Write one HTML page with player and scene; it needs no network and no server. Implied by an output NAME.html
     #[arg(long, conflicts_with_all = ["time", "sequence"], requires = "output")]
     html: bool,
     /// Store the page's scene in this file, in the page's folder or below, for web servers
-    #[arg(long, value_name = "FILE", requires = "html")]
+    #[arg(long, value_name = "FILE", requires = "output")]
     link: Option<PathBuf>,
 
     #[arg(short = 'm', long = "model-path", alias = "model_path", hide = true, conflicts_with = "source")]
@@ -123,13 +124,19 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
                 .into());
         }
     }
-    if args.html {
+    let named = |ending: &str| {
+        args.output.as_ref().is_some_and(|o| o.extension().is_some_and(|e| e.eq_ignore_ascii_case(ending)))
+    };
+    if args.html || named("html") || named("htm") {
         if args.label.is_some() {
             return Err(Error::input("a page shows the whole file")
                 .remedy("Make a file of what has the label first: splat4d edit RUN --crop 'label(NAME)' -o part.s4d.")
                 .into());
         }
         return page(path, args, console);
+    }
+    if args.link.is_some() {
+        return Err(Error::input("--link is of a page").remedy("Add -o NAME.html.").into());
     }
     let mut source = Source::open(path)?;
     if let Some(name) = args.label.as_ref().filter(|_| args.tracks.is_none()) {
@@ -138,6 +145,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             let of = labels::of(&layer.params);
             layer.edit(&RowEdit::prune(Space::Gaussians, of.iter().map(|l| *l == wanted)), &Rng::new(0, "export", 0));
         }
+    }
+    for file in args.output.iter().chain(&args.tracks) {
+        source.keep(path, file, &args.points.iter().map(PathBuf::as_path).collect::<Vec<_>>())?;
     }
     let scene = &source.scene;
     not_empty(scene, path)?;
@@ -172,7 +182,10 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     }
     let out = args.output.as_ref().expect("clap asks for an output");
     if out.extension().is_none_or(|e| !e.eq_ignore_ascii_case("ply")) && !out.starts_with("/dev") {
-        return Err(Error::input("only .ply files are written").at(out.display()).remedy("Use -o NAME.ply.").into());
+        return Err(Error::input("a time of the scene is written as .ply, and a page as .html")
+            .at(out.display())
+            .remedy("Use -o NAME.ply or -o NAME.html; `splat4d convert` writes other formats, `splat4d bake` a .s4d.")
+            .into());
     }
     let time = args.time.unwrap_or(scene.clip[0]);
     let n = write(time, out)?;
@@ -275,6 +288,19 @@ fn tracks(scene: &Scene<f32>, args: &Args, out: &Path, console: &Console) -> any
 /// Writes the page, and the scene beside it where that is wanted.
 fn page(path: &Path, args: &Args, console: &Console) -> anyhow::Result<()> {
     let out = args.output.as_ref().expect("clap asks for an output");
+    if !["html", "htm"].iter().any(|e| out.extension().is_some_and(|own| own.eq_ignore_ascii_case(e)))
+        && !out.starts_with("/dev")
+    {
+        return Err(Error::input("a page's name ends in .html").at(out.display()).remedy("Use -o NAME.html.").into());
+    }
+    let run = Run::is(path).then(|| Run::open(path)).transpose()?;
+    keep(path, run.as_ref(), out, &[])?;
+    if let Some(link) = args.link.as_ref().filter(|link| !is_named(link)) {
+        return Err(Error::input("the name does not end in .s4d")
+            .at(link.display())
+            .remedy("Use --link NAME.s4d.")
+            .into());
+    }
     let address = args.link.as_ref().map(|link| address(link, out)).transpose()?;
     let scene = Playable::open(path, console)?;
     let bytes = scene.bytes()?;

@@ -5,7 +5,7 @@ mod playback;
 
 use crate::chunked;
 use crate::console::Console;
-use crate::files::{grouped, human_bytes, human_seconds};
+use crate::files::{self, grouped, human_bytes, human_seconds};
 use crate::run_folder::Run;
 use crate::source::{Source, bundle, cloud};
 use serde_json::{Value, json};
@@ -18,6 +18,7 @@ use splat4d::scene::{GEOMETRY, SH};
 use splat4d::text::in_line;
 use splat4d_train::capture::{Aspect, Capture, Finding, Frame, Reach, Severity, Timing};
 use splat4d_train::event::Event;
+use splat4d_train::output::{Input, check_apart};
 use splat4d_train::path_text::to_text;
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::chunks::Outlook;
@@ -165,6 +166,9 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
         frame.tracks = frame.tracks.take().filter(|_| recipe.loss.tracks > 0.0);
     }
     if args.doctor {
+        check_apart(&args.output, &[Input::new(&capture.root, "the capture")])?;
+        // Before the pictures are looked at, which takes a while.
+        files::make_folder(&args.output)?;
         return doctor::of(&capture, &args.output, console);
     }
     let (first, last) = capture.time_range();

@@ -51,6 +51,10 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let source = Source::open(&args.scene)?;
     not_empty(&source.scene, &args.scene)?;
+    if let Some(output) = &args.output {
+        let read: Vec<&Path> = args.pictures.iter().chain(&args.start).map(PathBuf::as_path).collect();
+        source.keep(&args.scene, output, &read)?;
+    }
     let starts = starts(args, &source)?;
     let recipe = source.run.as_ref().and_then(|run| run.recipe().ok());
     let antialias = if recipe.is_some_and(|r| r.appearance.antialias) { Antialias::On } else { Antialias::Off };

@@ -131,6 +131,9 @@ fn one(args: &Args, path: &Path, camera: &Path, console: &Console) -> anyhow::Re
     }
     args.raw_format.suits(args.channel)?;
     let source = Source::open(path)?;
+    for file in args.output.iter().chain(&args.raw) {
+        source.keep(path, file, &[])?;
+    }
     let depth = args.channel == Channel::Depth || args.raw.is_some();
     let background = args.background.or(background).unwrap_or(source.scene.background);
     let painter = Painter::new(&source.scene, background, antialias(&source), depth);
@@ -221,6 +224,7 @@ fn film(args: &Args, path: &Path, console: &Console) -> anyhow::Result<()> {
     let stage = source.stage(&views);
     let shots = shots(&route, &clock, &views, &stage, args.size)?;
     let output = args.output.clone().unwrap_or_else(|| default_output(path, &route, source.run.is_some()));
+    source.keep(path, &output, &[])?;
     let size = [shots[0].camera.width, shots[0].camera.height];
     if let Some(other) = shots.iter().find(|s| [s.camera.width, s.camera.height] != size)
         && output.extension().is_some()

@@ -66,6 +66,11 @@ fn a_folder_in_use_is_refused_and_read() {
         let said = splat4d(&["train", str(&capture), "-o", str(&run)]).args(&TINY).args(force).run().failed();
         assert!(said.contains(&told) && said.contains("since 20"), "{said}");
     }
+    // One file in it is as much a write as a whole run.
+    let file = work.path().join("a.ply");
+    write_ply(&file, 0.0);
+    let said = splat4d(&["convert", str(&file), str(&run.join("scene.safetensors"))]).run().failed();
+    assert!(said.contains(&told) && !run.join("scene.safetensors").exists(), "{said}");
     drop(owner);
     // What a kill right after the start leaves: `--resume` begins again, as the command asked for it.
     splat4d(&["train", str(&capture), "-o", str(&run), "--no-eval"]).args(&TINY).run().ok();
@@ -83,6 +88,51 @@ fn a_folder_in_use_is_refused_and_read() {
     std::fs::write(run.join(".splat4d/asked"), asked).unwrap();
     splat4d(&["train", "--resume", str(&run), "--no-eval"]).run().ok();
     assert!(std::fs::read(run.join("scene.safetensors")).unwrap() == wanted);
+    // Its own files and its capture's are no outputs of other commands.
+    write_ply(&capture.join("points.ply"), 0.0);
+    let (scene, points) = (run.join("scene.safetensors"), capture.join("points.ply"));
+    for words in [
+        &["edit", str(&run), "--crop", "all", "-o", str(&scene)][..],
+        &["convert", str(&file), str(&scene)],
+        &["export", str(&run), "-o", str(&points)],
+        &["export", str(&run), "--html", "-o", str(&run.join("scene.s4d"))],
+    ] {
+        splat4d(words).run().refused();
+    }
+    assert!(std::fs::read(&scene).unwrap() == wanted);
+    // A pipe in place of one of its files is no reason to wait.
+    let info = run.join("run.json");
+    std::fs::remove_file(&info).unwrap();
+    if std::process::Command::new("mkfifo").arg(&info).status().is_ok_and(|s| s.success()) {
+        let said = splat4d(&["eval", str(&run), "--no-film"]).run().refused();
+        assert!(said.contains("run.json") && said.contains("regular file"), "{said}");
+    }
+}
+
+#[test]
+fn no_output_replaces_what_is_read() {
+    let work = tempfile::tempdir().unwrap();
+    let at = |name: &str| work.path().join(name);
+    write_ply(&at("a.ply"), 0.0);
+    write_ply(&at("frames/1.ply"), 0.0);
+    let before = std::fs::read(at("a.ply")).unwrap();
+    let (ply, page) = (at("a.ply"), at("a.html"));
+    for words in [
+        &["convert", str(&ply), str(&at("frames/../a.ply"))][..],
+        &["convert", str(&at("frames")), str(&at("frames/1.ply"))],
+        &["bake", str(&ply), "-o", str(&at("a.s4d")), "--report", str(&ply)],
+        &["edit", str(&ply), "--crop", "all", "-o", str(&ply)],
+        &["edit", str(&ply), "--crop", "all", "--save", str(&ply), "-o", str(&at("b.ply"))],
+        &["export", str(&ply), "-o", str(&page), "--link", str(&ply)],
+        &["export", str(&ply), "-o", str(&ply)],
+    ] {
+        splat4d(words).run().refused();
+        assert!(std::fs::read(&ply).unwrap() == before && !at("a.s4d").exists(), "{words:?}");
+    }
+    // An ending says what is wanted, and a file may be replaced that is not read.
+    splat4d(&["export", str(&ply), "-o", str(&page)]).run().ok();
+    assert!(std::fs::read(&page).unwrap().starts_with(b"<!doctype html>"), "a page");
+    splat4d(&["convert", str(&ply), str(&at("frames/1.ply"))]).run().ok();
 }
 
 #[test]

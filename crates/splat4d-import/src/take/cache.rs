@@ -40,7 +40,7 @@ impl Cache {
         make: impl FnOnce() -> Result<T>,
     ) -> Result<T> {
         let path = self.path(kind, made_of);
-        let known = std::fs::read(&path).ok().and_then(|b| serde_json::from_slice::<Entry<T>>(&b).ok());
+        let known = splat4d_train::files::read(&path).ok().and_then(|b| serde_json::from_slice::<Entry<T>>(&b).ok());
         if let Some(entry) = known.filter(|e| e.made_of == made_of) {
             return Ok(entry.value);
         }
@@ -62,7 +62,7 @@ impl Cache {
         make: impl FnOnce(&[[usize; 2]]) -> Result<Vec<T>>,
     ) -> Result<Vec<T>> {
         let path = self.path(kind, "pairs");
-        let read = std::fs::read(&path).ok().and_then(|b| serde_json::from_slice(&b).ok());
+        let read = splat4d_train::files::read(&path).ok().and_then(|b| serde_json::from_slice(&b).ok());
         let mut known: BTreeMap<String, T> = read.unwrap_or_default();
         let key = |&[a, b]: &[usize; 2]| format!("{} {}", names[a], names[b]);
         let missing: Vec<[usize; 2]> = pairs.iter().copied().filter(|p| !known.contains_key(&key(p))).collect();

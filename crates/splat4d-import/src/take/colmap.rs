@@ -73,7 +73,7 @@ pub(super) fn calibrate(
 ) -> Result<Calibration> {
     let work = stored.folder.join("import/colmap");
     let (note, made_of) = (work.join("made_of.txt"), stored.fingerprint());
-    if std::fs::read_to_string(&note).ok().as_deref() != Some(&made_of) {
+    if splat4d_train::files::read_text(&note).ok().as_deref() != Some(&made_of) {
         let helps = helps()?;
         prepare(stored, &work, progress)?;
         for (k, (step, help)) in STEPS.iter().zip(&helps).enumerate() {
@@ -122,7 +122,7 @@ fn prepare(stored: &Stored<'_>, work: &Path, progress: &mut Progress<'_>) -> Res
         write_atomically(&work.join("images").join(format!("{}.png", p.name)), &bytes)?;
         if let Some(masks) = stored.masks.get(c) {
             let from = stored.folder.join(&masks.files[p.shots.len() / 2]);
-            let mask = std::fs::read(&from).map_err(|e| Error::io("the mask cannot be read", e).at(from.display()))?;
+            let mask = splat4d_train::files::read(&from)?;
             write_atomically(&work.join("masks").join(format!("{}.png.png", p.name)), &mask)?;
         }
     }

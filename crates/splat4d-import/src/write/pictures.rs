@@ -309,7 +309,7 @@ impl Note {
 
 /// Notes that can be read; others are as good as none.
 fn read(path: &Path) -> Option<Note> {
-    serde_json::from_slice(&std::fs::read(path).ok()?).ok()
+    serde_json::from_slice(&splat4d_train::files::read(path).ok()?).ok()
 }
 
 /// Removes the pictures that were written into a folder before, and nothing else.

@@ -499,7 +499,7 @@ fn by_file(frames: &[usize], value: impl Fn(usize) -> Value) -> Value {
 /// Puts entries into a JSON file that may hold others.
 pub(super) fn merge(path: &Path, entries: Value) -> Result<()> {
     // A damaged file is replaced: everything in it can be measured again.
-    let old = std::fs::read_to_string(path).ok().and_then(|text| serde_json::from_str::<Value>(&text).ok());
+    let old = crate::files::read_text(path).ok().and_then(|text| serde_json::from_str::<Value>(&text).ok());
     let mut all = old.filter(Value::is_object).unwrap_or_else(|| json!({}));
     if let (Value::Object(all), Value::Object(entries)) = (&mut all, entries) {
         for (name, entry) in entries {

@@ -160,7 +160,7 @@ impl OutputFolder {
 
     /// What the unfinished command in a folder was asked for.
     pub fn asked(path: &Path) -> Option<String> {
-        std::fs::read_to_string(path.join(STATE).join(ASKED)).ok()
+        crate::files::read_text(&path.join(STATE).join(ASKED)).ok()
     }
 
     /// The new output has begun: what it replaces is deleted now, and what is there stays when the command fails.

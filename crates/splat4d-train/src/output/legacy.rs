@@ -36,7 +36,7 @@ const HEAD: usize = 512;
 
 /// Whether a folder is a run: its `recipe.toml` or `run.json` is one that we wrote.
 pub(super) fn is_run(folder: &Path) -> bool {
-    let text = |name: &str| std::fs::read_to_string(folder.join(name)).ok();
+    let text = |name: &str| crate::files::read_text(&folder.join(name)).ok();
     let recipe = text("recipe.toml").is_some_and(|t| !t.trim().is_empty() && Recipe::from_toml(&t).is_ok());
     let info = || {
         let value: serde_json::Value = serde_json::from_str(&text("run.json")?).ok()?;
@@ -75,7 +75,7 @@ fn collect(root: &Path, at: &Path, out: &mut Vec<PathBuf>) {
         }
     }
     let points = at.join("points.ply");
-    if std::fs::read(root.join(&points))
+    if crate::files::read(&root.join(&points))
         .is_ok_and(|b| b[..b.len().min(HEAD)].windows(FOUND_POINTS.len()).any(|w| w == FOUND_POINTS))
     {
         out.push(points);

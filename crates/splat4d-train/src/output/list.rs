@@ -131,7 +131,7 @@ fn is_folder(path: &Path) -> bool {
 
 /// The whole lines that lead nowhere but below the folder.
 fn read(file: &Path) -> BTreeSet<PathBuf> {
-    let text = std::fs::read_to_string(file).unwrap_or_default();
+    let text = crate::files::read_text(file).unwrap_or_default();
     let whole = text.split_inclusive('\n').filter_map(|line| line.strip_suffix('\n'));
     let below = |p: &PathBuf| {
         let mut parts = p.components();

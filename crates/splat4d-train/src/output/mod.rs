@@ -20,8 +20,8 @@ mod write;
 pub use date::rfc3339;
 pub use folder::{Found, Mixes, OutputFolder, Request};
 pub use list::note;
-pub use owner::{Owner, Standing};
-pub use place::{Input, check_apart};
+pub use owner::{Owner, Standing, check_free};
+pub use place::{Input, check_apart, check_file};
 pub use write::{Staged, write_atomically, write_atomically_with};
 
 /// Subfolder of an output folder with its lock, its owner and the list of its files.

@@ -61,7 +61,7 @@ impl Standing {
     }
 
     fn read(path: &Path) -> Option<Self> {
-        serde_json::from_slice(&std::fs::read(path).ok()?).ok()
+        serde_json::from_slice(&crate::files::read(path).ok()?).ok()
     }
 
     fn bytes(&self) -> Vec<u8> {
@@ -133,8 +133,14 @@ impl Owner {
         // What a dead owner left half-written. Workers on parts of a folder have folders and locks of their own.
         write::remove_leftovers(folder);
         let standing = Standing::new(command);
-        let mut file = File::options().write(true).create(true).truncate(true).open(&record).map_err(fail)?;
-        file.write_all(&standing.bytes()).map_err(fail)?;
+        let opened = File::options().write(true).create(true).truncate(true).open(&record);
+        let written = opened.and_then(|mut file| file.write_all(&standing.bytes()).map(|()| file));
+        let mut file = written.map_err(|e| {
+            // A full disk: nothing stays of what was made for nothing.
+            let _ = std::fs::remove_file(&record);
+            discard(&state);
+            fail(e)
+        })?;
         let done = Arc::new((Mutex::new(false), Condvar::new()));
         let heart = std::thread::spawn({
             let (standing, done) = (standing.clone(), done.clone());
@@ -162,9 +168,7 @@ impl Owner {
     /// Gives the folder back and removes all that says that it was ever owned: while the lock is held, so that nobody else has it.
     pub(super) fn remove(mut self, folder: &Path) {
         self.rest();
-        let state = folder.join(STATE);
-        let _ = std::fs::remove_file(state.join(LOCK));
-        let _ = std::fs::remove_dir(&state);
+        discard(&folder.join(STATE));
     }
 
     /// Ends the heartbeat and the record.
@@ -195,6 +199,22 @@ impl Drop for Owner {
     fn drop(&mut self) {
         self.rest();
         drop(self.lock.take());
+    }
+}
+
+/// Removes the lock, which is held, and the state where nothing else is in it.
+fn discard(state: &Path) {
+    let _ = std::fs::remove_file(state.join(LOCK));
+    let _ = std::fs::remove_dir(state);
+}
+
+/// Refuses to write a file into a folder that another process owns. Errors: who that is.
+pub fn check_free(file: &Path) -> Result<()> {
+    let folder = file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let own = |who: &Standing| who.process == std::process::id() && who.machine == machine();
+    match Owner::holder(folder) {
+        Some(who) if !who.as_ref().is_some_and(own) => Err(in_use(folder, who.as_ref())),
+        _ => Ok(()),
     }
 }
 

@@ -49,6 +49,26 @@ pub fn check_apart(output: &Path, inputs: &[Input<'_>]) -> Result<()> {
     Ok(())
 }
 
+/// Refuses to replace a file that is read, or one in a folder that is read. New files, devices and pipes are no loss.
+pub fn check_file(output: &Path, inputs: &[Input<'_>]) -> Result<()> {
+    if !output.is_file() {
+        return Ok(());
+    }
+    let above = ids(output);
+    for input in inputs {
+        let Some(read) = id(input.path) else { continue };
+        let how = match above.iter().position(|o| o.as_ref() == Some(&read)) {
+            Some(0) => "is",
+            Some(_) if !input.may_hold => "is a file of",
+            _ => continue,
+        };
+        return Err(Error::input(format!("the output {how} {} {}", input.what, input.path.display()))
+            .at(output.display())
+            .remedy("Choose another name: what is read is never replaced"));
+    }
+    Ok(())
+}
+
 /// What the file system calls a file or folder.
 #[cfg(unix)]
 type Id = (u64, u64);
@@ -129,6 +149,15 @@ mod tests {
             let input = [Input::new(&link, "the capture")];
             assert!(check_apart(&capture, &input).is_err() && check_apart(&at("capture/run"), &input).is_err());
         }
+        std::fs::write(capture.join("points.ply"), b"x").unwrap();
+        let file = |output: &Path, may_hold: bool| {
+            check_file(output, &[Input { may_hold, ..Input::new(&capture, "the capture") }]).map_err(|e| e.to_string())
+        };
+        let read = at("other/../capture/points.ply");
+        assert!(file(&read, false).unwrap_err().contains("is a file of the capture"));
+        assert_eq!([file(&read, true), file(&capture.join("new.ply"), false)], [Ok(()), Ok(())]);
+        let error = check_file(&read, &[Input::new(&capture.join("points.ply"), "the scene")]).unwrap_err().to_string();
+        assert!(error.contains("the output is the scene"), "{error}");
         assert!(check_apart(&at("x"), &[Input::new(&at("nowhere"), "the capture")]).is_ok(), "readers say that");
     }
 }

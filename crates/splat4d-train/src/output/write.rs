@@ -1,6 +1,7 @@
 //! Writes files so that nobody ever finds half of one: under a temporary name in the same folder, then renamed.
 
 use super::list;
+use super::owner::check_free;
 use crate::{Error, Result};
 use std::collections::BTreeSet;
 use std::ffi::{OsStr, OsString};
@@ -56,6 +57,7 @@ impl Staged {
             return Ok(Self { temporary: None, target });
         }
         if !list::note_folder(&target)? {
+            check_free(&target)?;
             remove_leftovers_once(&target);
         }
         let temporary = target.with_file_name(temporary_name(name));

@@ -30,7 +30,7 @@ pub fn read(run: &Path) -> Result<Option<Value>> {
     if !path.is_file() {
         return Ok(None);
     }
-    let text = std::fs::read_to_string(&path).map_err(|e| Error::io("it cannot be read", e).at(path.display()))?;
+    let text = crate::files::read_text(&path)?;
     let damage = |what: String| {
         Error::input(what)
             .at(path.display())

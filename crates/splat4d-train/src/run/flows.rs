@@ -33,7 +33,7 @@ pub(super) fn complete(
         return Ok(opened);
     }
     let mark = format!("{} {}", fingerprint(capture), env!("CARGO_PKG_VERSION"));
-    let kept = std::fs::read(run.join(FOLDER).join(MARK)).is_ok_and(|text| text == mark.as_bytes());
+    let kept = crate::files::read(&run.join(FOLDER).join(MARK)).is_ok_and(|text| text == mark.as_bytes());
     if !kept {
         let mut progress = Progress(listen);
         // Of most pictures the pyramid is needed twice: as where flow comes from and where it goes.

@@ -52,7 +52,7 @@ impl Metrics {
         render_backward_ms,motion_backward_ms,adam_ms,load_ms,other_ms";
 
     pub(super) fn open(run: &Path, iteration: usize, iterations: usize) -> Self {
-        let text = std::fs::read_to_string(run.join("metrics.csv")).unwrap_or_default();
+        let text = crate::files::read_text(&run.join("metrics.csv")).unwrap_or_default();
         let row = |line: &str| {
             Some(Row { iteration: line.split(',').next()?.parse().ok()?, begun: None, text: line.to_owned() })
         };

@@ -43,7 +43,8 @@ pub(super) fn complete(
     let moments = moments(&plan)?;
     let count = (WANTED * recipe.init.count as f64) as usize;
     let mark = format!("comment of {} {} {count} {moments:?}", fingerprint(capture), env!("CARGO_PKG_VERSION"));
-    let kept = std::fs::read(run.join(FILE)).is_ok_and(|bytes| bytes.windows(mark.len()).any(|w| w == mark.as_bytes()));
+    let kept =
+        crate::files::read(&run.join(FILE)).is_ok_and(|bytes| bytes.windows(mark.len()).any(|w| w == mark.as_bytes()));
     if !kept {
         let mut cloud = PointCloud::default();
         for p in vision::points(opened.frames.as_ref(), &moments, count, &mut Progress(listen))? {

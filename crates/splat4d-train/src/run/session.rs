@@ -12,6 +12,7 @@ use super::priors;
 use super::snapshot::Snapshots;
 use super::start::read_info;
 use crate::event::{Event, Progress};
+use crate::files;
 use crate::loss::image::ImageTerm;
 use crate::path_text::to_text;
 use crate::recipe::Recipe;
@@ -116,10 +117,8 @@ pub(super) fn restore_newest(
 ) -> Result<(RunState, Option<String>)> {
     let mut first_error = None;
     for path in checkpoint::list(run).iter().rev() {
-        let read = std::fs::read(path)
-            .map_err(|e| Error::io("the checkpoint cannot be read", e))
-            .and_then(|bytes| checkpoint::read(&bytes, trainer, identity))
-            .map_err(|e| e.at(path.display()));
+        let read = files::read(path)
+            .and_then(|bytes| checkpoint::read(&bytes, trainer, identity).map_err(|e| e.at(path.display())));
         match read {
             Ok(state) => return Ok((state, first_error.map(|e: Error| e.to_string()))),
             // Another version or capture is not damage: older ones would say the same.

@@ -255,6 +255,5 @@ pub(super) fn read_info(run: &Path) -> Result<serde_json::Value> {
 }
 
 pub(super) fn read_text(path: &Path) -> Result<String> {
-    std::fs::read_to_string(path)
-        .map_err(|e| Error::io("the run cannot be read", e).at(path.display()).remedy("Give the folder of a run"))
+    crate::files::read_text_with(path, "Give the folder of a run")
 }

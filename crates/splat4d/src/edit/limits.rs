@@ -1,6 +1,6 @@
 //! What a step may make of a scene: as many Gaussians as memory holds, a clip that can be gone through, finite numbers.
 
-use super::Context;
+use super::{Context, Step};
 use crate::layers::{Evaluation, Layer, Scene};
 use crate::scene::Time;
 use crate::scene::time::DEFAULT_FPS;
@@ -61,6 +61,24 @@ pub(super) fn check_room(size: Size, context: &dyn Context) -> Result<()> {
         what += &format!("; {:.1} GiB of memory are available", gib(free));
     }
     Err(Error::new(ErrorKind::Memory, what).remedy("Leave the step out, or delete Gaussians before it"))
+}
+
+/// Refuses steps that surely outgrow memory before the first of them is taken: copies of everything double a scene until a step
+/// removes something. Errors: which step, counted from `before`.
+pub(super) fn check_growth(before: usize, steps: &[Step], scene: &Scene<f32>, context: &dyn Context) -> Result<()> {
+    let mut size = Size::of_all(&scene.layers);
+    for (i, step) in steps.iter().enumerate() {
+        match step {
+            Step::Duplicate { select, .. } if select.trim() == "all" => {
+                size = size.plus(size);
+                let at = |e: Error| e.at(format!("edit {} ({})", before + i + 1, step.name()));
+                check_room(size, context).map_err(at)?;
+            }
+            Step::Delete { .. } | Step::Crop { .. } | Step::Cut { .. } | Step::Floaters { .. } => break,
+            _ => {}
+        }
+    }
+    Ok(())
 }
 
 /// Refuses a clip of so many seconds before anything goes through it.

@@ -362,6 +362,7 @@ pub fn replay_after(
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<(Scene<f32>, Vec<Done>)> {
     scene.check_finite()?;
+    limits::check_growth(done.len(), steps, &scene, context)?;
     for (i, step) in steps.iter().enumerate() {
         progress(i, steps.len());
         let at = |e: Error| e.at(format!("edit {} ({})", done.len() + 1, step.name()));

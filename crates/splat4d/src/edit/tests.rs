@@ -684,6 +684,10 @@ fn what_grows_beyond_memory_or_time_is_refused_before() {
     };
     let double = r#"{"do": "duplicate", "select": "all", "name": "copy"}"#;
     let many = format!("[{}]", [double; 60].join(","));
+    // In advance: no step is taken.
+    let mut taken = 0;
+    replay(&steps(&many), scene.clone(), &small, &mut |_, _| taken += 1).map(|_| ()).unwrap_err();
+    assert_eq!(taken, 0);
     let error = refused(&many, &small);
     let text = error.to_string();
     assert!(error.kind() == ErrorKind::Memory && text.contains("duplicate") && text.contains("Gaussians"), "{text}");

@@ -2,7 +2,7 @@
 
 use crate::console::Console;
 use crate::draw::antialias;
-use crate::files::{cannot_read, grouped, human_bytes};
+use crate::files::{self, grouped, human_bytes};
 use crate::measure::{Side, Subject, What, in_turns, looks_of};
 use crate::source::{Source, not_empty};
 use serde::Serialize;
@@ -57,7 +57,7 @@ impl Opened {
         let source = Source::open(path)?;
         not_empty(&source.scene, path)?;
         let bytes = match &source.playback {
-            Some(_) => Some(std::fs::read(path).map_err(|e| cannot_read(path, e))?.into()),
+            Some(_) => Some(files::read(path)?.into()),
             None => None,
         };
         Ok(Self { source, bytes })

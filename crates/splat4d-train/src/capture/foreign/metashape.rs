@@ -33,9 +33,9 @@ fn find(root: &Path) -> Option<PathBuf> {
 fn is(path: &Path) -> bool {
     use std::io::Read;
     let mut head = Vec::new();
-    let read = std::fs::File::open(path).and_then(|f| f.take(HEAD as u64).read_to_end(&mut head));
+    let read = crate::files::open(path).is_ok_and(|f| f.take(HEAD as u64).read_to_end(&mut head).is_ok());
     let text = String::from_utf8_lossy(&head);
-    read.is_ok() && text.contains("<document") && text.contains("<chunk") && text.contains("<sensor")
+    read && text.contains("<document") && text.contains("<chunk") && text.contains("<sensor")
 }
 
 /// A sensor's lens; its size.

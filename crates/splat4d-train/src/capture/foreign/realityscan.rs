@@ -30,10 +30,10 @@ fn find(root: &Path) -> Option<PathBuf> {
 fn is(path: &Path) -> bool {
     use std::io::Read;
     let mut head = Vec::new();
-    let read = std::fs::File::open(path).and_then(|f| f.take(HEAD as u64).read_to_end(&mut head));
+    let read = crate::files::open(path).is_ok_and(|f| f.take(HEAD as u64).read_to_end(&mut head).is_ok());
     let text = String::from_utf8_lossy(&head);
     let columns = columns(text.lines().next().unwrap_or_default());
-    read.is_ok() && COLUMNS.iter().all(|c| columns.contains_key(*c))
+    read && COLUMNS.iter().all(|c| columns.contains_key(*c))
 }
 
 /// Names of columns and their places.

@@ -322,7 +322,5 @@ pub(super) fn read_scene(path: &Path) -> Result<Scene<f32>> {
 }
 
 pub(super) fn read_file(path: &Path) -> Result<Vec<u8>> {
-    std::fs::read(path).map_err(|e| {
-        Error::io("it cannot be read", e).at(path.display()).remedy("Train the chunk again: delete its folder")
-    })
+    crate::files::read_with(path, "Train the chunk again: delete its folder")
 }
