@@ -25,7 +25,7 @@ const MOST_LEVELS: usize = 4;
 pub(super) fn fill(take: &mut Take) -> Result<()> {
     let folders: Vec<String> = rig::file_names(&take.root).into_iter().filter(|n| take.root.join(n).is_dir()).collect();
     let named = |known: &&str| folders.iter().find(|n| fold(n) == **known);
-    let Some(name) = FOLDERS.iter().find_map(|known| named(known)) else {
+    let Some(name) = FOLDERS.iter().find_map(named) else {
         tell_of_others(take, &folders);
         return Ok(());
     };

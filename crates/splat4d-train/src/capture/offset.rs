@@ -42,7 +42,7 @@ impl Capture {
     pub fn coarse(&self) -> Option<&'static str> {
         let centers: Vec<[f64; 3]> = self.frames.iter().map(|f| f.view.center()).collect();
         let points = self.points.as_ref().map_or(&[][..], |p| &p.points);
-        (offset_of(&centers, points) != [0.0; 3]).then_some(COARSE)
+        (self.offset == [0.0; 3] && offset_of(&centers, points) != [0.0; 3]).then_some(COARSE)
     }
 
     /// Makes positions relative to another offset: that of a scene with which the capture is compared.
