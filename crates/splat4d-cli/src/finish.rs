@@ -223,6 +223,7 @@ pub(crate) fn playback_by(run: &Path, deadline: &Deadline, console: &Console) ->
 pub fn scores(run: &Path, scene: &Scene<f32>, measure: &Measure, console: &Console) -> anyhow::Result<Scores> {
     let opened = Run::open(run)?;
     let (mut capture, recipe) = opened.open_capture()?;
+    capture.coarse().into_iter().for_each(|w| console.warn(w));
     corrected::apply(&mut capture, run)?;
     let capture = Arc::new(capture);
     let measuring = Measuring { opened: &opened, recipe: &recipe, measure };
@@ -253,6 +254,7 @@ pub(crate) fn scores_on(
     let opened = Run::open(run)?;
     let mut scene = read_scene(&opened.scene_file()?)?;
     let (mut capture, recipe) = opened.open_capture()?;
+    capture.coarse().into_iter().for_each(|w| console.warn(w));
     corrected::apply(&mut capture, run)?;
     let split = measured.name();
     if measured.frames(&capture).is_empty() {

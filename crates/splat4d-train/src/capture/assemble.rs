@@ -32,6 +32,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         ));
     }
     options::check_rate("frame rate", take.fps).map_err(located)?;
+    let used: BTreeSet<usize> = take.frames.iter().map(|f| f.camera).collect();
     skip_missing(&mut take, options).map_err(located)?;
     masks::fill(&mut take)?;
     panorama::split(&mut take, options.hold_out.as_ref())?;
@@ -40,7 +41,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
     }
     let in_part = take.take != Extent::default();
     if !in_part {
-        drop_unused_cameras(&mut take);
+        drop_unused_cameras(&mut take, &used);
         let mut all = Extent::default();
         take.frames.iter().for_each(|f| all.add(f.index..f.index + 1));
         take.take = all;
@@ -197,11 +198,12 @@ fn check_frame(frame: &mut RawFrame, camera: &str, options: &CaptureOptions) -> 
     Ok(())
 }
 
-/// Cameras without frames would be rows without meaning everywhere else.
-fn drop_unused_cameras(take: &mut Take) {
+/// Cameras without frames would be rows without meaning everywhere else. `listed` are those that had some before missing images
+/// were skipped, which was said.
+fn drop_unused_cameras(take: &mut Take, listed: &BTreeSet<usize>) {
     let used: BTreeSet<usize> = take.frames.iter().map(|f| f.camera).collect();
     let unused: Vec<&str> =
-        take.cameras.iter().enumerate().filter(|(i, _)| !used.contains(i)).map(|(_, n)| n.as_str()).collect();
+        take.cameras.iter().enumerate().filter(|(i, _)| !listed.contains(i)).map(|(_, n)| n.as_str()).collect();
     if !unused.is_empty() {
         take.warnings.push(format!("Cameras without any frame are left out: {}.", unused.join(", ")));
     }

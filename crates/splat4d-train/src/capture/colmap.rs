@@ -7,11 +7,14 @@
 mod multiview;
 mod unregistered;
 
-use super::account::Account;
+use super::account::{Account, Aspect};
 use super::colmap_files::{self, Point, Registered};
 use super::convention::{Convention, Poses};
 use super::lookup::{self, Lookup};
-use super::{CaptureKind, CaptureOptions, Extent, PointCloud, RawFrame, Split, Take, beside, rig, sequence};
+use super::points::read_ply;
+use super::preflight::Severity;
+use super::splits::Lists;
+use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take, beside, rig, sequence};
 use splat4d::math::{Se3, quat};
 use splat4d::scene::Camera;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -25,6 +28,8 @@ pub(super) const SPARSE: &str = "sparse";
 pub(super) const NESTED: &str = "colmap/sparse";
 /// The model of 4DGaussians' "multipleview" layout.
 pub(super) const MULTIVIEW: &str = "sparse_";
+/// A model's points as .ply: 3DGS writes it next to the others, and other programs in place of them.
+const POINTS: &str = "points3D.ply";
 /// Where a model may lie beside poses of another layout: COLMAP's habit and Nerfstudio's.
 const BESIDE: [&str; 2] = [SPARSE, NESTED];
 /// Names of folders between a capture's folder and a model's files, besides numbers.
@@ -56,47 +61,39 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     let names: Vec<&str> = shots.iter().map(|(name, _)| name.as_str()).collect();
     let poses: Vec<Se3> = shots.iter().map(|(_, source)| source.cam_from_world).collect();
     let order = sequence::order(&names, &poses, options.sequence, fps, &mut warnings, &mut notes);
-    let mut frames: Vec<RawFrame> = shots
-        .iter()
-        .zip(files)
-        .zip(&order.frames)
-        .map(|(((_, source), image), &(camera, index, time))| RawFrame {
-            camera,
-            source: source.clone(),
-            time,
-            index,
-            image,
-            mask: None,
-            depth: None,
-            flow: None,
-            labels: None,
-            features: None,
-            tracks: None,
-            split: Split::Train,
-        })
-        .collect();
+    let splits = Lists::beside_model(root, &folder)?.settle(&names, &mut account)?;
+    let frame = |(((split, image), (_, source)), &place): (((Option<Split>, PathBuf), &Shot), &_)| {
+        Some(RawFrame { split: split?, ..RawFrame::new(place, source.clone(), image) })
+    };
+    let mut frames: Vec<RawFrame> =
+        splits.into_iter().zip(files).zip(&shots).zip(&order.frames).filter_map(frame).collect();
+    if !lookup.folders().contains(&base) && !of_rig && base.is_dir() {
+        let what = format!("Images are those in {}.", base.strip_prefix(root).unwrap_or(&base).display());
+        account.add(Aspect::Assumed, Severity::Note, what);
+    }
     frames.sort_by(|a, b| (a.camera, a.index, &a.image).cmp(&(b.camera, b.index, &b.image)));
     lookup.tell(&mut account);
-    let cloud = cloud(&points);
+    let mut cloud = cloud_of(&points, &folder)?;
+    if cloud.is_none() {
+        cloud = multiview::points(root)?;
+    }
+    if let (Some(cloud), true) = (&cloud, points.is_empty()) {
+        notes.push(format!(
+            "The model has no file of points; the {} initial points are those of a .ply file.",
+            cloud.points.len()
+        ));
+    }
     Ok(Take {
-        name: None,
-        root: root.to_path_buf(),
-        kind: CaptureKind::Colmap,
         cameras: order.cameras,
         frames,
-        take: Extent::default(),
         named: order.named,
         timing: order.timing,
-        hold_out: None,
         fps,
-        points: if cloud.is_some() { cloud } else { multiview::points(root)? },
-        background: None,
-        up: None,
-        labels: Vec::new(),
+        points: cloud,
         warnings,
         notes,
         account,
-        convention: Convention::COLMAP,
+        ..Take::new(root, CaptureKind::Colmap, Convention::COLMAP)
     })
 }
 
@@ -174,7 +171,7 @@ fn sources(folder: &Path, registered: &[Registered], poses: Poses) -> Result<Vec
 /// The registered pictures of the largest model in a folder, and its points; no picture is looked at.
 pub(super) fn shots(folder: &Path) -> Result<(Vec<Shot>, Option<PointCloud>)> {
     let (folder, registered) = best_model(folder, &mut Vec::new())?;
-    Ok((sources(&folder, &registered, Poses::STATED)?, cloud(&colmap_files::points(&folder)?)))
+    Ok((sources(&folder, &registered, Poses::STATED)?, cloud_of(&colmap_files::points(&folder)?, &folder)?))
 }
 
 /// Whether a folder is a model, or holds some.
@@ -267,7 +264,7 @@ pub(super) fn points_beside(
 
 fn aligned_points(root: &Path, sparse: &Path, frames: &[RawFrame]) -> Result<(PointCloud, &'static str)> {
     let (folder, registered) = best_model(sparse, &mut Vec::new())?;
-    let mut cloud = cloud(&colmap_files::points(&folder)?)
+    let mut cloud = cloud_of(&colmap_files::points(&folder)?, &folder)?
         .ok_or_else(|| Error::input("it has no points").remedy("Triangulate them (colmap point_triangulator)."))?;
     let model: BTreeMap<String, Se3> =
         registered.iter().map(|r| Ok((beside::key(Path::new(&r.name)), pose_of(r)?))).collect::<Result<_>>()?;
@@ -281,6 +278,15 @@ fn aligned_points(root: &Path, sparse: &Path, frames: &[RawFrame]) -> Result<(Po
         false => "turned, moved and scaled to the cameras of",
     };
     Ok((cloud, how))
+}
+
+/// A model's points, which some programs write as .ply alone.
+fn cloud_of(points: &[Point], model: &Path) -> Result<Option<PointCloud>> {
+    let ply = model.join(POINTS);
+    match cloud(points) {
+        None if ply.is_file() => read_ply(&ply).map(Some),
+        cloud => Ok(cloud),
+    }
 }
 
 fn cloud(points: &[Point]) -> Option<PointCloud> {

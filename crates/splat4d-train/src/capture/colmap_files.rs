@@ -305,11 +305,13 @@ fn images_txt(text: &str) -> Result<Vec<Registered>> {
     Ok(images)
 }
 
-/// Whether a line of `images.txt` is an image's, not one of 2D points: its tenth word is a name, and no number.
+/// Whether a line of `images.txt` is an image's, not one of 2D points: its tenth word is a name, and no number; or its words
+/// are not triples.
 fn is_image_line(text: &str) -> bool {
-    let mut words = text.split_ascii_whitespace();
-    let numbers = words.by_ref().take(9).filter(|w| w.parse::<f64>().is_ok()).count();
-    numbers == 9 && words.next().is_some_and(|name| name.parse::<f64>().is_err())
+    let words: Vec<&str> = text.split_ascii_whitespace().collect();
+    let numbers = words.iter().take(9).filter(|w| w.parse::<f64>().is_ok()).count();
+    let named = words.get(9).is_some_and(|name| name.parse::<f64>().is_err());
+    numbers == 9 && (named || words.len() == 10)
 }
 
 fn points_txt(text: &str) -> Result<Vec<Point>> {

@@ -8,11 +8,10 @@ mod record3d;
 #[cfg(test)]
 mod tests;
 
-use super::account::Account;
 use super::convention::{Convention, Poses};
 use super::points::read_ply;
-use super::pose;
-use super::{CaptureKind, CaptureOptions, DepthFile, Extent, PointCloud, RawFrame, Split, Take, Timing, rig, sequence};
+use super::{CaptureKind, CaptureOptions, DepthFile, PointCloud, RawFrame, Take, Timing, rig, sequence};
+use super::{lookup, masks, pose};
 use splat4d::math::Se3;
 use splat4d::scene::Camera;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -91,47 +90,30 @@ fn take(root: &Path, mut shots: Vec<Shot>, said: Said, options: &CaptureOptions)
         sequence::order(&names, &poses, options.sequence, fps, &mut warnings, &mut notes)
     };
     let sequence::Order { cameras, frames: places, named, timing } = order;
-    let frame = |(shot, (camera, index, time)): (Shot, (usize, usize, f64))| RawFrame {
-        camera,
-        source: shot.source,
-        time,
-        index,
-        image: shot.image,
-        mask: None,
-        depth: shot.depth,
-        flow: None,
-        labels: None,
-        features: None,
-        tracks: None,
-        split: Split::Train,
-    };
+    let frame =
+        |(shot, place): (Shot, _)| RawFrame { depth: shot.depth, ..RawFrame::new(place, shot.source, shot.image) };
     Ok(Take {
-        name: None,
-        root: root.to_path_buf(),
-        kind,
         cameras,
         frames: shots.into_iter().zip(places).map(frame).collect(),
-        take: Extent::default(),
         named,
         timing,
-        hold_out: None,
         fps,
         points,
-        background: None,
         up,
-        labels: Vec::new(),
         warnings,
         notes,
-        account: Account::default(),
-        convention,
+        ..Take::new(root, kind, convention)
     })
 }
 
-/// How folders begin whose images are not the photos: masks, depth, reduced copies.
-const OTHERS: [&str; 4] = ["mask", "depth", "images_", "."];
+/// How folders begin whose images are not the photos, besides those of masks: depth, reduced copies.
+const OTHERS: [&str; 3] = ["depth", "images_", "."];
 
-/// Images by their names without endings, in lower case; from a folder, its folder `images`, and what lies in folders there.
-struct Images(BTreeMap<String, Vec<PathBuf>>);
+/// Images by their names without endings, however these are spelled; from a folder, and folders down to two levels below.
+struct Images {
+    found: BTreeMap<String, Vec<PathBuf>>,
+    root: PathBuf,
+}
 
 impl Images {
     fn below(root: &Path) -> Self {
@@ -143,22 +125,24 @@ impl Images {
         };
         add(root);
         let folders = |of: &Path| -> Vec<PathBuf> {
-            let names = rig::file_names(of).into_iter().filter(|n| !OTHERS.iter().any(|o| n.starts_with(o)));
+            let names = rig::file_names(of)
+                .into_iter()
+                .filter(|n| !masks::may_be(n) && !OTHERS.iter().any(|o| n.starts_with(o)));
             names.map(|n| of.join(n)).filter(|p| p.is_dir()).collect()
         };
         for folder in folders(root) {
             add(&folder);
             folders(&folder).iter().for_each(|inner| add(inner));
         }
-        Self(found)
+        Self { found, root: root.to_path_buf() }
     }
 
-    /// The image that an export calls `name`, with or without folders and ending. Errors: none, or several.
-    fn named(&self, name: &str) -> Result<&Path> {
-        match self.0.get(&key(name)).map_or(&[][..], Vec::as_slice) {
-            [one] => Ok(one),
-            [] => Err(Error::input(format!("there is no image of the name {name:.200}"))
-                .remedy("Put the images next to the export, in this folder or one below it.")),
+    /// The image that an export calls `name`, with or without folders and ending; where it should be if it is missing.
+    /// Errors: several fit.
+    fn named(&self, name: &str) -> Result<PathBuf> {
+        match self.found.get(&key(name)).map_or(&[][..], Vec::as_slice) {
+            [one] => Ok(one.clone()),
+            [] => Ok(self.root.join(name.replace('\\', "/"))),
             [first, second, ..] => {
                 let what = format!(
                     "there are several images of the name {name:.200}: {} and {}",
@@ -172,14 +156,14 @@ impl Images {
     }
 }
 
-/// A name without folders and ending, in lower case.
+/// A name without folders and ending, composed and in lower case.
 fn key(name: &str) -> String {
     let file = name.rsplit(['/', '\\']).next().unwrap_or(name);
     let stem = match file.rsplit_once('.') {
         Some((stem, ending)) if rig::IMAGE_ENDINGS.iter().any(|e| ending.eq_ignore_ascii_case(e)) => stem,
         _ => file,
     };
-    stem.to_lowercase()
+    lookup::fold(stem)
 }
 
 /// The only point cloud in a folder; several are none, and a note says so.

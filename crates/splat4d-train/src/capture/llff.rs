@@ -1,9 +1,8 @@
 //! LLFF captures: `poses_bounds.npy`, one row per image, and the images of one camera in a folder, in the order of the rows.
 
-use super::account::Account;
 use super::convention::Convention;
 use super::lookup::Lookup;
-use super::{CaptureKind, CaptureOptions, Extent, RawFrame, Split, Take};
+use super::{CaptureKind, CaptureOptions, RawFrame, Take};
 use super::{n3dv, picture, rig, sequence};
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -37,38 +36,16 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     let short: Vec<&str> = names.iter().map(String::as_str).collect();
     let poses: Vec<Se3> = shots.iter().map(|(_, source)| source.cam_from_world).collect();
     let order = sequence::order(&short, &poses, options.sequence, fps, &mut warnings, &mut notes);
-    let frame = |((image, source), &(camera, index, time)): ((PathBuf, _), &(usize, usize, f64))| RawFrame {
-        camera,
-        source,
-        time,
-        index,
-        image,
-        mask: None,
-        depth: None,
-        flow: None,
-        labels: None,
-        features: None,
-        tracks: None,
-        split: Split::Train,
-    };
+    let frame = |((image, source), &place): ((PathBuf, _), &_)| RawFrame::new(place, source, image);
     Ok(Take {
-        name: None,
-        root: root.to_path_buf(),
-        kind: CaptureKind::Llff,
         cameras: order.cameras,
         frames: shots.into_iter().zip(&order.frames).map(frame).collect(),
-        take: Extent::default(),
         named: order.named,
         timing: order.timing,
-        hold_out: None,
         fps,
         points: n3dv::points(root)?,
-        background: None,
-        up: None,
-        labels: Vec::new(),
         warnings,
         notes,
-        account: Account::default(),
-        convention: Convention::NERF,
+        ..Take::new(root, CaptureKind::Llff, Convention::NERF)
     })
 }

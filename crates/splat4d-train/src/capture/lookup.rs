@@ -6,7 +6,7 @@
 
 use super::account::{Account, Aspect};
 use super::preflight::Severity;
-use super::{CaptureOptions, rig};
+use super::{CaptureOptions, masks, rig};
 use splat4d::{Error, Result};
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -16,6 +16,8 @@ use unicode_normalization::UnicodeNormalization;
 
 /// Folders in which images usually lie, below that of the capture.
 const IMAGE_FOLDERS: [&str; 3] = ["images", "input", "image"];
+/// How names of folders begin that hold other things than images, though their files may be called like these.
+const NO_IMAGES: [&str; 5] = ["depth", "normal", "seg", "flow", "."];
 /// Names of images compared when a folder is looked for: enough to tell folders apart.
 const SAMPLE: usize = 32;
 /// Endings of images, readable ones first; a name with one of the others may be an image converted since.
@@ -90,9 +92,8 @@ fn parts(name: &str) -> (Vec<&str>, bool) {
 pub(super) fn key(name: &str) -> String {
     let (mut parts, _) = parts(name);
     let file = parts.pop().unwrap_or_default();
-    let of_all = |part: &str| IMAGE_FOLDERS.contains(&part) || reduction(part).is_some();
-    let folders = parts.iter().filter(|p| !of_all(p));
-    folders.map(|p| fold(p)).chain([fold(without_ending(file))]).collect::<Vec<_>>().join("/")
+    let folders = parts.iter().map(|p| fold(p)).filter(|p| !is_image_folder(p));
+    folders.chain([fold(without_ending(file))]).collect::<Vec<_>>().join("/")
 }
 
 impl Lookup {
@@ -136,7 +137,13 @@ impl Lookup {
     pub(super) fn folder_of(&self, names: &[&str]) -> PathBuf {
         let sample: Vec<&&str> = names.iter().step_by(names.len().div_ceil(SAMPLE).max(1)).collect();
         let mut best: Option<(usize, PathBuf)> = None;
-        for folder in self.folders() {
+        let usual = self.folders();
+        // Folders of other names only where none of the usual ones has an image.
+        let others = || self.other_folders().into_iter().map(|folder| (folder, true));
+        for (folder, other) in usual.into_iter().map(|folder| (folder, false)).chain(others()) {
+            if other && best.is_some() {
+                break;
+            }
             let exact = sample.iter().filter(|name| folder.join(name).is_file()).count();
             let loose =
                 || sample.iter().filter(|name| matches!(self.walk(&folder, &parts(name).0), Ok(Some(_)))).count();
@@ -147,6 +154,17 @@ impl Lookup {
         }
         let usual = || self.chosen.clone().unwrap_or_else(|| self.root.join(IMAGE_FOLDERS[0]));
         best.map_or_else(usual, |(_, folder)| folder)
+    }
+
+    /// Folders of the capture's that are none of the usual ones.
+    fn other_folders(&self) -> Vec<PathBuf> {
+        if self.chosen.is_some() {
+            return Vec::new();
+        }
+        let names = rig::file_names(&self.root).into_iter();
+        let for_images = |n: &String| !NO_IMAGES.iter().any(|o| fold(n).starts_with(o)) && !masks::may_be(n);
+        let other = names.filter(|n| !is_image_folder(n) && for_images(n));
+        other.map(|name| self.root.join(name)).filter(|folder| folder.is_dir()).collect()
     }
 
     /// The capture's folder.
@@ -405,7 +423,9 @@ mod tests {
 
     #[test]
     fn lists_of_names_are_compared_by_what_they_name() {
-        for name in ["./images/Cam0/0001.PNG", "images\\cam0\\0001.png", "cam0/0001", "cam0/0001.jpg"] {
+        for name in
+            ["./images/Cam0/0001.PNG", "IMAGES\\CAM0\\0001.JPG", "images\\cam0\\0001.png", "cam0/0001", "cam0/0001.jpg"]
+        {
             assert_eq!(key(name), "cam0/0001", "{name}");
         }
     }

@@ -11,8 +11,10 @@ use splat4d::{Error, Result};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-/// Folders of masks.
+/// Folders of masks, in any letter case.
 const FOLDERS: [&str; 2] = ["masks", "mask"];
+/// What names of folders have in which other programs keep masks, whatever white means there.
+const MAYBE: [&str; 3] = ["mask", "matte", "segment"];
 /// What names of masks have besides those of their images.
 const SUFFIXES: [&str; 4] = ["_mask", "-mask", ".mask", "_seg"];
 const PREFIXES: [&str; 2] = ["mask_", "mask-"];
@@ -21,7 +23,13 @@ const MOST_LEVELS: usize = 4;
 
 /// Gives frames without a mask theirs. Errors: two masks of one image.
 pub(super) fn fill(take: &mut Take) -> Result<()> {
-    let Some(folder) = FOLDERS.iter().map(|name| take.root.join(name)).find(|f| f.is_dir()) else { return Ok(()) };
+    let folders: Vec<String> = rig::file_names(&take.root).into_iter().filter(|n| take.root.join(n).is_dir()).collect();
+    let named = |known: &&str| folders.iter().find(|n| fold(n) == **known);
+    let Some(name) = FOLDERS.iter().find_map(named) else {
+        tell_of_others(take, &folders);
+        return Ok(());
+    };
+    let folder = take.root.join(name);
     let mut files = Vec::new();
     list(&folder, String::new(), 0, &mut files);
     if files.is_empty() {
@@ -45,13 +53,17 @@ pub(super) fn fill(take: &mut Take) -> Result<()> {
     }
     // Where folders differ (`rgb/1x`), a name that only one image has is enough.
     let short = |image: &Path| fold(without_ending(&image.file_name().unwrap_or_default().to_string_lossy()));
+    let mut by_file: BTreeMap<String, Vec<&String>> = BTreeMap::new();
+    for (key, masks) in &by_name {
+        by_file.entry(key.rsplit('/').next().unwrap_or(key).to_owned()).or_default().extend(masks);
+    }
     let mut names: BTreeMap<String, usize> = BTreeMap::new();
     take.frames.iter().for_each(|f| *names.entry(short(&f.image)).or_default() += 1);
     let mut used: BTreeSet<&String> = BTreeSet::new();
     let mut filled = 0;
     for frame in take.frames.iter_mut().filter(|f| f.mask.is_none()) {
         let relative = frame.image.strip_prefix(&take.root).unwrap_or(&frame.image).to_string_lossy().into_owned();
-        let alone = || by_name.get(&short(&frame.image)).filter(|_| names.get(&short(&frame.image)) == Some(&1));
+        let alone = || by_file.get(&short(&frame.image)).filter(|_| names.get(&short(&frame.image)) == Some(&1));
         let Some(fitting) = by_name.get(&key(&relative)).or_else(alone) else { continue };
         let name = relative.rsplit(['/', '\\']).next().unwrap_or_default();
         let rank = |mask: &str| rank(mask, name);
@@ -69,6 +81,20 @@ pub(super) fn fill(take: &mut Take) -> Result<()> {
     }
     tell(take, &folder, (files.len(), &by_name, &used, filled));
     Ok(())
+}
+
+/// Whether a folder's name is like those of masks.
+pub(super) fn may_be(folder: &str) -> bool {
+    MAYBE.iter().any(|word| fold(folder).contains(word))
+}
+
+/// Names folders that may hold masks and are not read, where no frame has one.
+fn tell_of_others(take: &mut Take, folders: &[String]) {
+    let others: Vec<&String> = folders.iter().filter(|n| may_be(n)).collect();
+    if !others.is_empty() && take.frames.iter().all(|f| f.mask.is_none()) {
+        let what = format!("Folders that may hold masks: {}. To use one, call it masks.", first_names(&others));
+        take.account.add(Aspect::NotRead, Severity::Note, what);
+    }
 }
 
 /// Says how many masks and images have no counterpart.

@@ -41,6 +41,7 @@ mod preflight;
 mod rgb8;
 mod rig;
 mod sequence;
+mod splits;
 mod store;
 mod tracks;
 mod transforms;
@@ -65,6 +66,7 @@ pub use tracks::Tracks;
 use account::Account;
 use splat4d::Result;
 use splat4d::math::se3::{norm, sub};
+use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, Time};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -260,6 +262,32 @@ struct Take {
     convention: Convention,
 }
 
+impl Take {
+    /// An empty take of a layout; readers fill in what it states.
+    fn new(root: &Path, kind: CaptureKind, convention: Convention) -> Self {
+        Self {
+            name: None,
+            root: root.to_path_buf(),
+            kind,
+            cameras: Vec::new(),
+            named: false,
+            timing: Timing::Told,
+            frames: Vec::new(),
+            take: Extent::default(),
+            hold_out: None,
+            fps: DEFAULT_FPS,
+            points: None,
+            background: None,
+            up: None,
+            labels: Vec::new(),
+            warnings: Vec::new(),
+            notes: Vec::new(),
+            account: Account::default(),
+            convention,
+        }
+    }
+}
+
 /// A frame as a reader found it.
 struct RawFrame {
     camera: usize,
@@ -274,6 +302,26 @@ struct RawFrame {
     features: Option<PathBuf>,
     tracks: Option<Arc<Tracks>>,
     split: Split,
+}
+
+impl RawFrame {
+    /// An image to train on, with nothing next to it. `place`: its camera, frame number and seconds.
+    fn new((camera, index, time): (usize, usize, f64), source: Camera, image: PathBuf) -> Self {
+        Self {
+            camera,
+            source,
+            time,
+            index,
+            image,
+            mask: None,
+            depth: None,
+            flow: None,
+            labels: None,
+            features: None,
+            tracks: None,
+            split: Split::Train,
+        }
+    }
 }
 
 impl Capture {

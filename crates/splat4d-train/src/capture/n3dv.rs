@@ -5,8 +5,8 @@ use super::convention::{Convention, Poses};
 use super::layout::{ffmpeg_command, videos};
 use super::points::read_ply;
 use super::preflight::Severity;
-use super::{CaptureKind, CaptureOptions, Extent, PointCloud, RawFrame, Split, Take, Timing};
-use super::{json, llff, picture, pose, rig, sequence};
+use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take};
+use super::{json, llff, masks, picture, pose, rig, sequence};
 use splat4d::format::npy::Npy;
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -72,41 +72,19 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         let header = picture::header(&folder.images[0])?;
         let source = camera_of(row, header.stored, options.poses).map_err(in_row)?;
         for (&index, image) in numbers[camera].iter().zip(&folder.images) {
-            frames.push(RawFrame {
-                camera,
-                source: source.clone(),
-                time: index as f64 / fps,
-                index,
-                image: image.clone(),
-                mask: None,
-                depth: None,
-                flow: None,
-                labels: None,
-                features: None,
-                tracks: None,
-                split: if camera == 0 && rows.len() > 1 { Split::Held } else { Split::Train },
-            });
+            let split = if camera == 0 && rows.len() > 1 { Split::Held } else { Split::Train };
+            let place = (camera, index, index as f64 / fps);
+            frames.push(RawFrame { split, ..RawFrame::new(place, source.clone(), image.clone()) });
         }
     }
     Ok(Take {
-        name: None,
-        root: root.to_path_buf(),
-        kind: CaptureKind::N3dv,
         cameras: folders.into_iter().map(|f| f.name).collect(),
         frames,
-        take: Extent::default(),
         named: true,
-        timing: Timing::Told,
-        hold_out: None,
         fps,
         points: points(root)?,
-        background: None,
-        up: None,
-        labels: Vec::new(),
-        warnings: Vec::new(),
-        notes: Vec::new(),
         account,
-        convention: Convention::NERF,
+        ..Take::new(root, CaptureKind::N3dv, Convention::NERF)
     })
 }
 
@@ -187,7 +165,9 @@ fn folders(root: &Path) -> Vec<Folder> {
 
 /// Whether a folder's images are not the frames of one camera.
 fn is_other(name: &str) -> bool {
-    ["masks", "mask", "depth", "sparse", "sparse_", "colmap", "image_colmap"].contains(&name) || rig::is_plain(name)
+    ["depth", "sparse", "sparse_", "colmap", "image_colmap"].contains(&name)
+        || masks::may_be(name)
+        || rig::is_plain(name)
 }
 
 /// The camera of a row, for images of this size.

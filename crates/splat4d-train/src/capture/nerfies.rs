@@ -10,7 +10,7 @@ use super::convention::{Convention, Poses};
 use super::json::{self, Node};
 use super::lookup::Lookup;
 use super::preflight::Severity;
-use super::{CaptureKind, CaptureOptions, Extent, PointCloud, RawFrame, Split, Take, Timing, pose};
+use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take, pose};
 use splat4d::format::npy::Npy;
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -163,20 +163,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         let source = source.map_err(|e| e.at(file.display()))?.downscaled(smaller);
         let image = lookup.image(&folders, id)?.unwrap_or_else(|| folders[0].join(format!("{id}.png")));
         let time = index as f64 / fps;
-        frames.push(RawFrame {
-            camera,
-            source,
-            time,
-            index,
-            image,
-            mask: None,
-            depth: None,
-            flow: None,
-            labels: None,
-            features: None,
-            tracks: None,
-            split,
-        });
+        frames.push(RawFrame { split, ..RawFrame::new((camera, index, time), source, image) });
     }
     let last = frames.iter().map(|f| f.index).max().unwrap_or(0);
     let first = frames.iter().map(|f| f.index).min().unwrap_or(0);
@@ -195,24 +182,13 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     lookup.tell(&mut account);
     let named = cameras.len() > 1;
     Ok(Take {
-        name: None,
-        root: root.to_path_buf(),
-        kind: CaptureKind::Nerfies,
         cameras: cameras.iter().map(|c| format!("camera{c}")).collect(),
         frames,
-        take: Extent::default(),
         named,
-        timing: Timing::Told,
-        hold_out: None,
         fps,
         points: points(root, &framing)?,
-        background: None,
-        up: None,
-        labels: Vec::new(),
-        warnings: Vec::new(),
-        notes: Vec::new(),
         account,
-        convention: Convention::NERFIES,
+        ..Take::new(root, CaptureKind::Nerfies, Convention::NERFIES)
     })
 }
 

@@ -5,9 +5,7 @@ use super::convention::Convention;
 use super::json::{self, Node};
 use super::lookup::Lookup;
 use super::points::read_ply;
-use super::{
-    CaptureKind, CaptureOptions, DepthFile, DepthKind, Extent, HoldOut, RawFrame, Split, Take, Timing, Tracks, pose,
-};
+use super::{CaptureKind, CaptureOptions, DepthFile, DepthKind, Extent, HoldOut, RawFrame, Take, Tracks, pose};
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, Intrinsics, Lens};
@@ -114,25 +112,21 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<T
     }
     let mut account = Account::default();
     lookup.tell(&mut account);
+    let convention = Convention { world_to_camera: !inverse, opengl, quaternions: false };
     Ok(Take {
         name: top.opt("name")?.map(|n| n.text()).transpose()?.map(str::to_string),
-        root: root.to_path_buf(),
-        kind: CaptureKind::Own,
         cameras,
         frames,
         take: if in_part { take } else { Extent::default() },
         named: true,
-        timing: Timing::Told,
         hold_out,
         fps,
         points: top.opt("points")?.map(|n| read_ply(&lookup.file(n.text()?)?)).transpose()?,
         background: read_background(top)?,
         up: top.opt("up")?.map(|n| n.numbers::<3>()).transpose()?,
         labels,
-        warnings: Vec::new(),
-        notes: Vec::new(),
         account,
-        convention: Convention { world_to_camera: !inverse, opengl, quaternions: false },
+        ..Take::new(root, CaptureKind::Own, convention)
     })
 }
 
@@ -328,19 +322,14 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
             }
         };
         let beside = |files: &Option<Files>| path(files, index).map_err(|e| node.at(e));
+        let source = Camera { cam_from_world, intrinsics, lens, width, height, near: Camera::NEAR };
         frames.push(RawFrame {
-            camera: context.camera,
-            source: Camera { cam_from_world, intrinsics, lens, width, height, near: Camera::NEAR },
-            time: time + offset,
-            index,
-            image,
             mask: beside(&masks)?,
             depth: depth.as_ref().map(|d| d.file(context.lookup, start, index)).transpose()?.flatten(),
             flow: beside(&flow)?,
             labels: beside(&labels)?,
             features: beside(&features)?,
-            tracks: None,
-            split: Split::Train,
+            ..RawFrame::new((context.camera, index, time + offset), source, image)
         });
     }
     // Nobody knows where the pixels of the last frame go.

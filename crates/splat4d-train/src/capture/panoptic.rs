@@ -6,7 +6,7 @@ use super::convention::Convention;
 use super::json::{self, Node};
 use super::lookup::{self, Lookup};
 use super::points::read_ply;
-use super::{CaptureKind, CaptureOptions, Extent, PointCloud, RawFrame, Split, Take, Timing, rig};
+use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take, rig};
 use splat4d::format::npy::Npy;
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -42,24 +42,15 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     let mut account = Account::default();
     lookup.tell(&mut account);
     Ok(Take {
-        name: None,
-        root: root.to_path_buf(),
-        kind: CaptureKind::Panoptic,
         cameras: ids.iter().map(ToString::to_string).collect(),
         frames: found.into_iter().map(|(_, f)| f).collect(),
-        take: Extent::default(),
         named: true,
-        timing: Timing::Told,
-        hold_out: None,
         fps,
         points,
-        background: None,
         up: Some(UP),
-        labels: Vec::new(),
         warnings,
-        notes: Vec::new(),
         account,
-        convention: Convention::OPENCV,
+        ..Take::new(root, CaptureKind::Panoptic, Convention::OPENCV)
     })
 }
 
@@ -98,21 +89,8 @@ fn read_meta(
             };
             let mask = lookup.image(&masks, &format!("{}.png", lookup::without_ending(name)))?;
             let image = lookup.image_or_place(&images, name)?;
-            let raw = RawFrame {
-                camera: 0,
-                source,
-                time: t as f64 / fps,
-                index: t,
-                image,
-                mask,
-                depth: None,
-                flow: None,
-                labels: None,
-                features: None,
-                tracks: None,
-                split,
-            };
-            out.push((ids[c].count()?, raw));
+            let raw = RawFrame::new((0, t, t as f64 / fps), source, image);
+            out.push((ids[c].count()?, RawFrame { mask, split, ..raw }));
         }
     }
     Ok(())

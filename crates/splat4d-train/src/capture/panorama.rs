@@ -104,20 +104,8 @@ fn view(frame: &RawFrame, turn: &[[f64; 3]; 3], size: [usize; 2]) -> RawFrame {
         height: side,
         near: frame.source.near,
     };
-    RawFrame {
-        camera: frame.camera,
-        source,
-        time: frame.time,
-        index: frame.index,
-        image: frame.image.clone(),
-        mask: frame.mask.clone(),
-        depth: None,
-        flow: None,
-        labels: None,
-        features: None,
-        tracks: None,
-        split: frame.split,
-    }
+    let place = (frame.camera, frame.index, frame.time);
+    RawFrame { mask: frame.mask.clone(), split: frame.split, ..RawFrame::new(place, source, frame.image.clone()) }
 }
 
 /// The camera of the stored picture, as far as its size goes: of a panorama the whole of it.

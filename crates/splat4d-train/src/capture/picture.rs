@@ -120,9 +120,17 @@ fn open<'a>(source: impl BufRead + Seek + 'a, path: &Path) -> Result<impl ImageD
 /// How far the shape of a resized picture may be from the one that its intrinsics are for; more was cropped or padded.
 const MAX_ASPECT_CHANGE: f64 = 0.01;
 
+/// By how much reduced copies of images are reduced at most (`images_8`), with room.
+const MAX_REDUCTION: usize = 16;
+
 /// Whether a picture of `size` is one of the camera's size that was made smaller or larger: of the same shape, but for
-/// the rounding of its shorter side.
+/// the rounding of its shorter side; or reduced by a whole number.
 pub(super) fn is_resized(size: (usize, usize), camera: &Camera) -> bool {
+    let whole = |side: usize, of: usize, k: usize| side == of / k || side == of.div_ceil(k);
+    let reduced = |k: usize| whole(size.0, camera.width, k) && whole(size.1, camera.height, k);
+    if (2..=MAX_REDUCTION).any(reduced) {
+        return true;
+    }
     let (width, height) = (size.0 as f64 / camera.width as f64, size.1 as f64 / camera.height as f64);
     let rounding = 1.0 / size.0.min(size.1).max(1) as f64;
     (width / height - 1.0).abs() <= rounding.min(MAX_ASPECT_CHANGE)

@@ -6,7 +6,6 @@
 
 mod clock;
 mod frame;
-mod splits;
 
 use super::account::{Account, Aspect, first_names};
 use super::convention::{Convention, Poses};
@@ -15,7 +14,8 @@ use super::lookup::Lookup;
 use super::points::read_ply;
 use super::preflight::Severity;
 use super::sequence::{self, Order};
-use super::{CaptureKind, CaptureOptions, Extent, PointCloud, RawFrame, Sequence, Split, Take, colmap, picture};
+use super::splits::Lists;
+use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Sequence, Split, Take, colmap, picture};
 use frame::Entry;
 use splat4d::Result;
 use splat4d::scene::Camera;
@@ -62,19 +62,11 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     };
     let Order { cameras, frames: places, named, timing } = order;
     let blender = several && entries.iter().all(|e| e.by_angle);
-    let frame = |(entry, (camera, index, time)): (Entry, (usize, usize, f64))| RawFrame {
-        camera,
-        source: entry.source,
-        time,
-        index,
-        image: entry.image,
+    let frame = |(entry, place): (Entry, _)| RawFrame {
         mask: entry.mask,
         depth: entry.depth,
-        flow: None,
-        labels: None,
-        features: None,
-        tracks: None,
         split: entry.split,
+        ..RawFrame::new(place, entry.source, entry.image)
     };
     let frames: Vec<RawFrame> = entries.into_iter().zip(places).map(frame).collect();
     let points = match first.points {
@@ -83,25 +75,19 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     };
     warnings.extend(first.warning);
     lookup.tell(&mut account);
+    let kind = if several { CaptureKind::DNerf } else { CaptureKind::Nerfstudio };
     Ok(Take {
-        name: None,
-        root: root.to_path_buf(),
-        kind: if several { CaptureKind::DNerf } else { CaptureKind::Nerfstudio },
         cameras,
         frames,
-        take: Extent::default(),
         named,
         timing,
-        hold_out: None,
         fps,
         points,
-        background: None,
         up: blender.then_some(BLENDER_UP),
-        labels: Vec::new(),
         warnings,
         notes,
         account,
-        convention: Convention::NERF,
+        ..Take::new(root, kind, Convention::NERF)
     })
 }
 
@@ -181,7 +167,12 @@ impl Document {
         let file = frame::File { lookup, bases: &bases, top, poses: options.poses, size: *size };
         let mut entries = nodes.iter().map(|node| frame::read(&file, node)).collect::<Result<Vec<_>>>()?;
         match split {
-            Split::Train => splits::apply(top, &mut entries, account)?,
+            Split::Train => {
+                let names: Vec<&str> = entries.iter().map(|e| e.name.as_str()).collect();
+                let settled = Lists::of_transforms(top)?.settle(&names, account)?;
+                let kept = entries.into_iter().zip(settled);
+                entries = kept.filter_map(|(e, split)| Some(Entry { split: split?, ..e })).collect();
+            }
             other => entries.iter_mut().for_each(|e| e.split = other),
         }
         let unread = frame::unread(top);

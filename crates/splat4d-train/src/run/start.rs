@@ -24,6 +24,8 @@ use std::sync::atomic::AtomicBool;
 
 /// Seconds that steps are timed for, where a run is not kept to its minutes and is only to be foretold.
 const PREDICTION: f64 = 4.0;
+/// The scene of a finished run.
+const SCENE: &str = "scene.safetensors";
 /// The verb that makes runs from points.
 pub(super) const TRAIN: &str = "train";
 
@@ -194,6 +196,9 @@ pub fn resume_with(
     listen: &mut dyn FnMut(&Event),
 ) -> Result<Outcome> {
     let (recipe, capture) = open_run(run)?;
+    if let Some(message) = capture.coarse() {
+        listen(&Event::Warning { message: message.into() });
+    }
     let info = read_info(run)?;
     let own_loss = info["own_loss"].as_bool().unwrap_or(false);
     if own_loss != options.own_loss.is_some() {
@@ -234,7 +239,7 @@ pub fn resume_with(
     session.drive(&mut trainer, state, &mut listen)
 }
 
-/// A run's recipe and its capture. Errors: not a run; the capture has gone.
+/// A run's recipe and its capture, relative to the offset of the run's scene. Errors: not a run; the capture has gone.
 pub fn open_run(run: &Path) -> Result<(Recipe, Capture)> {
     let text = read_text(&run.join("recipe.toml"))?;
     let recipe = Recipe::from_toml(&text).map_err(|e| e.at(run.join("recipe.toml").display()))?;
@@ -242,10 +247,24 @@ pub fn open_run(run: &Path) -> Result<(Recipe, Capture)> {
     let path = info["capture"].as_str().ok_or_else(|| {
         Error::input("it does not name its capture").at(run.join("run.json").display()).remedy("Train again")
     })?;
-    let capture = open_capture(&of_text(path), &recipe)
+    let mut capture = open_capture(&of_text(path), &recipe)
         .map_err(|e| e.remedy("The run needs its capture where it was when it was trained"))?;
+    if capture.offset != [0.0; 3]
+        && let Some(offset) = offset_of_scene(run)?
+    {
+        capture.relocate(offset);
+    }
     let capture = flows::with_found(points::with_found(capture, &recipe, run)?, &recipe, run);
     Ok((recipe, capture))
+}
+
+/// The offset of a run's scene; `None`: there is no scene yet. Runs of earlier versions have none, which is zero.
+fn offset_of_scene(run: &Path) -> Result<Option<[f64; 3]>> {
+    let finished = Some(run.join(SCENE)).filter(|path| path.is_file());
+    let Some(path) = finished.or_else(|| checkpoint::list(run).pop()) else { return Ok(None) };
+    let place = |e: Error| e.at(path.display());
+    let bytes = std::fs::read(&path).map_err(|e| place(Error::io("the scene cannot be read", e)))?;
+    Ok(Some(splat4d::format::scene::read(&bytes).map_err(place)?.offset))
 }
 
 pub(super) fn read_info(run: &Path) -> Result<serde_json::Value> {

@@ -38,7 +38,7 @@ pub(super) struct Look {
     /// Its frame of the capture.
     pub(super) frame: usize,
     /// The camera of the image file.
-    camera: Camera,
+    pub(super) camera: Camera,
     lens: Distortion,
     color: Planes<f32>,
     /// Pixels of the file along one of the small image's.

@@ -118,7 +118,9 @@ impl Capture {
             .rev()
             .max_by(|&a, &b| measures[a].score().total_cmp(&measures[b].score()));
         let Some(best) = found.filter(|&k| measures[k].score() > stated.score()) else {
-            return PoseCheck { written_as: None, finding: stated.agrees() };
+            let unseen = stated.points.asked > 0 && stated.points.seen == 0.0;
+            let finding = if unseen { stated.points.elsewhere() } else { stated.agrees() };
+            return PoseCheck { written_as: None, finding };
         };
         let (m, poses) = (&measures[best], conventions[best]);
         let mut parts = Vec::new();

@@ -1,5 +1,6 @@
 //! Features that two images share, and whether poses put them on each other's epipolar lines, in front of both cameras.
 
+use super::super::assemble::same_pose;
 use super::look::{Look, Mark};
 use rayon::prelude::*;
 use splat4d::math::Se3;
@@ -17,6 +18,8 @@ const PARALLEL: f64 = 0.006;
 const ONE_PLACE: f64 = 1e-6;
 /// Matches that one convention fits and the other does not, at least, and how many times as many as the other way round.
 const MORE: (usize, usize) = (20, 4);
+/// Of its matches, how many the poses as read fit at most where another convention is right.
+const RIVAL: f64 = 0.8;
 /// Share of the matches that a right convention fits at least: many are chance.
 const FITTING: f64 = 0.2;
 
@@ -24,6 +27,14 @@ const FITTING: f64 = 0.2;
 pub(super) struct Match {
     looks: [usize; 2],
     rays: [[f64; 2]; 2],
+}
+
+#[cfg(test)]
+impl Match {
+    /// The two looks.
+    pub(super) fn looks(&self) -> [usize; 2] {
+        self.looks
+    }
 }
 
 /// What matches say of one convention.
@@ -55,12 +66,14 @@ impl Measure {
 
 /// Whether matches say that poses are written in this convention.
 pub(super) fn prefers(m: &Measure) -> bool {
-    m.convinces() && m.gained >= MORE.0 && m.gained >= MORE.1 * m.lost
+    let stated = m.fitting + m.lost - m.gained;
+    m.convinces() && m.gained >= MORE.0 && m.gained >= MORE.1 * m.lost && stated as f64 <= RIVAL * m.fitting as f64
 }
 
-/// Mutual best matches of all pairs of looks.
+/// Mutual best matches of all pairs of looks but those of one pose, which fits them in any convention.
 pub(super) fn matches(looks: &[Look]) -> Vec<Match> {
-    let pairs: Vec<[usize; 2]> = (0..looks.len()).flat_map(|a| (a + 1..looks.len()).map(move |b| [a, b])).collect();
+    let all = (0..looks.len()).flat_map(|a| (a + 1..looks.len()).map(move |b| [a, b]));
+    let pairs: Vec<[usize; 2]> = all.filter(|&[a, b]| !same_pose(&looks[a].camera, &looks[b].camera)).collect();
     pairs.par_iter().flat_map_iter(|&[a, b]| between([a, b], &looks[a].marks, &looks[b].marks, RATIO)).collect()
 }
 

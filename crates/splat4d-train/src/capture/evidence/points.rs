@@ -1,7 +1,8 @@
 //! Initial points: which part is in front of the cameras and in their images, and whether their colours are those there.
 
-use super::super::Capture;
 use super::super::lens::Distortion;
+use super::super::preflight::{Finding, Severity};
+use super::super::{Aspect, Capture};
 use super::look::{Look, pixel_of};
 use super::pairs;
 use splat4d::math::Se3;
@@ -33,6 +34,22 @@ pub(super) struct Measure {
 }
 
 impl Measure {
+    /// The finding where no camera sees a point.
+    pub(super) fn elsewhere(&self) -> Finding {
+        Finding {
+            severity: Severity::Warning,
+            aspect: Some(Aspect::Assumed),
+            what: format!(
+                "Initial points and poses do not fit: none of {} points is in front of a camera and inside its image, and no \
+                 other convention of poses fits either. One of the two is wrong, or in another unit.",
+                self.asked
+            ),
+            remedy:
+                "Export poses and points from one program together, or find points in the images: --set init=pictures."
+                    .into(),
+        }
+    }
+
     /// Whether poses are right by this.
     pub(super) fn convinces(&self) -> bool {
         self.seen >= CONVINCES.0 && self.gain.is_some_and(|g| g >= CONVINCES.1)

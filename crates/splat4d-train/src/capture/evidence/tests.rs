@@ -251,6 +251,25 @@ fn conventions_are_named_by_foregrounds() {
 }
 
 #[test]
+fn a_fixed_camera_is_no_evidence_for_its_pose() {
+    let capture = photos(false);
+    let mut looks = look::take(&capture, &[0, 1, 1]);
+    look::describe(&mut looks);
+    let matches = pairs::matches(&looks);
+    assert!(matches.len() > 20 && matches.iter().all(|m| m.looks()[0] == 0), "features agree with themselves");
+}
+
+#[test]
+fn points_of_another_world_are_no_evidence_of_health() {
+    let mut capture = photos(true);
+    // Far below all cameras.
+    capture.points.as_mut().unwrap().points.iter_mut().for_each(|p| p[2] -= 1e4);
+    let check = capture.check_poses();
+    assert_eq!((check.written_as, check.finding.severity), (None, Severity::Warning));
+    assert!(check.finding.what.contains("points and poses do not fit"), "{}", check.finding.what);
+}
+
+#[test]
 fn what_says_too_little_is_not_checked() {
     let mut capture = photos(false);
     capture.train.truncate(1);

@@ -7,6 +7,7 @@
 
 use super::{Convention, Export, Images, Said, Shot, only_points, take, without_pose};
 use crate::capture::{CaptureKind, CaptureOptions, Take, json, panorama, pose, rig};
+use crate::text;
 use roxmltree::{Document, Node};
 use splat4d::math::{Se3, Sim3};
 use splat4d::scene::{Camera, Intrinsics, Lens};
@@ -34,7 +35,7 @@ fn is(path: &Path) -> bool {
     use std::io::Read;
     let mut head = Vec::new();
     let read = crate::files::open(path).is_ok_and(|f| f.take(HEAD as u64).read_to_end(&mut head).is_ok());
-    let text = String::from_utf8_lossy(&head);
+    let text = text::decode(&head).unwrap_or_else(|_| String::from_utf8_lossy(&head));
     read && text.contains("<document") && text.contains("<chunk") && text.contains("<sensor")
 }
 
@@ -47,7 +48,7 @@ struct Optics {
 
 fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
     let bytes = json::read_bytes(marker)?;
-    let text = String::from_utf8_lossy(&bytes);
+    let text = text::decode(&bytes).unwrap_or_else(|_| String::from_utf8_lossy(&bytes));
     let text = text.trim_start_matches('\u{feff}');
     let place = |e: Error| e.at(marker.display());
     let document = Document::parse(text)
@@ -122,7 +123,7 @@ fn shot(label: &str, transform: Node<'_, '_>, sensor: Node<'_, '_>, world: &Sim3
         translation: world.apply(chunk_from_cam.translation),
     };
     let Optics { intrinsics, lens, size } = optics(sensor)?;
-    let image = images.named(label)?.to_owned();
+    let image = images.named(label)?;
     let source = Camera {
         cam_from_world: world_from_cam.inverse(),
         intrinsics,

@@ -6,9 +6,10 @@
 
 use super::{Convention, Export, Said, Shot, only_points, take};
 use crate::capture::json::{self, Node};
-use crate::capture::{CaptureKind, CaptureOptions, DepthFile, DepthKind, Take, pose, rig};
+use crate::capture::{CaptureKind, CaptureOptions, DepthFile, DepthKind, Sequence, Take, pose, rig};
 use splat4d::scene::{Camera, Intrinsics, Lens};
 use splat4d::{Error, Result};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 pub(super) const EXPORT: Export = Export { find, is: |_| false, read };
@@ -29,23 +30,30 @@ fn find(root: &Path) -> Option<PathBuf> {
 
 fn pair(folder: &Path) -> Option<[PathBuf; 2]> {
     let there = |names: &[&str; 2]| names.map(|n| folder.join(n));
-    PAIRS.iter().map(there).find(|[images, cameras]| {
-        !rig::image_names(images).is_empty() && rig::file_names(cameras).iter().any(|n| n.ends_with(".json"))
-    })
+    PAIRS
+        .iter()
+        .map(there)
+        .find(|[images, cameras]| !rig::image_names(images).is_empty() && !camera_names(cameras).is_empty())
+}
+
+/// Names of the cameras in a folder, without endings.
+fn camera_names(folder: &Path) -> Vec<String> {
+    rig::file_names(folder).iter().filter_map(|n| n.strip_suffix(".json").map(str::to_owned)).collect()
 }
 
 fn read(root: &Path, folder: &Path, options: &CaptureOptions) -> Result<Take> {
     let [images, cameras] = pair(folder).ok_or_else(|| {
         Error::input("it has no images with cameras").at(folder.display()).remedy("Export the raw data again.")
     })?;
-    let (mut shots, mut bare) = (Vec::new(), 0);
-    for name in rig::image_names(&images) {
-        let stem = name.rsplit_once('.').map_or(name.as_str(), |(stem, _)| stem);
+    let mut by_stem: BTreeMap<String, String> = rig::image_names(&images)
+        .into_iter()
+        .map(|name| (name.rsplit_once('.').map_or(name.as_str(), |(stem, _)| stem).to_owned(), name))
+        .collect();
+    let mut shots = Vec::new();
+    for stem in camera_names(&cameras) {
+        // An image that is missing is counted with those of other layouts.
+        let name = by_stem.remove(&stem).unwrap_or_else(|| format!("{stem}.jpg"));
         let camera = cameras.join(format!("{stem}.json"));
-        if !camera.is_file() {
-            bare += 1;
-            continue;
-        }
         let value = json::read(&camera)?;
         let source = camera_of(&Node::root(&value)).map_err(|e| e.at(camera.display()))?;
         let depth = folder.join("depth").join(format!("{stem}.png"));
@@ -53,9 +61,15 @@ fn read(root: &Path, folder: &Path, options: &CaptureOptions) -> Result<Take> {
         shots.push(Shot { name: name.clone(), image: images.join(&name), source, time: None, depth });
     }
     let (mut warnings, mut notes) = (Vec::new(), Vec::new());
-    super::without_pose(bare, bare + shots.len(), &mut warnings);
+    super::without_pose(by_stem.len(), by_stem.len() + shots.len(), &mut warnings);
     if !images.ends_with(PAIRS[0][0]) {
         warnings.push("There are no corrected cameras: poses are those of the telephone, not optimised ones.".into());
+    }
+    if options.sequence == Sequence::Auto {
+        notes.push(
+            "Keyframes are taken for photos of one moment. If they are a film, say --set capture.sequence=video."
+                .into(),
+        );
     }
     let points = only_points(root, &mut notes)?;
     let said = Said {
@@ -67,7 +81,12 @@ fn read(root: &Path, folder: &Path, options: &CaptureOptions) -> Result<Take> {
         warnings,
         notes,
     };
-    take(root, shots, said, options)
+    // Names are time stamps, and what is scanned stands still.
+    let sequence = match options.sequence {
+        Sequence::Auto => Sequence::Photos,
+        told => told,
+    };
+    take(root, shots, said, &CaptureOptions { sequence, ..options.clone() })
 }
 
 fn camera_of(node: &Node<'_>) -> Result<Camera> {

@@ -6,6 +6,7 @@
 
 use super::{Convention, Export, Images, Said, Shot, only_points, take};
 use crate::capture::{CaptureKind, CaptureOptions, Take, json, picture, pose, rig};
+use crate::text;
 use splat4d::math::se3::mat_mul;
 use splat4d::scene::{Camera, Intrinsics, Lens};
 use splat4d::{Error, ErrorKind, Result};
@@ -31,7 +32,7 @@ fn is(path: &Path) -> bool {
     use std::io::Read;
     let mut head = Vec::new();
     let read = crate::files::open(path).is_ok_and(|f| f.take(HEAD as u64).read_to_end(&mut head).is_ok());
-    let text = String::from_utf8_lossy(&head);
+    let text = text::decode(&head).unwrap_or_else(|_| String::from_utf8_lossy(&head));
     let columns = columns(text.lines().next().unwrap_or_default());
     read && COLUMNS.iter().all(|c| columns.contains_key(*c))
 }
@@ -44,7 +45,7 @@ fn columns(line: &str) -> BTreeMap<String, usize> {
 
 fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
     let bytes = json::read_bytes(marker)?;
-    let text = String::from_utf8_lossy(&bytes);
+    let text = text::decode(&bytes).unwrap_or_else(|_| String::from_utf8_lossy(&bytes));
     let place = |e: Error| e.at(marker.display());
     let mut lines = text.lines().enumerate().map(|(i, l)| (i + 1, l.trim())).filter(|(_, l)| !l.is_empty());
     let columns = columns(lines.next().map_or("", |l| l.1));
@@ -54,10 +55,17 @@ fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
             .remedy("Export the registration as \"Internal/External camera parameters\"."));
     }
     let images = Images::below(root);
+    let rows: Vec<(usize, Row<'_>)> =
+        lines.map(|(number, line)| (number, Row { columns: &columns, words: words(line) })).collect();
+    let found =
+        rows.iter().map(|(number, row)| images.named(row.name()).map_err(|e| place(e.at(format!("line {number}")))));
+    let found = found.collect::<Result<Vec<PathBuf>>>()?;
+    // The size of an image that is there is that of missing ones, which are counted later.
+    let there = found.iter().find(|image| image.is_file());
+    let size = there.map(|image| picture::header(image)).transpose()?.map_or((1, 1), |header| header.upright());
     let mut shots = Vec::new();
-    for (number, line) in lines {
-        let row = Row { columns: &columns, words: line.split(',').map(|w| w.trim().trim_matches('"')).collect() };
-        shots.push(row.shot(&images).map_err(|e| place(e.at(format!("line {number}"))))?);
+    for ((number, row), image) in rows.iter().zip(found) {
+        shots.push(row.shot(image, size).map_err(|e| place(e.at(format!("line {number}"))))?);
     }
     let (warnings, mut notes) = (Vec::new(), Vec::new());
     let points = only_points(root, &mut notes)?;
@@ -71,6 +79,11 @@ fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
         notes,
     };
     take(root, shots, said, options)
+}
+
+/// A line's cells.
+fn words(line: &str) -> Vec<&str> {
+    line.split(',').map(|w| w.trim().trim_matches('"')).collect()
 }
 
 struct Row<'a> {
@@ -88,11 +101,13 @@ impl Row<'_> {
         })
     }
 
-    fn shot(&self, images: &Images) -> Result<Shot> {
-        let name = self.words.get(self.columns["name"]).copied().unwrap_or_default();
-        let image = images.named(name)?.to_owned();
-        let header = picture::header(&image)?;
-        let size = header.upright();
+    fn name(&self) -> &str {
+        self.words.get(self.columns["name"]).copied().unwrap_or_default()
+    }
+
+    /// `size`: that of an image which is missing.
+    fn shot(&self, image: PathBuf, size: (usize, usize)) -> Result<Shot> {
+        let size = if image.is_file() { picture::header(&image)?.upright() } else { size };
         let (width, height) = (size.0 as f64, size.1 as f64);
         let angle = |name: &str| Ok::<_, Error>(self.number(name)?.to_radians().sin_cos());
         let ((sh, ch), (sp, cp), (sr, cr)) = (angle("heading")?, angle("pitch")?, angle("roll")?);
@@ -122,6 +137,6 @@ impl Row<'_> {
         let lens = if k == [0.0; 6] && p == [0.0; 2] { Lens::Pinhole } else { Lens::Brown { k, p, s: [0.0; 4] } };
         let (width, height) = size;
         let source = Camera { cam_from_world, intrinsics, lens, width, height, near: Camera::NEAR };
-        Ok(Shot { name: name.to_owned(), image, source, time: None, depth: None })
+        Ok(Shot { name: self.name().to_owned(), image, source, time: None, depth: None })
     }
 }

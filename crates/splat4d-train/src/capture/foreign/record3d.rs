@@ -45,16 +45,24 @@ fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
     })?;
     let mut images = rig::image_names(&folder);
     images.sort_by_key(|n| (rig::trailing_number(n), n.clone()));
+    let size = picture::header(&folder.join(&images[0]))?.upright();
     let fps = top.opt("fps").map_err(place)?.map_or(Ok(FPS), |n| n.number()).map_err(place)?;
     let poses = top.get("poses").and_then(|n| n.list()).map_err(place)?;
     let times = top.opt("frameTimestamps").map_err(place)?.map(|n| n.list()).transpose().map_err(place)?;
     let own = top.opt("perFrameIntrinsicCoeffs").map_err(place)?.map(|n| n.list()).transpose().map_err(place)?;
+    // Images are numbered: one that is missing leaves its pose, and is counted later.
+    if poses.len() > images.len() {
+        let ending = images[0].rsplit_once('.').map_or_else(String::new, |(_, e)| e.to_owned());
+        let all: Vec<String> = (0..poses.len()).map(|i| format!("{i}.{ending}")).collect();
+        if images.iter().all(|name| all.contains(name)) {
+            images = all;
+        }
+    }
     if poses.len() != images.len() {
         return Err(place(Error::input(format!("it has {} poses for {} images", poses.len(), images.len())))
             .remedy("Export the recording again, with all of its images."));
     }
     let shared: [f64; 9] = top.get("K").and_then(|n| n.numbers()).map_err(place)?;
-    let size = picture::header(&folder.join(&images[0]))?.upright();
     let side = |key: &str, own: usize| top.opt(key)?.map_or(Ok(own), |n| n.count());
     let (width, height) = (side("w", size.0).map_err(place)?, side("h", size.1).map_err(place)?);
     let mut shots = Vec::with_capacity(images.len());

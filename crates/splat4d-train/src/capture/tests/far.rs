@@ -55,6 +55,35 @@ fn maps_coordinates_become_small_and_the_offset_is_kept() {
     }
 }
 
+#[test]
+fn a_run_of_world_coordinates_is_measured_there_and_said_to_be_coarse() {
+    let far = samples::photos(9, cam, Some(&Sim3 { translation: SHIFT, ..Sim3::default() }));
+    let run = tempfile::tempdir().unwrap();
+    let write = |name: &str, text: &str| std::fs::write(run.path().join(name), text).unwrap();
+    write("recipe.toml", &crate::recipe::Recipe::default().to_toml());
+    write("run.json", &json!({"capture": crate::path_text::to_text(&far.path("sparse"))}).to_string());
+    let capture = || crate::run::open_run(run.path()).unwrap().1;
+    let read = capture();
+    assert!(read.offset != [0.0; 3] && read.coarse().is_none(), "there is no scene yet");
+    // The scenes of earlier versions have no offset.
+    for offset in [[0.0; 3], read.offset, [4e5, 5e6, 0.0]] {
+        let scene = splat4d::layers::Scene::<f32> { offset, ..Default::default() };
+        let mut bytes = Vec::new();
+        splat4d::format::scene::write(&scene, &mut bytes).unwrap();
+        std::fs::write(run.path().join("scene.safetensors"), bytes).unwrap();
+        let moved = capture();
+        assert_eq!((moved.offset, moved.coarse().is_some()), (offset, offset == [0.0; 3]));
+        for (a, b) in moved.frames.iter().zip(&read.frames) {
+            let world = |c: &Camera, offset: [f64; 3]| std::array::from_fn(|k| c.center()[k] + offset[k]);
+            for (a, b) in [(&a.view, &b.view), (&a.source, &b.source)] {
+                assert!(norm(sub(world(a, offset), world(b, read.offset))) < 1e-6);
+            }
+        }
+        let point = |c: &Capture| std::array::from_fn(|k| c.points.as_ref().unwrap().points[0][k] + c.offset[k]);
+        assert!(norm(sub(point(&moved), point(&read))) < 1e-6);
+    }
+}
+
 /// The colour of a direction.
 fn sky([x, y, z]: [f64; 3]) -> [u8; 3] {
     let length = norm([x, y, z]);

@@ -251,8 +251,9 @@ fn lists_of_splits_are_kept() {
         });
         sample
     };
-    let capture =
-        open(&with(json!({"train_filenames": ["images/cam00.png", "./images/cam02.png", "images\\cam05.png"]})));
+    let capture = open(&with(
+        json!({"train_filenames": ["/home/me/images/CAM00.png", "./images/cam02.png", "images\\cam05.png"]}),
+    ));
     assert_eq!((capture.train.as_slice(), capture.held.len()), (&[0, 2, 5][..], 6));
     assert_said(&capture, Aspect::Assumed, Severity::Note, &["6 of 9", "held out"]);
     let both =
@@ -263,6 +264,17 @@ fn lists_of_splits_are_kept() {
     let capture = open(&with(json!({"test_filenames": ["images/cam03.png", "images/gone.png"]})));
     assert_eq!(capture.held, [3]);
     assert_said(&capture, Aspect::NotFound, Severity::Warning, &["1 names", "gone.png"]);
+    assert!(refuse(&with(json!({"train_filenames": ["gone.png"]}))).contains("none of the 1 names"));
+    // Lists next to COLMAP models: 3DGS's, and Nerfstudio's, which go first.
+    let sample = colmap_at("sparse/0", &["images"]);
+    sample.write("sparse/0/test.txt", b"_DSC8680.png\r\n_DSC8683.png\r\n");
+    let capture = open(&sample);
+    assert_eq!((capture.train.len(), capture.held.as_slice()), (7, &[1, 4][..]));
+    sample.write("test_list.txt", b"_DSC8681.png\n");
+    sample.write("train_list.txt", "\u{feff}_DSC8679.png\n_DSC8682.png\n".as_bytes());
+    let capture = open(&sample);
+    assert_eq!((capture.train.as_slice(), capture.held.as_slice()), (&[0, 2][..], &[1][..]));
+    assert_said(&capture, Aspect::Assumed, Severity::Note, &["6 of 9", "left out"]);
     // DyCheck's lists and rate, and HyperNeRF's lists without ids.
     let sample = samples::nerfies();
     sample.edit("dataset.json", |v| *v = json!({"ids": ["000000", "000001", "000002", "000003"]}));
@@ -295,7 +307,7 @@ fn times_are_read_as_what_they_count() {
     let lettered = |i: usize| format!("{}.png", char::from(b'a' + i as u8));
     let steps = |step: f64| (0..9).map(|i| step * i as f64).collect::<Vec<f64>>();
     type Case<'a> = (Vec<f64>, Option<f64>, &'a dyn Fn(usize) -> String, f64, Severity, &'a str);
-    let cases: [Case<'_>; 9] = [
+    let cases: [Case<'_>; 10] = [
         // Frame numbers, as names tell, and as a stated rate makes likely.
         (steps(1.0), Some(30.0), &numbered, 8.0 / 30.0, Severity::Note, "frame numbers"),
         (steps(1.0), None, &numbered, 8.0 / 30.0, Severity::Note, "frame numbers"),
@@ -307,6 +319,8 @@ fn times_are_read_as_what_they_count() {
         // Parts of the capture.
         (steps(1.0 / 8.0), None, &lettered, 8.0 / 30.0, Severity::Note, "parts"),
         (steps(1.0 / 9.0), Some(24.0), &lettered, 8.0 / 9.0 * 8.0 / 24.0, Severity::Note, "parts"),
+        // Another rate than the one that is stated.
+        (steps(2.0 / 15.0), Some(9.0), &lettered, 8.0 * 2.0 / 15.0, Severity::Warning, "do not fit"),
         // Milliseconds.
         (steps(33.5), Some(30.0), &lettered, 8.0 * 33.5, Severity::Warning, "seconds"),
     ];
@@ -356,6 +370,8 @@ fn keys_of_lenses_are_used_or_refused() {
     let listed = json!({"distortion_params": [0.1, 0.02, 0.0, 0.0, 0.001, 0.002]});
     assert_eq!(lens(listed), brown([0.1, 0.02, 0.0, 0.0, 0.0, 0.0], [0.001, 0.002]));
     assert_eq!(lens(json!({"distortion_params": [0, 0, 0, 0, 0, 0]})), splat4d::scene::Lens::Pinhole);
+    assert!(matches!(lens(json!({"is_fisheye": 1})), splat4d::scene::Lens::Fisheye { .. }));
+    assert!(refuse(&with(json!({"is_fisheye": "yes"}))).contains("is_fisheye"));
     for keys in [
         json!({"latlong": true}),
         json!({"k4": 0.1}),
@@ -370,11 +386,12 @@ fn keys_of_lenses_are_used_or_refused() {
 
 #[test]
 fn masks_beside_images_are_found_in_every_layout() {
-    let names: [fn(&str) -> String; 4] = [
+    let names: [fn(&str) -> String; 5] = [
         |n| format!("masks/{n}.png"),
         |n| format!("masks/{}_mask.png", n.trim_end_matches(".png")),
         |n| format!("mask/{}.png", n.trim_end_matches(".png")),
         |n| format!("masks/images/{n}"),
+        |n| format!("Masks/{n}"),
     ];
     for name in names {
         for sample in [samples::photos(3, |c| format!("cam{c}.png"), None), samples::colmap_txt(), samples::n3dv()] {
@@ -388,6 +405,13 @@ fn masks_beside_images_are_found_in_every_layout() {
             assert!(capture.frames.iter().all(|f| f.mask.is_some()), "{:?}: {}", capture.kind, name("a.png"));
         }
     }
+    // Folders of another layout's images, and a folder of another name.
+    let sample = samples::nerfies();
+    (0..4).for_each(|i| sample.mask(&format!("mask/1x/{i:06}.png.png"), |x, _| if x < 9 { 255 } else { 0 }));
+    assert!(open(&sample).frames.iter().all(|f| f.mask.is_some()));
+    let sample = samples::photos(3, |c| format!("cam{c}.png"), None);
+    sample.mask("images_masks/cam1.png", |_, _| 255);
+    assert_said(&open(&sample), Aspect::NotRead, Severity::Note, &["may hold masks: images_masks"]);
     // Half the size, and a name that fits nothing.
     let sample = samples::photos(3, |c| format!("cam{c}.png"), None);
     sample.save(
@@ -451,6 +475,24 @@ fn standard_folders_of_colmap_are_read() {
             assert_eq!((capture.kind, capture.frames.len()), (CaptureKind::Colmap, 9), "{model}");
             assert!(capture.frames.iter().all(|f| f.image.is_file()) && capture.points.is_some());
         }
+    }
+    // Points as .ply alone.
+    let sample = colmap_at("sparse/0", &["images"]);
+    std::fs::remove_file(sample.path("sparse/0/points3D.txt")).unwrap();
+    assert!(open(&sample).points.is_none());
+    sample.write("sparse/0/points3D.ply", samples::PLY.as_bytes());
+    let capture = open(&sample);
+    assert_eq!(capture.points.as_ref().unwrap().points.len(), 2);
+    assert!(capture.notes.iter().any(|n| n.contains("2 initial points are those of a .ply")), "{:?}", capture.notes);
+    // Images in a folder of another name; those of masks and depth are none.
+    for folder in ["Images", "photos"] {
+        let sample = colmap_at("sparse/0", &["images"]);
+        std::fs::rename(sample.path("images"), sample.path(folder)).unwrap();
+        let other = image::ImageBuffer::from_pixel(WIDTH as u32, HEIGHT as u32, image::Luma([9u8]));
+        (0..9).for_each(|c| sample.save(&format!("depth/_DSC{}.png", c + 8679), other.clone()));
+        let capture = open(&sample);
+        assert!(capture.frames.len() == 9 && capture.frames.iter().all(|f| f.image.starts_with(sample.path(folder))));
+        assert_said(&capture, Aspect::Assumed, Severity::Note, &["Images are those in", folder]);
     }
     // Mip-NeRF 360: reduced copies, and LLFF's poses beside the model.
     let sample = colmap_at("sparse/0", &["images", "images_2"]);
@@ -529,6 +571,14 @@ fn images_without_lines_of_points_are_all_read() {
     sample.write("sparse/0/images.txt", one_each.join("\n").as_bytes());
     let capture = read(&sample.path("sparse"), &CaptureOptions::default());
     assert_eq!((capture.frames.len(), capture.warnings.len()), (9, 0), "{:?}", capture.warnings);
+    // Names without endings are numbers, as coordinates of points are.
+    let bare = |line: &&str| line.replace("cam0", "").replace(".png", "");
+    (0..9).for_each(|c| {
+        std::fs::rename(sample.path(&format!("images/cam{c:02}.png")), sample.path(&format!("images/{c}.png")))
+            .unwrap();
+    });
+    sample.write("sparse/0/images.txt", one_each.iter().map(bare).collect::<Vec<_>>().join("\n").as_bytes());
+    assert_eq!(read(&sample.path("sparse"), &CaptureOptions::default()).frames.len(), 9);
 }
 
 #[test]

@@ -19,6 +19,9 @@ const FILLED: f64 = 0.9;
 const RATES: [f64; 13] = [23.976, 24.0, 25.0, 29.97, 30.0, 48.0, 50.0, 59.94, 60.0, 90.0, 100.0, 120.0, 240.0];
 /// How much shorter than a frame the usual step of a camera may be: frame rates that vary.
 const FEWER: f64 = 0.2;
+/// A step of so few frames that is this far from a whole number of them is of another rate.
+const FEW_FRAMES: f64 = 3.0;
+const BETWEEN: f64 = 0.1;
 /// Frames between neighbouring instants from which another unit than seconds is likelier than a time lapse.
 const MANY_FRAMES: f64 = 29.5;
 
@@ -144,7 +147,9 @@ fn read(
     }
     // Cameras of a rig, whose shutters do not open at once, are compared each with itself.
     let own = 2.0 * half_frame(of_camera.iter().copied().zip(times.iter().copied()));
-    if rate.stated && own > 0.0 && own * fps < 1.0 - FEWER {
+    let per_step = own * fps;
+    let between = per_step < FEW_FRAMES && (per_step - per_step.round()).abs() > BETWEEN;
+    if rate.stated && own > 0.0 && (per_step < 1.0 - FEWER || between) {
         return doubt(Times::Seconds, format!("steps of {own:.4} s do not fit {fps} frames a second"));
     }
     of(Times::Seconds)

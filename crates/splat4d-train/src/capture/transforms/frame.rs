@@ -181,7 +181,14 @@ fn lens(top: &Node<'_>, node: &Node<'_>) -> Result<Lens> {
         return Err(unsupported(format!("the lens of \"{key}\" is not read")));
     }
     // instant-ngp's word for it.
-    let fisheye = value(top, node, "is_fisheye")?.is_some_and(|n| n.value.as_bool() == Some(true));
+    let fisheye = match value(top, node, "is_fisheye")? {
+        None => false,
+        Some(n) => n
+            .value
+            .as_bool()
+            .or_else(|| n.value.as_f64().map(|x| x != 0.0))
+            .ok_or_else(|| n.error("is_fisheye is neither true nor false").remedy("Write true or false."))?,
+    };
     let model = value(top, node, "camera_model")?.map(|n| n.text()).transpose()?;
     match model.unwrap_or(if fisheye { "OPENCV_FISHEYE" } else { "OPENCV" }) {
         "OPENCV_FISHEYE" if k[4..] != [0.0; 2] || p != [0.0; 2] || s != [0.0; 4] => {
