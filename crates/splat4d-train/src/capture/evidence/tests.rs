@@ -253,8 +253,8 @@ fn conventions_are_named_by_foregrounds() {
 #[test]
 fn a_fixed_camera_is_no_evidence_for_its_pose() {
     let capture = photos(false);
-    let mut looks = look::take(&capture, &[0, 1, 1]);
-    look::describe(&mut looks);
+    let mut looks = look::take(&capture, &[0, 1, 1], look::COARSE);
+    look::describe(&mut looks, look::COARSE);
     let matches = pairs::matches(&looks);
     assert!(matches.len() > 20 && matches.iter().all(|m| m.looks()[0] == 0), "features agree with themselves");
 }
