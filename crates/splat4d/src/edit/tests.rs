@@ -500,7 +500,7 @@ fn what_cannot_be_done_says_why() {
         (r#"{"do": "delete", "select": "all"}"#, "nothing"),
         (r#"{"do": "delete", "select": "frustum(back)"}"#, "front"),
         (r#"{"do": "delete", "select": "at(7, all)"}"#, "clip"),
-        (r#"{"do": "hide", "select": "all", "from": 1, "to": 0}"#, "span"),
+        (r#"{"do": "hide", "select": "all", "from": 1, "to": 0}"#, "time range"),
         (r#"{"do": "opacity", "select": "all", "factor": 2}"#, "factor"),
         (r#"{"do": "opacity", "select": "all"}"#, "keys"),
         (r#"{"do": "move", "select": "all"}"#, "to"),
