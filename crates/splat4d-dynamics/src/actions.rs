@@ -111,7 +111,7 @@ mod tests {
         assert!(a.check(2, 1).is_ok() && a.check(2, 2).unwrap_err().to_string().contains("need 3"));
         for (bad, word) in [
             ("", "empty"),
-            ("1,2\n3,4\n", "no name"),
+            ("1,2\n3,4\n", "invalid column"),
             ("a,a\n1,2\n", "two columns"),
             ("a,b\n1\n", "line 2"),
             ("a\nNaN\n", "line 2"),

@@ -322,7 +322,7 @@ fn bad_opencv_files_are_explained() {
     refused(&with("camera_matrix", "kamera"), "camera matrix is missing");
     refused(&with("901.250000000000", ".Nan"), "NaN");
     refused(&with("901.250000000000", "-901.25"), "focal length");
-    refused(&with("rows: 3", "rows: 4"), "not as many as it says");
+    refused(&with("rows: 3", "rows: 4"), "stated number of values");
     refused(&with("image_width: 1280", "image_width: 0"), "picture size");
     refused(&with("rows: 5", "rows: 6"), "distortion_coefficients");
     let six = good.replacen("rows: 5", "rows: 6", 1).replacen(&list(&[c.intrinsics.fx])[..4], "901.", 1);
