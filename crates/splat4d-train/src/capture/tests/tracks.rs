@@ -68,7 +68,7 @@ fn tables_and_arrays_say_the_same() {
     let wrong = npz(&[("tracks", &[2, 1, 2], vec![0.0; 4]), ("visibility", &[1, 2], vec![1.0; 2])]);
     assert_says(&message(wrong), &["tracks.npz", "visibility is [1, 2]", "[2, 1, 2]"]);
     let wrong = npz(&[("tracks", &[1, 1, 2], vec![f32::NAN; 2]), ("visibility", &[1, 1], vec![1.0])]);
-    assert_says(&message(wrong), &["tracks.npz", "point 0, frame 0", "no number"]);
+    assert_says(&message(wrong), &["tracks.npz", "point 0, frame 0", "not finite"]);
 }
 
 #[test]
