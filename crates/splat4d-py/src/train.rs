@@ -99,7 +99,9 @@ pub(crate) fn resume(
     let options = TrainOptions { device: named(device)?, clock: Stopwatch::start(), ..TrainOptions::default() };
     let listener = Listener::new(progress, loss);
     listener.drive(py, options, |options, listen| {
-        let _folder = path.is_dir().then(|| OutputFolder::amend(&path, "resume (Python)")).transpose()?;
+        // A folder that is no run is refused below, and nothing is written into it.
+        let is_run = path.join("recipe.toml").is_file();
+        let _folder = is_run.then(|| OutputFolder::amend(&path, "resume (Python)")).transpose()?;
         run::resume_with(&path, options, &listener.raised.stop, listen)
     })
 }

@@ -110,7 +110,7 @@ class Errors(InFolder):
         refuses("row 1 of points", [[picture]], times=[0.0], points=[[1, 2, 3], [1, np.inf, 3]])
         refuses("colors", [[picture]], times=[0.0], points=[[1, 2, 3]], colors=[[2, 2, 2]])
         refuses("names", [[picture]], times=[0.0], names=["a", "b"])
-        refuses("no name", [[picture]], times=[0.0], names=["../a"])
+        refuses("invalid name", [[picture]], times=[0.0], names=["../a"])
         refuses("2 poses for 1 images", [[picture]], [[camera, camera]], times=[0.0])
         refuses("expected Camera objects", [[picture]], [["camera"]], times=[0.0])
         refuses(r"images\[1\]\[0\]", [[picture], [picture + 2]], [camera, camera], times=[0.0])
