@@ -193,6 +193,11 @@ test('words, colours, moves by handles, keys on the time line; wrong words are s
   assert.ok(Math.hypot(...shift) > 0, `${shift}`);
   await e.act('Key here');
   await page.evaluate(() => { const p = document.querySelector('splat-4d').player; p.seek(p.first + p.duration / 2); });
+  // A key is set at the time that is shown.
+  await page.waitForFunction(() => {
+    const p = document.querySelector('splat-4d').player;
+    return Math.abs(p.time - (p.first + p.duration / 2)) < 0.05;
+  });
   await panel.getByLabel('Shift z').fill('0.5');
   await panel.getByLabel('Shift z').blur();
   await e.idle();
