@@ -1,6 +1,6 @@
 //! Files and folders that commands write: no user file is lost, and no two processes write into one folder.
 //!
-//! - [`write`](mod@write): a file appears whole or not at all.
+//! - `write`: a file appears whole or not at all.
 //! - [`Owner`]: one process at a time writes into a folder. Readers take no part in it.
 //! - [`OutputFolder`]: what a command may find in its folder, the list of its own files, their replacement, and the
 //!   continuation of an unfinished command.
