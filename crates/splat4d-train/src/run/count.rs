@@ -15,7 +15,7 @@ use std::collections::BTreeSet;
 
 /// Pixels of distinct views for one Gaussian. Source: published recipes give a real room 0.2 to 1.2 million Gaussians for
 /// four times the pixels of our copy of it, where 150,000 and 300,000 end 1.5 dB above 30,000 after the same processor time
-/// (docs/suite.md).
+/// (studies/records/2026-11-26-real-size.md).
 const PIXELS: f64 = 350.0;
 /// Gaussians that one step can settle. Source: the same room in 480 processor seconds: 32 a step end at 27.58 dB (SSIM 0.843),
 /// 100 a step at 27.67 dB (0.849), 4 a step at 26.08 dB (0.788).

@@ -86,7 +86,7 @@ pub struct Outcome {
 /// Share of the largest number of Gaussians from which on a run is at its cap.
 const AT_CAP: f64 = 0.98;
 /// PSNR of training views below which a cloud at its cap is too small for them, dB: a real room of 292 photos ends at 26.5
-/// with 30,000 Gaussians and at 27.4 with 150,000; captures that have enough end above 29 (docs/suite.md).
+/// with 30,000 Gaussians and at 27.4 with 150,000; captures that have enough end above 29 (studies/records/2026-11-26-real-size.md).
 const UNDER_FITTED: f64 = 28.0;
 
 /// What a run that ends at its cap with blurred training views should tell the user.

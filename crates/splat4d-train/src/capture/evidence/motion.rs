@@ -22,7 +22,7 @@ const BANDS: [f64; 4] = [1.5, 3.0, 8.0, 40.0];
 const FEWEST: [usize; 2] = [10, 200];
 /// Share of features that moved up to which a scene is static, where the capture states times, as those of moving scenes do,
 /// and where they are taken from the names of numbered images, as walks through a building have them. Measured: walks and
-/// rooms up to 1.1 %, a moving hand 1.7 % (docs/suite.md).
+/// rooms up to 0.7 %, a moving hand 1.9 % (studies/records/2026-11-26-real-size.md).
 const STATIC: [f64; 2] = [0.003, 0.0125];
 
 /// How far matches of frames at different times agree with one static scene.
