@@ -315,7 +315,9 @@ mod tests {
         std::fs::create_dir_all(&state).unwrap();
         let other = Standing { host: "elsewhere".into(), machine: "other".into(), ..Standing::new("train") };
         let other = Standing { beat: beat.into(), ..other };
-        std::fs::write(state.join(RECORD), other.bytes()).unwrap();
+        // Whole at any time, as a real owner's: one that is read empty is that of a killed process.
+        std::fs::write(state.join("elsewhere.tmp"), other.bytes()).unwrap();
+        std::fs::rename(state.join("elsewhere.tmp"), state.join(RECORD)).unwrap();
         other
     }
 
