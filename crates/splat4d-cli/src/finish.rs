@@ -125,8 +125,8 @@ pub(crate) fn all(run: &Path, measure: &Measure, deadline: &Deadline, console: &
     write_report(run, console)
 }
 
-/// What is left of the minutes of a run that was resumed: what its commands took until training was over does not count anew,
-/// and time between them not at all.
+/// What is left of the minutes of a run that was resumed: the time of earlier commands until the end of training counts once,
+/// and time between commands does not count.
 pub(crate) fn rest_of(run: &Run, clock: Stopwatch) -> Deadline {
     let budget = &run.info["budget"];
     let left = || Some(60.0 * budget["minutes"].as_f64()? - budget["before"].as_f64()? - run.number("seconds")?);

@@ -91,7 +91,7 @@ fn child(options: &Options) -> Result<()> {
             ensure!(begun.elapsed() < SLOWEST, "input {i} takes {:.0} s", begun.elapsed().as_secs_f64());
             i += 1;
         }
-        // Whoever waits for this process learns how far it came even if the next batch kills it.
+        // The parent process reads the progress here, even if the next batch kills this one.
         println!("{i}");
     }
     Ok(())

@@ -112,7 +112,7 @@ export class Splat4D extends THREE.Mesh {
   #scratch = { view: new THREE.Matrix4(), viewport: new THREE.Vector4(), rows: new Float64Array(12) };
 
   /// `source`: an address, File, Blob or ArrayBuffer. `onchange()` is called when a better picture can be drawn: pages came,
-  /// or a new order; whoever draws on demand draws then. `budget`: bytes of Gaussians that stay in memory. `up`: the object's
+  /// or a new order; pages that render on demand render then. `budget`: bytes of Gaussians that stay in memory. `up`: the object's
   /// axis ('x', 'y', 'z') that points up as the file's up does; null keeps the file's axes.
   constructor(source, { onchange = () => {}, budget, up = 'y' } = {}) {
     const geometry = new THREE.InstancedBufferGeometry();

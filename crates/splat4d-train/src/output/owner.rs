@@ -154,7 +154,7 @@ impl Owner {
         Self::take(folder, command)?.map_err(|who| in_use(folder, who.as_ref()))
     }
 
-    /// Waits for the folder as long as `go_on` says so of whoever has it. Errors: the folder cannot be written; it is in use.
+    /// Waits for the folder while `go_on` returns true for its owner. Errors: the folder cannot be written; it is in use.
     pub fn wait(folder: &Path, command: &str, go_on: &mut dyn FnMut(Option<&Standing>) -> bool) -> Result<Self> {
         loop {
             match Self::take(folder, command)? {
@@ -341,7 +341,7 @@ mod tests {
         drop(Owner::of(folder.path(), "eval").unwrap());
     }
 
-    /// A record of a process that was killed: whoever comes takes over at once, also where its number was given to another process.
+    /// A record of a process that was killed: the next process takes over at once, also if its process id was reused.
     #[test]
     fn a_dead_owner_of_this_machine_is_replaced_at_once() {
         let folder = tempfile::tempdir().unwrap();

@@ -24,8 +24,8 @@ impl<'a> Input<'a> {
     }
 }
 
-/// Refuses an output folder that equals, contains or lies inside an input. Inputs that are not there are left to whoever reads
-/// them.
+/// Refuses an output folder that equals, contains or lies inside an input. Missing inputs are reported by
+/// their readers.
 pub fn check_apart(output: &Path, inputs: &[Input<'_>]) -> Result<()> {
     let above_output = ids(output);
     for input in inputs {

@@ -1,8 +1,8 @@
-//! Whether anything moves in front of moving cameras: matches of frames that are apart in time either agree with one static
-//! scene, or lie beside their epipolar lines.
+//! Whether anything moves in front of moving cameras: matches of frames at different times either agree with one static
+//! scene, or lie next to their epipolar lines.
 //!
-//! A wrong match lies anywhere, a feature that moved lies near its line: what lies near it in excess of what chance explains
-//! has moved.
+//! Wrong matches are spread over the image, moved features lie near their lines. Matches near the lines in excess of the
+//! expected wrong ones count as moved.
 
 use super::super::{Capture, Timing};
 use super::look;

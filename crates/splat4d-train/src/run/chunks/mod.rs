@@ -168,7 +168,7 @@ impl Chunked {
         Ok(Self { run: run.to_owned(), source, recipe, plan, pacing: None })
     }
 
-    /// The same, with parts that are planned anew while they are trained, so that training ends on time.
+    /// The same, with parts that are re-planned during training, so that training ends on time.
     pub fn paced(self, pacing: Option<Pacing>) -> Self {
         Self { pacing, ..self }
     }
