@@ -6,7 +6,7 @@ use super::{
     Capture, CaptureKind, CaptureOptions, Exif, Extent, FlowFile, Frame, HoldOut, PointCloud, RawFrame, Rig, Split,
     Take, Timing,
 };
-use super::{evidence, lookup, masks, options, panorama, picture, pose};
+use super::{borders, evidence, lookup, masks, options, panorama, picture, pose};
 use splat4d::math::se3::{norm, normalize, sub};
 use splat4d::scene::{Camera, Lens, Time};
 use splat4d::{Error, Result};
@@ -95,6 +95,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         notes: take.notes,
     };
     settle_orientation(&mut capture, &unsure);
+    borders::find(&mut capture, options);
     for remark in &capture.account {
         let list = if remark.severity == Severity::Warning { &mut capture.warnings } else { &mut capture.notes };
         list.push(remark.what.clone());
@@ -156,6 +157,7 @@ fn finish(raw: RawFrame, downscale: usize) -> Frame {
         labels: raw.labels,
         features: raw.features,
         tracks: raw.tracks,
+        recorded: None,
     }
 }
 

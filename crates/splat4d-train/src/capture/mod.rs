@@ -8,6 +8,7 @@
 mod account;
 mod assemble;
 mod beside;
+mod borders;
 mod colmap;
 mod colmap_files;
 mod convention;
@@ -53,7 +54,8 @@ pub use evidence::{Agreement, PoseCheck};
 pub(crate) use flow::{FlowFile, to_picture as flow_picture};
 pub use lens::Distortion;
 pub use options::{
-    CaptureOptions, CaptureSettings, Exif, FlowSource, HoldOut, MAX_POINTS, Sequence, Text, Times, Unregistered,
+    Borders, CaptureOptions, CaptureSettings, Exif, FlowSource, HoldOut, MAX_POINTS, Sequence, Text, Times,
+    Unregistered,
 };
 pub use points::PointCloud;
 pub use posed::{PosedCamera, check_intrinsics, colmap_cameras, is_colmap, rigid, transforms_cameras};
@@ -132,6 +134,8 @@ pub struct Frame {
     pub features: Option<PathBuf>,
     /// The tracks of its camera.
     pub tracks: Option<Arc<Tracks>>,
+    /// [height · width] of the picture file: 1 where its lens recorded something, 0 in black borders; `None`: no borders.
+    pub recorded: Option<Arc<Vec<u8>>>,
 }
 
 impl Frame {

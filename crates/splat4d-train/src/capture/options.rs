@@ -97,6 +97,16 @@ choices! {
 }
 
 choices! {
+    /// What becomes of black borders of images.
+    pub enum Borders {
+        /// They are found, and neither trained nor scored.
+        Auto = "auto",
+        /// They are content like any other.
+        Keep = "keep",
+    }
+}
+
+choices! {
     /// What the times of a capture count.
     pub enum Times {
         /// As their range, steps and the images' names show.
@@ -161,6 +171,9 @@ settings! {
         /// Pixels that poses describe if images have an EXIF orientation: stored, upright, or auto (as stored for
         /// COLMAP, else by the sizes).
         exif: Exif = Exif::Auto;
+        /// Black borders of images, as undistortion and letterboxing leave them: auto (found, and neither trained nor
+        /// scored) or keep (they are content).
+        borders: Borders = Borders::Auto;
         /// Unit of times: seconds, fractions (of the capture), frames, or auto (by their range, steps and names).
         times: Times = Times::Auto;
         /// Images without a pose whose camera has one: share (the pose), leave (out), or auto (by names).
@@ -201,6 +214,8 @@ pub struct CaptureOptions {
     pub poses: Poses,
     /// Whose pixels poses and intrinsics describe.
     pub exif: Exif,
+    /// What becomes of black borders.
+    pub borders: Borders,
     /// What times count.
     pub times: Times,
     /// What becomes of images without a pose of their own.
@@ -246,6 +261,7 @@ impl Default for CaptureOptions {
             images: None,
             poses: Poses::STATED,
             exif: Exif::Auto,
+            borders: Borders::Auto,
             times: Times::Auto,
             unregistered: Unregistered::Auto,
             max_missing: MAX_MISSING,

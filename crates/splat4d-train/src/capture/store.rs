@@ -376,17 +376,20 @@ fn prepare(frame: &Frame, capture: &Capture) -> Result<StoredPicture> {
     if let (true, true, 1, Samples::Eight(samples)) = (opaque, lens.is_pinhole(), capture.downscale, &raster.samples) {
         let mask = mask.map(|m| m.iter().map(|&v| to_byte(v)).collect());
         let color = Samples::Eight(planar(samples, raster.channels));
-        return Ok(StoredPicture { width: raster.width, height: raster.height, color, mask, valid: None, depth, flow });
+        let valid = frame.recorded.as_ref().map(|r| r.iter().map(|&v| v * u8::MAX).collect());
+        return Ok(StoredPicture { width: raster.width, height: raster.height, color, mask, valid, depth, flow });
     }
     let (stored_width, stored_height) = (raster.width, raster.height);
     let mut planes = composite(&raster, background);
     drop(raster);
     planes.extend(mask);
-    let mut valid = None;
+    let mut valid: Option<Vec<f32>> = frame.recorded.as_ref().map(|r| r.iter().map(|&v| f32::from(v)).collect());
     if !lens.is_pinhole() {
         let map = UndistortMap::new(&lens, &frame.source);
-        planes = planes.iter().map(|p| map.apply(p, stored_width, stored_height)).collect();
-        valid = map.valid();
+        let undistort = |plane: &Vec<f32>| map.apply(plane, stored_width, stored_height);
+        planes = planes.iter().map(undistort).collect();
+        // Outside of the picture it is 0 as well.
+        valid = valid.as_ref().map(undistort).or_else(|| map.valid());
     }
     let (k, width, height) = (capture.downscale, frame.source.width, frame.source.height);
     planes.iter_mut().chain(&mut valid).for_each(|p| *p = box_mean(p, width, height, k));

@@ -40,6 +40,7 @@ pub fn capture_options(recipe: &Recipe) -> Result<CaptureOptions> {
         images: Some(recipe.capture.images.0.clone()).filter(|name| !name.is_empty()),
         poses: recipe.capture.poses,
         exif: recipe.capture.exif,
+        borders: recipe.capture.borders,
         times: recipe.capture.times,
         unregistered: recipe.capture.unregistered,
         max_missing: recipe.capture.max_missing,

@@ -174,6 +174,7 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
             labels: None,
             features: None,
             tracks: None,
+            recorded: None,
             mask: None,
         }
     };

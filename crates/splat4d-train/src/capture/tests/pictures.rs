@@ -187,3 +187,26 @@ fn a_picture_is_undistorted_while_all_workers_are_busy() {
     busy.1.notify_all();
     assert_eq!(answer, Ok(true));
 }
+
+#[test]
+fn black_borders_are_neither_trained_nor_scored() {
+    // Six photos that undistortion left a black column at either side of; one is damaged by a dark stripe across.
+    let sample = samples::photos(6, |c| format!("{c}.png"), None);
+    for c in 0..6u32 {
+        let pixel = |x: u32, y: u32| {
+            let black = x == 0 || x == WIDTH as u32 - 1 || (c == 0 && y == 8);
+            image::Rgb(if black { [3, 0, 12] } else { [90 + 9 * x as u8, 60 + 7 * (y + c) as u8, 50] })
+        };
+        sample.save(&format!("images/{c}.png"), ImageBuffer::from_fn(WIDTH as u32, HEIGHT as u32, pixel));
+    }
+    let capture = open(sample.root(), 1);
+    assert!(capture.notes.iter().any(|n| n.contains("6 images have black borders")), "{:?}", capture.notes);
+    let valid = load(&capture, 0).valid.expect("the borders are left out");
+    let row: Vec<f32> = (0..WIDTH).map(|x| valid.get(0, 8, x)).collect();
+    assert_eq!((&row[..4], &row[WIDTH - 4..]), (&[0.0, 0.0, 0.0, 1.0][..], &[1.0, 0.0, 0.0, 0.0][..]));
+    let half = load(&open(sample.root(), 2), 1).valid.expect("at half size too");
+    assert_eq!([0, 1, 2].map(|x| (2.0 * half.get(0, 4, x)).round()), [0.0, 1.0, 2.0], "half of a pixel is recorded");
+    let keep = CaptureOptions { borders: Borders::Keep, ..CaptureOptions::default() };
+    let kept = Arc::new(Capture::open(sample.root(), &keep).unwrap());
+    assert!(load(&kept, 0).valid.is_none() && kept.notes.iter().all(|n| !n.contains("borders")));
+}
