@@ -211,7 +211,7 @@ pub(crate) struct Frame {
     number: usize,
     /// The camera's name.
     name: String,
-    /// Of the picture as training sees it.
+    /// Of the image as training sees it.
     camera: Camera,
     /// Seconds.
     time: f64,
@@ -219,6 +219,6 @@ pub(crate) struct Frame {
     index: usize,
     /// `train`, `test`, `val` or `future`.
     split: &'static str,
-    /// The picture file.
+    /// The image file.
     file: PathBuf,
 }
