@@ -1,9 +1,9 @@
 // The documentation site: the repository's Markdown files, the gallery and the API references. See ../CONTRIBUTING.md.
 import { cpSync, existsSync, readdirSync, readFileSync } from 'node:fs';
-import { dirname, join, posix, resolve } from 'node:path';
+import { dirname, join, resolve } from 'node:path';
 import { fileURLToPath } from 'node:url';
 import { defineConfig } from 'vitepress';
-import { describe, github, isPage, rows, slug } from './markdown.mjs';
+import { describe, github, rows, slug } from './markdown.mjs';
 import { crates, navigation, sidebar } from './navigation.mjs';
 
 const root = resolve(dirname(fileURLToPath(import.meta.url)), '../..');
@@ -16,6 +16,17 @@ if (!api && process.env.REQUIRE_API) {
 /** Records, newest first: page and title. */
 const records = readdirSync(join(root, 'studies/records')).filter(name => /^\d.*\.md$/.test(name)).sort().reverse()
   .map(name => [`studies/records/${name}`, readFileSync(join(root, 'studies/records', name), 'utf8').match(/^# (.*)/)[1]]);
+
+/** Measurements and history come last. These functions run in the browser: they may use nothing from outside. */
+const ranking = {
+  options: {
+    processTerm: term => ['a', 'an', 'and', 'for', 'in', 'is', 'of', 'on', 'the', 'to', 'with'].includes(term.toLowerCase()) ? null : term.toLowerCase(),
+  },
+  searchOptions: {
+    boost: { title: 4, text: 2, titles: 2 },
+    boostDocument: id => id.includes('/records/') || id.includes('CHANGELOG') ? 0.2 : 1,
+  },
+};
 
 export default defineConfig({
   title: 'splat4d',
@@ -43,7 +54,7 @@ export default defineConfig({
     nav: navigation(api),
     sidebar: sidebar(records, api, page => existsSync(join(root, page))),
     outline: [2, 3],
-    search: { provider: 'local', options: { detailedView: true, _render: describe } },
+    search: { provider: 'local', options: { detailedView: true, _render: describe, miniSearch: ranking } },
     socialLinks: [{ icon: 'github', link: 'https://github.com/splat4d/splat4d' }],
     footer: { message: 'MIT or Apache-2.0' },
   },
@@ -53,8 +64,10 @@ export default defineConfig({
     for (const name of readdirSync(join(root, 'examples')).filter(name => name.endsWith('.s4d'))) {
       cpSync(join(root, 'examples', name), join(outDir, 'scenes', name));
     }
-    for (const name of api ? [...crates, 'static.files', 'src', 'search.index', 'trait.impl', 'type.impl', 'crates.js', 'help.html', 'settings.html', 'src-files.js'] : []) {
-      if (existsSync(join(rustdoc, name))) cpSync(join(rustdoc, name), join(outDir, 'api', name), { recursive: true });
+    const parts = [...crates, 'static.files', 'src', 'search.index', 'trait.impl', 'type.impl'];
+    const files = ['crates.js', 'src-files.js', 'help.html', 'settings.html'];
+    for (const name of api ? [...parts, ...files].filter(name => existsSync(join(rustdoc, name))) : []) {
+      cpSync(join(rustdoc, name), join(outDir, 'api', name), { recursive: true });
     }
   },
 });

@@ -6,7 +6,7 @@ const REPOSITORY = 'https://github.com/splat4d/splat4d/blob/main/';
 /** Folders whose Markdown files are pages; with it those of the root. */
 const PAGES = /^(docs\/[^/]+|studies\/records\/[^/]+|[^/]+)\.md$/;
 
-export const isPage = path => PAGES.test(path);
+const isPage = path => PAGES.test(path);
 
 /** A heading's anchor, as GitHub makes it. */
 export function slug(heading) {
@@ -35,25 +35,27 @@ export function github(md, root) {
   });
 }
 
-/** Pages whose table rows are entries of a reference: settings and options. */
-const REFERENCE = /(^|\/)(recipe|cli)[a-z-]*\.md$/;
+/** Pages whose table rows are entries of a reference, and an entry's name by its section and first cell; none: no entry. */
+const REFERENCES = [
+  // `densify.max_cap` of `max_cap` under `[densify]`.
+  [/(^|\/)recipe[a-z-]*\.md$/, (section, cell) => section.match(/^`\[(\w+)\]`$/)?.[1].concat('.', cell)],
+  // `train --minutes` of `--minutes M` under `train`.
+  [/(^|\/)cli[a-z-]*\.md$/, (section, cell) => cell.match(/--[\w-]+/)?.[0].replace(/^/, `${section} `)],
+  // `Scene.at` of `at(t: float) -> Gaussians` under `Scene`.
+  [/(^|\/)python-api\.md$/, (section, cell) => cell.match(/^\w+/)?.[0].replace(/^/, `${section}.`)],
+];
 
-/** An entry's name: `densify.max_cap` of row `max_cap` under `[densify]`, `train --minutes` of `--minutes` under `train`. */
-function entry(heading, cell) {
-  const name = cell.split(' ').find(word => word.startsWith('--')) ?? cell.split(' ')[0];
-  const table = heading.replace(/[`[\]]/g, '');
-  return name.startsWith('-') ? `${table} ${name}` : `${table}.${name}`;
-}
-
-/** A plugin: every setting and option is a row with an anchor of its own. */
+/** A plugin: every setting, option and member is a row with an anchor of its own. */
 export function rows(md) {
   md.core.ruler.push('rows', ({ tokens, env }) => {
-    if (!REFERENCE.test(env.relativePath ?? '')) return;
-    let heading = '';
+    const name = REFERENCES.find(([page]) => page.test(env.relativePath ?? ''))?.[1];
+    if (!name) return;
+    let section = '';
     tokens.forEach((token, i) => {
-      if (token.type === 'heading_open') heading = tokens[i + 1].content;
+      if (token.type === 'heading_open') section = tokens[i + 1].content;
       const first = token.type === 'tr_open' ? tokens[i + 2].children?.[0] : null;
-      if (first?.type === 'code_inline') token.attrSet('id', entry(heading, first.content).replaceAll(' ', '-'));
+      const entry = first?.type === 'code_inline' ? name(section, first.content) : null;
+      if (entry) token.attrSet('id', entry.replace(' ', ''));
     });
   });
 }
@@ -61,5 +63,5 @@ export function rows(md) {
 /** What the search indexes of a page: each row with an anchor is a section of its own. */
 export function describe(source, env, md) {
   const html = md.render(source, env);
-  return html.replace(/<tr id="([^"]*)"/g, (row, id) => `<h4>${id} <a href="#${id}">#</a></h4>${row}`);
+  return html.replace(/<tr id="([^"]*)"/g, (row, id) => `<h3>${id.replace('--', ' --')} <a href="#${id}">#</a></h3>${row}`);
 }

@@ -86,6 +86,7 @@ const EXPLANATION = [
 const MEASUREMENTS = [
   ['docs/suite', 'Suite of captures'],
   ['docs/benchmarks', 'Benchmarks'],
+  ['studies/records/index', 'All records'],
 ];
 const PROJECT = [
   ['CONTRIBUTING', 'Contributing'],
@@ -106,7 +107,7 @@ export function navigation(api) {
   ];
 }
 
-/** `exists` skips pages that are written elsewhere and not merged yet; the link check finds all others that are missing. */
+/** `records`: pages and titles; `api`: whether there are pages of rustdoc; `exists`: whether a page is there. */
 export function sidebar(records, api, exists) {
   const item = ([page, name]) => Array.isArray(name)
     ? { text: page, collapsed: true, items: name.map(item) }
@@ -116,11 +117,12 @@ export function sidebar(records, api, exists) {
   const reference = group('Reference', REFERENCE);
   reference.items.push(...rust);
   return [
+    // The notebooks' page comes with them.
     group('Tutorials', TUTORIALS.filter(([page]) => page !== 'docs/from-scratch' || exists(`${page}.md`)), false),
     group('How-to guides', GUIDES, false),
     reference,
     group('Explanation', EXPLANATION),
-    group('Records', [['docs/suite', 'Suite of captures'], ['docs/benchmarks', 'Benchmarks'], ['studies/records/index', 'All records'], ...records.map(([page, title]) => [page.replace(/\.md$/, ''), title])]),
+    group('Records', [...MEASUREMENTS, ...records.map(([page, title]) => [page.replace(/\.md$/, ''), title])]),
     group('Project', PROJECT),
   ];
 }
