@@ -6,7 +6,7 @@ import { tmpdir } from 'node:os';
 import { dirname, join, resolve } from 'node:path';
 import test from 'node:test';
 import { fileURLToPath } from 'node:url';
-import { describe, github, rows, slug } from './.vitepress/markdown.mjs';
+import { describe, equations, github, rows, slug } from './.vitepress/markdown.mjs';
 import { sidebar } from './.vitepress/navigation.mjs';
 
 const root = resolve(dirname(fileURLToPath(import.meta.url)), '..');
@@ -39,6 +39,12 @@ test('links to pages stay, links to other files lead to the repository, and dead
   assert.equal(link('../Cargo.toml'), 'https://github.com/splat4d/splat4d/blob/main/Cargo.toml');
   assert.equal(link('../examples/knight'), 'https://github.com/splat4d/splat4d/tree/main/examples/knight');
   assert.throws(() => link('../nothing.rs'), /leads nowhere/);
+});
+
+test('fenced equations become blocks of mathematics, and other fences stay', () => {
+  const fences = ['math', 'js'].map(info => ({ type: 'fence', info }));
+  run(equations, fences, 'docs/models.md');
+  assert.deepEqual(fences.map(f => f.type), ['math_block', 'fence']);
 });
 
 test('settings, options and members are found by their names', () => {

@@ -3,12 +3,12 @@ import { cpSync, existsSync, readdirSync, readFileSync } from 'node:fs';
 import { dirname, join, resolve } from 'node:path';
 import { fileURLToPath } from 'node:url';
 import { defineConfig } from 'vitepress';
-import { describe, github, rows, slug } from './markdown.mjs';
+import { describe, equations, github, rows, slug } from './markdown.mjs';
 import { crates, navigation, sidebar } from './navigation.mjs';
 
 const root = resolve(dirname(fileURLToPath(import.meta.url)), '../..');
 /** What `cargo doc --workspace --no-deps` wrote. */
-const rustdoc = join(process.env.CARGO_TARGET_DIR ?? join(root, 'target'), 'doc');
+const rustdoc = resolve(root, process.env.CARGO_TARGET_DIR ?? 'target', 'doc');
 const api = crates.every(name => existsSync(join(rustdoc, name, 'index.html')));
 if (!api && process.env.REQUIRE_API) {
   throw new Error(`${rustdoc} has no pages of ${crates.join(', ')}. Run: cargo doc --workspace --no-deps`);
@@ -45,7 +45,7 @@ export default defineConfig({
   markdown: {
     math: true,
     anchor: { slugify: slug },
-    config: md => void md.use(github, root).use(rows),
+    config: md => void md.use(github, root).use(equations).use(rows),
   },
   transformPageData(page) {
     if (page.relativePath === 'index.md') Object.assign(page.frontmatter, home);

@@ -35,6 +35,13 @@ export function github(md, root) {
   });
 }
 
+/** A plugin: fenced blocks `math` are equations, as on GitHub. */
+export function equations(md) {
+  md.core.ruler.push('equations', ({ tokens }) => {
+    for (const token of tokens) if (token.type === 'fence' && token.info.trim() === 'math') token.type = 'math_block';
+  });
+}
+
 /** Pages whose table rows are entries of a reference, and an entry's name by its section and first cell; none: no entry. */
 const REFERENCES = [
   // `densify.max_cap` of `max_cap` under `[densify]`.
