@@ -64,11 +64,7 @@ export default defineConfig({
     for (const name of readdirSync(join(root, 'examples')).filter(name => name.endsWith('.s4d'))) {
       cpSync(join(root, 'examples', name), join(outDir, 'scenes', name));
     }
-    const parts = [...crates, 'static.files', 'src', 'search.index', 'trait.impl', 'type.impl'];
-    const files = ['crates.js', 'src-files.js', 'help.html', 'settings.html'];
-    for (const name of api ? [...parts, ...files].filter(name => existsSync(join(rustdoc, name))) : []) {
-      cpSync(join(rustdoc, name), join(outDir, 'api', name), { recursive: true });
-    }
+    if (api) cpSync(rustdoc, join(outDir, 'api'), { recursive: true });
   },
 });
 
