@@ -35,13 +35,16 @@ fn document() -> String {
 
 /// Documentation comments of Rust code by the name that Python has: `open`, `Scene`, `Scene.at`.
 fn comments(code: &str, words: &mut BTreeMap<String, String>) {
-    let (mut comment, mut owner) = (String::new(), String::new());
+    let (mut comment, mut owner, mut renamed) = (String::new(), String::new(), None);
     for line in code.lines() {
         let bare = line.trim();
         if let Some(text) = bare.strip_prefix("///") {
             // An empty line begins a paragraph.
             comment += if text.is_empty() { "\n\n" } else { text };
             continue;
+        }
+        if let Some(other) = bare.strip_prefix("#[getter(") {
+            renamed = Some(other.trim_end_matches(")]").to_owned());
         }
         let outside = !line.starts_with(' ');
         if outside && bare == "}" {
@@ -59,7 +62,7 @@ fn comments(code: &str, words: &mut BTreeMap<String, String>) {
         } else if let Some(of) = named("impl ").filter(|_| outside) {
             owner = of;
         } else if let Some(function) = named("fn ") {
-            let function = if function == "new" { "__new__".into() } else { function };
+            let function = if function == "new" { "__new__".into() } else { renamed.take().unwrap_or(function) };
             name = Some(if outside { function } else { member(&owner, &function) });
         } else if let Some((field, _)) = item.split_once(": ").filter(|(f, _)| !outside && !f.contains(' ')) {
             name = Some(member(&owner, field));
@@ -245,11 +248,11 @@ fn every_public_name_of_the_package_is_on_the_page_with_words() {
 fn stubs_become_calls() {
     let mut words = BTreeMap::new();
     comments(
-        "/// Says a.\n#[pyclass]\npub(crate) struct A {\n    /// Wide.\n    w: usize,\n}\nimpl A {\n    /// Made.\n    fn new() {}\n}\n",
+        "/// Says a.\n#[pyclass]\npub(crate) struct A {\n    /// Wide.\n    w: usize,\n}\nimpl A {\n    /// Made.\n    fn new() {}\n    /// Kept.\n    #[getter(K)]\n    fn k() {}\n}\n",
         &mut words,
     );
     assert_eq!(words["A"], "Says a.");
-    assert_eq!((words["A.w"].as_str(), words["A.__new__"].as_str()), ("Wide.", "Made."));
+    assert_eq!(["A.w", "A.__new__", "A.K"].map(|name| words[name].as_str()), ["Wide.", "Made.", "Kept."]);
     let stub = "class A:\n    w: int\n    def __new__(\n        cls,\n        x: int,\n    ) -> A: ...\n    @property\n    def p(self) -> _F32: ...\ndef f(a: _Path) -> A: ...\n";
     let text = written(stub, &words);
     for there in [
