@@ -42,8 +42,8 @@ const REFERENCE = [
   ['Command line', [
     ['docs/cli', 'import, info, train, join'],
     ['docs/cli-results', 'eval, render, predict …'],
-    ['docs/cli-scenes', 'bake, compress, export …'],
-    ['docs/cli-edits', 'edit, label, completions'],
+    ['docs/cli-scenes', 'bake, compress, view, export'],
+    ['docs/cli-edits', 'convert, edit, label …'],
     ['docs/exit-codes', 'Exit codes'],
     ['docs/events', 'JSON output'],
     ['docs/output-folders', 'Output folders'],

@@ -18,8 +18,8 @@ const PAGES: [Page; 4] = [
                examples of all commands: [commands](verbs.md).\n\n| page | commands |\n|---|---|\n\
                | this page | import, info, train, join |\n\
                | [results](cli-results.md) | eval, render, predict, localise, bench |\n\
-               | [scenes and files](cli-scenes.md) | bake, compress, view, export, convert |\n\
-               | [edits](cli-edits.md) | edit, label, completions |\n\n\
+               | [scenes and files](cli-scenes.md) | bake, compress, view, export |\n\
+               | [conversion and edits](cli-edits.md) | convert, edit, label, completions |\n\n\
                Every command also accepts these options:\n",
         commands: &["import", "info", "train", "join"],
     },
@@ -31,15 +31,15 @@ const PAGES: [Page; 4] = [
     },
     Page {
         file: "cli-scenes.md",
-        head: "# Command line: scenes and files\n\nOptions of `bake`, `compress`, `view`, `export` and `convert`. Options \
-               that every command accepts: [captures and training](cli.md).\n",
-        commands: &["bake", "compress", "view", "export", "convert"],
+        head: "# Command line: scenes and files\n\nOptions of `bake`, `compress`, `view` and `export`. Options that every \
+               command accepts: [captures and training](cli.md).\n",
+        commands: &["bake", "compress", "view", "export"],
     },
     Page {
         file: "cli-edits.md",
-        head: "# Command line: edits\n\nOptions of `edit`, `label` and `completions`. Options that every command accepts: \
-               [captures and training](cli.md).\n",
-        commands: &["edit", "label", "completions"],
+        head: "# Command line: conversion and edits\n\nOptions of `convert`, `edit`, `label` and `completions`. Options that \
+               every command accepts: [captures and training](cli.md).\n",
+        commands: &["convert", "edit", "label", "completions"],
     },
 ];
 
