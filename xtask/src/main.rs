@@ -5,7 +5,6 @@
 //! | module | content |
 //! |---|---|
 //! | `capture.rs`, `scene.rs`, `raster.rs` and others | render the bundled capture with a small renderer of their own |
-//! | `site.rs`, `python_api.rs` | the static site; the Python API as its page |
 //! | `fuzz.rs`, `chaos/` | damaged inputs for every reader; kills, full disks and second processes for every command that writes |
 
 mod camera;
@@ -21,10 +20,8 @@ mod material;
 mod mesh;
 mod metrics;
 mod picture;
-mod python_api;
 mod raster;
 mod scene;
-mod site;
 mod skin;
 mod still;
 mod strip;
@@ -57,7 +54,6 @@ chores:
                              draws a take of any length: twenty cameras, 30 frames a second, 200x150, a frame in memory at a time
   strip-character IN.glb OUT.glb CLIP... [--drop NODE...]
                              keeps the named animation clips of a character, drops the named nodes' meshes
-  site OUT [--no-api]        makes the static site in OUT: documents, API, a gallery that plays the example scenes
   fuzz [--minutes N] [--seed S] [--reader NAME]
                              mutates sound inputs of every reader and prints how many were read (default: 2 minutes)
   chaos [--trials N] [--seed N] [--verb NAME] [--program FILE]
@@ -83,7 +79,6 @@ fn run(arguments: &[String]) -> Result<()> {
         "chaos" => chaos::command(rest),
         "count" => count::command(rest),
         "fuzz" => fuzz::command(rest),
-        "site" => site::command(rest),
         "strip-character" => strip_character(rest),
         _ => bail!("unknown chore {chore}\n{USAGE}"),
     }

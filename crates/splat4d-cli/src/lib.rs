@@ -262,8 +262,8 @@ fn exit_code(error: &anyhow::Error) -> u8 {
     if error.downcast_ref::<Error>().is_some_and(Error::is_users) { BAD_INPUT } else { FAILED }
 }
 
-/// The whole command, for completions and help.
-fn command() -> clap::Command {
+/// The whole command, for completions, help and the reference in docs/.
+pub fn command() -> clap::Command {
     <Cli as clap::CommandFactory>::command()
 }
 

@@ -54,36 +54,43 @@ impl Camera {
         checked(scene::Camera { near, ..scene::Camera::with_fov_y(pose, fov_y.to_radians(), width, height) })
     }
 
+    /// Pixels of the image, left to right.
     #[getter]
     fn width(&self) -> usize {
         self.0.width
     }
 
+    /// Pixels of the image, top to bottom.
     #[getter]
     fn height(&self) -> usize {
         self.0.height
     }
 
+    /// Horizontal focal length, pixels.
     #[getter]
     fn fx(&self) -> f64 {
         self.0.intrinsics.fx
     }
 
+    /// Vertical focal length, pixels.
     #[getter]
     fn fy(&self) -> f64 {
         self.0.intrinsics.fy
     }
 
+    /// Horizontal position of the principal point, pixels.
     #[getter]
     fn cx(&self) -> f64 {
         self.0.intrinsics.cx
     }
 
+    /// Vertical position of the principal point, pixels.
     #[getter]
     fn cy(&self) -> f64 {
         self.0.intrinsics.cy
     }
 
+    /// Smallest depth that is rendered, scene units.
     #[getter]
     fn near(&self) -> f64 {
         self.0.near
@@ -106,7 +113,7 @@ impl Camera {
         shaped(py, vec![fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], &[3, 3])
     }
 
-    /// Where it stands in the world.
+    /// Position of the camera in the world.
     #[getter]
     fn position(&self) -> [f64; 3] {
         self.0.center()

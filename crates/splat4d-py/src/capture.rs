@@ -115,6 +115,7 @@ impl Capture {
         Self::open(py, folder, &Recipe::default(), temporary)
     }
 
+    /// Name of the capture.
     #[getter]
     fn name(&self) -> &str {
         &self.capture.name
@@ -132,12 +133,13 @@ impl Capture {
         self.capture.times()
     }
 
+    /// Frames per second.
     #[getter]
     fn fps(&self) -> f64 {
         self.capture.fps
     }
 
-    /// Upwards in the world.
+    /// Up direction in the world.
     #[getter]
     fn up(&self) -> [f64; 3] {
         self.capture.up
@@ -168,6 +170,7 @@ impl Capture {
         self.capture.frames.len()
     }
 
+    /// Image i with its camera and time.
     fn __getitem__(&self, i: isize) -> PyResult<Frame> {
         let at = self.frame_at(i)?;
         let frame = &self.capture.frames[at];
@@ -211,7 +214,7 @@ pub(crate) struct Frame {
     number: usize,
     /// The camera's name.
     name: String,
-    /// Of the picture as training sees it.
+    /// Camera of the image, as training uses it.
     camera: Camera,
     /// Seconds.
     time: f64,
@@ -219,6 +222,6 @@ pub(crate) struct Frame {
     index: usize,
     /// `train`, `test`, `val` or `future`.
     split: &'static str,
-    /// The picture file.
+    /// The image file.
     file: PathBuf,
 }

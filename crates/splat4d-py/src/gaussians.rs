@@ -66,6 +66,7 @@ impl Gaussians {
         Ok(made.clone_ref(py))
     }
 
+    /// Number of Gaussians.
     fn __len__(&self) -> usize {
         self.count
     }

@@ -35,7 +35,7 @@ impl Raised {
 pub(crate) struct View {
     /// Second of the scene.
     time: f64,
-    /// Place of the picture among those trained on.
+    /// Place of the image among those trained on.
     frame: usize,
     /// Place of its camera in the capture.
     camera: usize,

@@ -21,13 +21,14 @@ pub(crate) struct Run {
 
 #[pymethods]
 impl Run {
+    /// Opens the run in a folder.
     #[new]
     pub(crate) fn new(path: PathBuf) -> PyResult<Self> {
         run_folder::Run::open(&path).or_raise()?;
         Ok(Self { path })
     }
 
-    /// Whether it has taken its last step.
+    /// Whether training has ended.
     #[getter]
     fn finished(&self) -> bool {
         run_folder::Run::is_finished(&self.path)

@@ -58,12 +58,13 @@ impl Scene {
         (self.source.scene.clip[0], self.source.scene.clip[1])
     }
 
+    /// Frames per second.
     #[getter]
     fn fps(&self) -> f64 {
         self.source.scene.fps
     }
 
-    /// Upwards in the world.
+    /// Up direction in the world.
     #[getter]
     fn up(&self) -> [f64; 3] {
         self.source.scene.up

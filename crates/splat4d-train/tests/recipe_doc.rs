@@ -56,9 +56,10 @@ const PAGES: [Page; 3] = [
 const HEAD: &str = "\
 # Settings
 
-All settings of a run, with default and meaning. The size of the scene and its file follows mainly from `densify.max_cap`, the time from
-`run.iterations` and `capture.downscale`. `densify.max_cap = 0` derives the number of Gaussians from the capture: one for 350 pixels of
-distinct views, at most 45 per step and what fits the memory, at least 30,000. `train` prints the number and the reason.
+All settings of a run, with default and meaning. The size of the scene and its file follows mainly from `densify.max_cap`
+([how to limit it](file-size.md)), the time from `run.iterations` and `capture.downscale`. `densify.max_cap = 0` derives the number of
+Gaussians from the capture: one for 350 pixels of distinct views, at most 45 per step and what fits the memory, at least 30,000. `train`
+prints the number and the reason. The search of the documentation site finds every setting by its name.
 
 | page | tables |
 |---|---|
