@@ -16,6 +16,8 @@ from common import KNIGHT, PLAYABLE, ROOT, InFolder
 FOLDER = ROOT / "crates/splat4d-py/examples"
 # Lines of an example, at most; the one for Rerun says all of its archetypes.
 LINES = 20
+# Bytes of a notebook with its outputs, at most: GitHub shows small ones at once.
+NOTEBOOK_BYTES = 300_000
 
 
 class Examples(InFolder):
@@ -76,6 +78,7 @@ class Examples(InFolder):
         here = pathlib.Path(__file__).read_text()
         for book in FOLDER.glob("*.ipynb"):
             self.assertIn(f'"{book.name}"', here)
+            self.assertLess(book.stat().st_size, NOTEBOOK_BYTES, book.name)
 
     def test_notebook(self):
         names = self.run_notebook("knight.ipynb")
