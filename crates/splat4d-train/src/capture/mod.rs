@@ -34,6 +34,7 @@ mod own;
 mod panoptic;
 mod panorama;
 mod picture;
+mod plausible;
 mod points;
 mod pose;
 mod posed;
@@ -43,6 +44,7 @@ mod rig;
 mod sequence;
 mod splits;
 mod store;
+mod stray;
 mod tracks;
 mod transforms;
 

@@ -2,9 +2,9 @@
 
 use super::account::{Account, Aspect, first_names};
 use super::convention::{Convention, Poses};
-use super::layout::{ffmpeg_command, videos};
 use super::points::read_ply;
 use super::preflight::Severity;
+use super::stray::{ffmpeg_command, videos};
 use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take};
 use super::{json, llff, masks, picture, pose, rig, sequence};
 use splat4d::format::npy::Npy;
