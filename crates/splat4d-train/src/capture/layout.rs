@@ -66,6 +66,11 @@ pub(super) fn read(path: &Path, options: &CaptureOptions) -> Result<Take> {
             if MODEL_FILES.iter().any(|name| is(name)) {
                 return colmap::read(root, path, options);
             }
+            if stray::is_archive(path) {
+                return Err(Error::input("is an archive, not a capture")
+                    .at(path.display())
+                    .remedy("Unpack it (it is a .zip if it ends in .r3d), and give the folder that it makes."));
+            }
             if stray::is_transforms(path) {
                 return transforms::read(root, path, options);
             }
@@ -130,6 +135,15 @@ fn is_model(path: &Path, marker: &str, file: &Path) -> bool {
         colmap::is_model(&model) && model.parent().is_some_and(|above| above != path && colmap::has_images(above))
     };
     colmap::is_model(file) && colmap::has_images(path) || !colmap::WORKSPACES.iter().any(|w| own_images(&w))
+}
+
+/// Whether a file's name is one that a capture's metadata can have.
+pub(super) fn is_metadata(path: &Path) -> bool {
+    const ENDINGS: [&str; 5] = ["json", "npy", "xml", "csv", "r3d"];
+    let ending = path.extension().is_some_and(|e| ENDINGS.iter().any(|v| e.eq_ignore_ascii_case(v)));
+    let name = path.file_name().unwrap_or_default();
+    let model = READERS.iter().map(|(marker, _)| *marker).chain(MODEL_FILES).any(|n| name.eq_ignore_ascii_case(n));
+    ending || model && path.is_file()
 }
 
 /// Whether a folder holds a capture of one of these layouts.

@@ -408,6 +408,11 @@ impl Capture {
 #[cfg(test)]
 mod tests;
 
+/// Whether a file's name is one that a capture's metadata can have: [`Capture::open`] takes such files too.
+pub fn is_metadata(path: &Path) -> bool {
+    layout::is_metadata(path)
+}
+
 /// A coloured point cloud from a .ply file. Errors: not a point cloud, damage, absurd counts.
 pub(crate) fn read_points(path: &Path) -> Result<PointCloud> {
     points::read_ply(path)

@@ -6,10 +6,14 @@ use std::path::{Path, PathBuf};
 /// Endings of pictures that can be decoded.
 pub(super) const IMAGE_ENDINGS: &[&str] = &["png", "jpg", "jpeg", "webp"];
 
+/// What macOS puts next to every file on foreign disks, under its name after this.
+const APPLE_DOUBLE: &str = "._";
+
 /// Sorted names of the files and folders directly in `folder`; empty where it cannot be read.
 pub(super) fn file_names(folder: &Path) -> Vec<String> {
     let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
-    let mut names: Vec<String> = entries.flatten().filter_map(|e| e.file_name().into_string().ok()).collect();
+    let names = entries.flatten().filter_map(|e| e.file_name().into_string().ok());
+    let mut names: Vec<String> = names.filter(|n| !n.starts_with(APPLE_DOUBLE)).collect();
     names.sort();
     names
 }

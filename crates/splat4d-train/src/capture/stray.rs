@@ -1,14 +1,14 @@
 //! What a folder holds that is no capture, and the way from there to one: archives, captures above and below, files under
 //! other names, images and videos without poses.
 
-use super::{colmap, layout, rig};
+use super::{colmap, layout, lookup, rig, sequence};
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// Where the videos of a rig often lie.
 const VIDEO_FOLDER: &str = "videos";
 const VIDEO_ENDINGS: &[&str] = &["mp4", "mov", "mkv", "avi", "webm"];
-const ARCHIVE_ENDINGS: &[&str] = &["zip", "7z", "rar", "tar", "tgz", "gz"];
+const ARCHIVE_ENDINGS: &[&str] = &["zip", "7z", "rar", "tar", "tgz", "gz", "r3d"];
 /// COLMAP's features and matches.
 const DATABASE: &str = "database.db";
 /// The cameras of a 3DGS output: names of images and poses, without the images.
@@ -21,20 +21,17 @@ const MOST_FOLDERS: usize = 100;
 /// What to do with a folder that is no capture, by what it holds. `None`: it holds nothing that is known.
 pub(super) fn advice(root: &Path) -> Option<String> {
     let names = rig::file_names(root);
-    let ends = |name: &str, endings: &[&str]| {
-        Path::new(name).extension().is_some_and(|e| endings.iter().any(|v| e.eq_ignore_ascii_case(v)))
-    };
     let folders = || names.iter().map(|n| root.join(n)).filter(|p| p.is_dir()).take(MOST_FOLDERS);
     if let Some(inner) = folders().find(|folder| layout::is_capture(folder)) {
         return Some(format!("A folder in it is a capture: give {}.", inner.display()));
     }
-    if let Some(above) = above(root).filter(|folder| layout::is_capture(folder)) {
+    if let Some(above) = above(root).filter(|folder| is_part(root) && layout::is_capture(folder)) {
         return Some(format!("The folder that holds it is a capture: give {}.", above.display()));
     }
     if let Some(name) = names.iter().find(|n| is_transforms(&root.join(n))) {
         return Some(format!("{name} has poses as transforms.json has them: give its path, or rename it."));
     }
-    if let Some(name) = names.iter().find(|n| ends(n, ARCHIVE_ENDINGS)) {
+    if let Some(name) = names.iter().find(|n| ends(Path::new(n), ARCHIVE_ENDINGS)) {
         return Some(format!("{name} is an archive: unpack it, and give the folder that it makes."));
     }
     if root.join(OUTPUT_CAMERAS).is_file() {
@@ -58,6 +55,22 @@ pub(super) fn advice(root: &Path) -> Option<String> {
     colmap::has_images(root).then(|| format!("It holds images, but no camera poses: {reconstruct}."))
 }
 
+/// Whether a name ends in one of these.
+fn ends(path: &Path, endings: &[&str]) -> bool {
+    path.extension().is_some_and(|e| endings.iter().any(|v| e.eq_ignore_ascii_case(v)))
+}
+
+/// Whether a file is an archive by its name, which is to be unpacked.
+pub(super) fn is_archive(path: &Path) -> bool {
+    ends(path, ARCHIVE_ENDINGS)
+}
+
+/// Whether a folder is called like the images of a capture, or like one of its cameras.
+fn is_part(root: &Path) -> bool {
+    let name = root.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    lookup::is_image_folder(&name) || rig::is_plain(&name) || sequence::are_cameras(&[name])
+}
+
 /// The folder that holds this one.
 fn above(root: &Path) -> Option<PathBuf> {
     let full = std::path::absolute(root).ok()?;
@@ -66,8 +79,7 @@ fn above(root: &Path) -> Option<PathBuf> {
 
 /// Whether a JSON file, whatever its name, lists frames with matrices as a transforms file does.
 pub(super) fn is_transforms(path: &Path) -> bool {
-    let json = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("json"));
-    if !json || !path.is_file() {
+    if !ends(path, &["json"]) || !path.is_file() {
         return false;
     }
     let mut head = Vec::new();
@@ -83,10 +95,7 @@ fn first_video(root: &Path) -> Option<String> {
 
 /// Names of the video files in a folder, sorted.
 pub(super) fn videos(folder: &Path) -> Vec<String> {
-    let video = |n: &String| {
-        !n.starts_with('.')
-            && Path::new(n).extension().is_some_and(|e| VIDEO_ENDINGS.iter().any(|v| e.eq_ignore_ascii_case(v)))
-    };
+    let video = |n: &String| !n.starts_with('.') && ends(Path::new(n), VIDEO_ENDINGS);
     rig::file_names(folder).into_iter().filter(video).collect()
 }
 

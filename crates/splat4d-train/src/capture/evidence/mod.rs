@@ -18,6 +18,7 @@ use super::{Aspect, Capture, Frame, Poses};
 use look::Look;
 pub use motion::Agreement;
 use splat4d::math::Se3;
+use std::collections::BTreeSet;
 
 /// Images that are looked at, at most; and at least, where they are large.
 const LOOKS: [usize; 2] = [4, 10];
@@ -126,10 +127,15 @@ impl Capture {
             return fullest.into_iter().take(most).collect();
         }
         if self.fixed_cameras() {
-            // More images of a camera show the same again: its mistakes would count several times.
-            let instant = self.frames[fullest[0]].index;
-            let all = (0..self.frames.len()).filter(|&i| self.frames[i].index == instant);
-            return all.take(most).collect();
+            // One image of each: more of a camera show the same again, and its mistakes would count several times.
+            let instant = fullest.first().map_or(0, |&i| self.frames[i].index);
+            let mut nearest: Vec<usize> = (0..self.frames.len()).collect();
+            nearest.sort_by_key(|&i| (self.frames[i].index.abs_diff(instant), i));
+            let mut cameras = BTreeSet::new();
+            nearest.retain(|&i| cameras.insert(self.frames[i].camera));
+            nearest.truncate(most);
+            nearest.sort_unstable();
+            return nearest;
         }
         // Two runs of frames, a little apart from one another within each.
         let mut frames = self.train.clone();
