@@ -114,7 +114,7 @@ fn capture_folder(models: &Path) -> PathBuf {
             return folder;
         }
         let name = folder.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let of_models = MODEL_FOLDERS.contains(&name.as_str()) || name.parse::<u32>().is_ok();
+        let of_models = MODEL_FOLDERS.iter().any(|n| name.eq_ignore_ascii_case(n)) || name.parse::<u32>().is_ok();
         if folder != models && !of_models {
             return folder;
         }

@@ -239,9 +239,11 @@ impl Lookup {
             bases.iter().any(|base| self.listing(base).names.contains_key(&folder))
         };
         // A relative path may have folders of another machine too, but none that is here with other files.
-        let elsewhere = absolute || parts.first().is_some_and(|first| !there(first));
+        let elsewhere = parts.first().is_some_and(|first| !there(first));
         for skip in 0..parts.len() {
-            if !elsewhere && !parts[..skip].iter().all(|p| rig::is_plain(p)) {
+            // A folder right before the file may name a camera, whose image this is not.
+            let with_folder = elsewhere && parts.len() - skip > 1;
+            if !absolute && !with_folder && !parts[..skip].iter().all(|p| rig::is_plain(p)) {
                 break;
             }
             for base in bases {
