@@ -16,7 +16,7 @@ use splat4d::math::sh::degree_of;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, SH};
 use splat4d::text::in_line;
-use splat4d_train::capture::{Aspect, Capture, Finding, Frame, Reach, Severity, Timing};
+use splat4d_train::capture::{self, Aspect, Capture, Finding, Frame, Reach, Severity, Timing};
 use splat4d_train::event::Event;
 use splat4d_train::output::{Input, check_apart};
 use splat4d_train::path_text::to_text;
@@ -102,7 +102,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             .remedy("Give a capture, a run or a scene file.")
             .into());
     }
-    let marker = path.extension().is_some_and(|e| e == "json" || e == "npy");
+    let marker = capture::is_metadata(path);
     let sog = path.join(sog::META).is_file() || path.file_name().is_some_and(|name| name == sog::META);
     let levels = path.file_name().is_some_and(|name| name == sog::levels::LEVELS);
     let foreign = sog || levels || (path.is_dir() && bundle::is_scene(path));

@@ -6,13 +6,13 @@ use super::{
     Capture, CaptureKind, CaptureOptions, Exif, Extent, FlowFile, Frame, HoldOut, PointCloud, RawFrame, Rig, Split,
     Take, Timing,
 };
-use super::{borders, evidence, lookup, masks, options, panorama, picture, pose};
+use super::{borders, evidence, lookup, masks, options, panorama, picture, plausible, pose};
 use splat4d::math::se3::{norm, normalize, sub};
 use splat4d::scene::{Camera, Lens, Time};
 use splat4d::{Error, Result};
 use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Poses closer than this, relative to the distance from the origin, are one pose.
 const SAME_POSE: f64 = 1e-9;
@@ -34,6 +34,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
     options::check_rate("frame rate", take.fps).map_err(located)?;
     let used: BTreeSet<usize> = take.frames.iter().map(|f| f.camera).collect();
     skip_missing(&mut take, options).map_err(located)?;
+    skip_repeated(&mut take);
     masks::fill(&mut take)?;
     panorama::split(&mut take, options.hold_out.as_ref())?;
     for frame in &mut take.frames {
@@ -319,7 +320,19 @@ fn skip_missing(take: &mut Take, options: &CaptureOptions) -> Result<()> {
     if missing.is_empty() {
         return Ok(());
     }
-    let what = format!("{} of {all} images are missing: {}", missing.len(), first_names(&missing));
+    let mut what = format!("{} of {all} images are missing: {}", missing.len(), first_names(&missing));
+    let gone = take.frames.iter().zip(&there).find(|(_, t)| !**t).map(|(f, _)| &f.image);
+    let other = gone.and_then(|image| lookup::unreadable(image));
+    if let Some(other) = &other {
+        what += &format!("; {} is there instead", other.display());
+    }
+    if let (Some(other), true) = (other, share > options.max_missing) {
+        let name = other.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let png = format!("{}.png", lookup::without_ending(&name));
+        return Err(Error::input(what).remedy(format!(
+            "Its format is not read: convert the images to PNG or JPEG under the same names (ffmpeg -i {name} {png})."
+        )));
+    }
     if missing.len() == all {
         return Err(Error::input(what)
             .remedy("Put them there, or say with --images NAME which folder of the capture holds them."));
@@ -333,6 +346,37 @@ fn skip_missing(take: &mut Take, options: &CaptureOptions) -> Result<()> {
     let mut there = there.into_iter();
     take.frames.retain(|_| there.next().unwrap_or(true));
     Ok(())
+}
+
+/// Takes out frames that are listed twice: with one image, pose, time and purpose.
+fn skip_repeated(take: &mut Take) {
+    let mut earlier: BTreeMap<&Path, Vec<usize>> = BTreeMap::new();
+    let mut repeated = BTreeSet::new();
+    for (i, frame) in take.frames.iter().enumerate() {
+        let same = |&j: &usize| {
+            let other = &take.frames[j];
+            other.split == frame.split && other.time == frame.time && same_pose(&other.source, &frame.source)
+        };
+        let others = earlier.entry(&frame.image).or_default();
+        if others.iter().any(same) {
+            repeated.insert(i);
+        } else {
+            others.push(i);
+        }
+    }
+    if repeated.is_empty() {
+        return;
+    }
+    let names: Vec<String> = repeated.iter().map(|&i| take.frames[i].image.display().to_string()).collect();
+    let what = format!(
+        "{} of {} frames are listed twice, with one image, pose and time: {}. They are read once.",
+        names.len(),
+        take.frames.len(),
+        first_names(&names)
+    );
+    take.account.add(Aspect::Assumed, Severity::Warning, what);
+    let mut kept = (0..take.frames.len()).map(|i| !repeated.contains(&i));
+    take.frames.retain(|_| kept.next().unwrap_or(true));
 }
 
 /// Says which frames have one image and different poses: one of them shows something else.
@@ -383,6 +427,7 @@ fn fit_pictures(take: &mut Take, options: &CaptureOptions) -> Result<(bool, Vec<
     let mut as_stored = 0;
     for frame in &mut take.frames {
         let header = picture::header(&frame.image)?;
+        picture::check_end(&frame.image)?;
         alpha |= header.alpha;
         let whole = panorama::stored(&frame.source);
         let turn = match options.exif {
@@ -436,6 +481,7 @@ fn fit_pictures(take: &mut Take, options: &CaptureOptions) -> Result<(bool, Vec<
         take.account.add(Aspect::Assumed, if meant { Severity::Note } else { Severity::Warning }, what);
     }
     tell_of_orientation(take, as_stored, by_size);
+    plausible::check(take);
     Ok((alpha, upright, unsure))
 }
 
@@ -478,13 +524,15 @@ fn settle_orientation(capture: &mut Capture, unsure: &[usize]) {
 
 /// An error if masks exist and not one of them shows anything; stops at the first that does.
 fn check_masks(take: &Take, has_alpha: bool) -> Result<()> {
+    check_mask_shapes(take)?;
     let masked: Vec<&RawFrame> = take.frames.iter().filter(|f| f.mask.is_some() || has_alpha).collect();
     let Some(first) = masked.first() else { return Ok(()) };
     for frame in &masked {
         if let Some(mask) = &frame.mask {
             // Its size is compared before its pixels are read: a small file may claim gigabytes of them.
             let header = picture::header(mask)?;
-            let sane = picture::check_not_larger("mask", header.upright(), &frame.source);
+            let size = header.upright();
+            let sane = picture::check_not_larger("mask", size, &frame.source);
             sane.map_err(|e| e.at(mask.display()))?;
         }
         match picture::any_foreground(frame.mask.as_deref().unwrap_or(&frame.image), frame.mask.is_none()) {
@@ -499,6 +547,23 @@ fn check_masks(take: &Take, has_alpha: bool) -> Result<()> {
     Err(Error::input("the masks exclude everything: no picture has a foreground pixel")
         .at(place.display())
         .remedy("Masks are white where the picture counts: invert them, or leave them out of the capture."))
+}
+
+/// Masks whose shape is compared with that of their image's before training loads all.
+const SHAPES: usize = 50;
+
+/// An error if a mask has another shape than its image.
+fn check_mask_shapes(take: &Take) -> Result<()> {
+    let masked: Vec<(&RawFrame, &PathBuf)> = take.frames.iter().filter_map(|f| Some((f, f.mask.as_ref()?))).collect();
+    for (frame, mask) in masked.iter().step_by(masked.len().div_ceil(SHAPES).max(1)) {
+        let own = panorama::stored(&frame.source);
+        let header = picture::header(mask)?;
+        if ![header.stored, header.upright()].iter().any(|&size| fits(size, &own)) {
+            picture::check_not_larger("mask", header.upright(), &own).map_err(|e| e.at(mask.display()))?;
+            picture::check_beside(mask, "mask", header.stored, &own)?;
+        }
+    }
+    Ok(())
 }
 
 type Indices = Vec<usize>;

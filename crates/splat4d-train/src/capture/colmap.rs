@@ -28,12 +28,17 @@ pub(super) const SPARSE: &str = "sparse";
 pub(super) const NESTED: &str = "colmap/sparse";
 /// The model of 4DGaussians' "multipleview" layout.
 pub(super) const MULTIVIEW: &str = "sparse_";
+/// Where the files of a model lie if there is no folder for several.
+pub(super) const COLMAP: &str = "colmap";
+/// Models of workspaces next to the images, or with images of their own: those of `image_undistorter`, and last the model
+/// from which the converter of 3DGS undistorts.
+pub(super) const WORKSPACES: [&str; 4] = ["undistorted/sparse", "dense/sparse", "dense/0/sparse", "distorted/sparse"];
 /// A model's points as .ply: 3DGS writes it next to the others, and other programs in place of them.
 const POINTS: &str = "points3D.ply";
 /// Where a model may lie beside poses of another layout: COLMAP's habit and Nerfstudio's.
 const BESIDE: [&str; 2] = [SPARSE, NESTED];
 /// Names of folders between a capture's folder and a model's files, besides numbers.
-const MODEL_FOLDERS: [&str; 5] = [SPARSE, MULTIVIEW, "colmap", "distorted", "undistorted"];
+const MODEL_FOLDERS: [&str; 6] = [SPARSE, MULTIVIEW, COLMAP, "distorted", "undistorted", "dense"];
 /// Mean reprojection error above which poses blur the result, pixels.
 const LARGE_ERROR: f64 = 1.5;
 
@@ -46,6 +51,9 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     let root = &capture_folder(models);
     let lookup = Lookup::new(root, options)?;
     let (folder, registered) = best_model(models, &mut warnings)?;
+    if ["bin", "txt"].iter().all(|ending| folder.join(format!("images.{ending}")).is_file()) {
+        notes.push(format!("{} has its model as .bin and as .txt: the .bin files are read.", folder.display()));
+    }
     let points = colmap_files::points(&folder)?;
     let mut shots = sources(&folder, &registered, options.poses)?;
     let of_rig = multiview::rename(root, &mut shots, &mut account);
@@ -100,17 +108,13 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
 /// The capture's folder of a model: the nearest one with images, of itself and those above while they are named as folders
 /// of models are.
 fn capture_folder(models: &Path) -> PathBuf {
-    let has_images = |folder: &Path| {
-        let below = rig::file_names(folder).iter().any(|n| lookup::is_image_folder(n) && folder.join(n).is_dir());
-        below || !rig::image_names(folder).is_empty() || multiview::applies(folder)
-    };
     let mut folder = models.to_path_buf();
     loop {
         if has_images(&folder) {
             return folder;
         }
         let name = folder.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let of_models = MODEL_FOLDERS.contains(&name.as_str()) || name.parse::<u32>().is_ok();
+        let of_models = MODEL_FOLDERS.iter().any(|n| name.eq_ignore_ascii_case(n)) || name.parse::<u32>().is_ok();
         if folder != models && !of_models {
             return folder;
         }
@@ -122,10 +126,22 @@ fn capture_folder(models: &Path) -> PathBuf {
     }
 }
 
+/// Whether a folder has images where captures have them.
+pub(super) fn has_images(folder: &Path) -> bool {
+    let below = rig::file_names(folder).iter().any(|n| lookup::is_image_folder(n) && folder.join(n).is_dir());
+    below || !rig::image_names(folder).is_empty() || multiview::applies(folder)
+}
+
 /// The image of every shot, or where it should be.
 fn files(lookup: &Lookup, base: &Path, names: &[&str]) -> Result<Vec<PathBuf>> {
     let bases = [base.to_path_buf()];
     let found: Vec<Option<PathBuf>> = names.iter().map(|name| lookup.image(&bases, name)).collect::<Result<_>>()?;
+    if found.iter().all(Option::is_none) && names.iter().all(|name| !name.contains(['/', '\\'])) {
+        let found = names.iter().map(|name| lookup.anywhere(name)).collect::<Result<Option<Vec<_>>>>()?;
+        if let Some(found) = found {
+            return Ok(found);
+        }
+    }
     if found.iter().all(Option::is_none) && lookup::is_reduced(base) {
         // LLFF's reduced copies are numbered anew, in the order of the originals.
         let images = rig::image_names(base);
@@ -146,7 +162,8 @@ pub(super) type Shot = (String, Camera);
 
 /// Name and camera of every registered picture.
 fn sources(folder: &Path, registered: &[Registered], poses: Poses) -> Result<Vec<Shot>> {
-    let optics = colmap_files::cameras(folder)?;
+    let used = registered.iter().map(|r| r.camera).collect();
+    let optics = colmap_files::cameras(folder, &used)?;
     let mut shots = Vec::with_capacity(registered.len());
     for picture in registered {
         let place = |e: Error| e.at(format!("{}: picture {:.200}", folder.display(), picture.name));
@@ -181,16 +198,15 @@ pub(super) fn is_model(folder: &Path) -> bool {
 
 /// Whether a marker of models is one: a folder that holds some, or a model's file with the other two.
 pub(super) fn is_marker(marker: &Path) -> bool {
-    let with_images = |folder: &Path| ["images.bin", "images.txt"].iter().any(|n| folder.join(n).is_file());
+    let with_images = |folder: &Path| ["images.bin", "images.txt"].iter().any(|n| rig::spelled(folder, n).is_file());
     match marker.is_file() {
         true => marker.parent().is_some_and(with_images),
-        // An empty `sparse` is said to be empty.
-        false => true,
+        false => is_model(marker),
     }
 }
 
 fn has_cameras(folder: &Path) -> bool {
-    ["cameras.bin", "cameras.txt"].iter().any(|n| folder.join(n).is_file())
+    ["cameras.bin", "cameras.txt"].iter().any(|n| rig::spelled(folder, n).is_file())
 }
 
 /// The model folder (`sparse` itself or a numbered one in it) with the most registered pictures.

@@ -3,11 +3,11 @@
 use crate::text;
 use splat4d::scene::{Intrinsics, Lens};
 use splat4d::{Error, ErrorKind, Result};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use super::json::read_bytes;
-use super::panorama;
+use super::{panorama, rig};
 
 /// A camera's intrinsics.
 #[derive(Clone, Debug)]
@@ -184,9 +184,10 @@ fn optics(id: u32, model: usize, size: [u64; 2], p: &[f64]) -> Result<Optics> {
     Ok(Optics { intrinsics, lens, width, height })
 }
 
-/// Reads `cameras.bin` or `cameras.txt`.
-pub(super) fn cameras(folder: &Path) -> Result<BTreeMap<u32, Optics>> {
-    load(folder, "cameras", cameras_bin, cameras_txt)
+/// Reads the cameras in `used` from `cameras.bin` or `cameras.txt`. Others may be of any model, and broken.
+pub(super) fn cameras(folder: &Path, used: &BTreeSet<u32>) -> Result<BTreeMap<u32, Optics>> {
+    let used = |id: u32| used.contains(&id);
+    load(folder, "cameras", |bytes| cameras_bin(bytes, used), |text| cameras_txt(text, used))
 }
 
 /// Reads `images.bin` or `images.txt`.
@@ -196,19 +197,19 @@ pub(super) fn images(folder: &Path) -> Result<Vec<Registered>> {
 
 /// Reads `points3D.bin` or `points3D.txt`; an empty list where neither exists.
 pub(super) fn points(folder: &Path) -> Result<Vec<Point>> {
-    let there = ["points3D.bin", "points3D.txt"].iter().any(|n| folder.join(n).is_file());
+    let there = ["points3D.bin", "points3D.txt"].iter().any(|n| rig::spelled(folder, n).is_file());
     if there { load(folder, "points3D", points_bin, points_txt) } else { Ok(Vec::new()) }
 }
 
-fn load<T>(folder: &Path, stem: &str, bin: fn(&[u8]) -> Result<T>, txt: fn(&str) -> Result<T>) -> Result<T> {
-    let (binary, text) = (folder.join(format!("{stem}.bin")), folder.join(format!("{stem}.txt")));
+fn load<T>(folder: &Path, stem: &str, bin: impl Fn(&[u8]) -> Result<T>, txt: impl Fn(&str) -> Result<T>) -> Result<T> {
+    let [binary, text] = ["bin", "txt"].map(|ending| rig::spelled(folder, &format!("{stem}.{ending}")));
     let path = if binary.is_file() { &binary } else { &text };
     let bytes = read_bytes(path)?;
     let read = if path == &binary { bin(&bytes) } else { text::decode(&bytes).and_then(|text| txt(&text)) };
     read.map_err(|e| e.at(path.display()).remedy("Export the reconstruction again (colmap model_converter)."))
 }
 
-fn cameras_bin(bytes: &[u8]) -> Result<BTreeMap<u32, Optics>> {
+fn cameras_bin(bytes: &[u8], used: impl Fn(u32) -> bool) -> Result<BTreeMap<u32, Optics>> {
     let mut cursor = Cursor(bytes);
     let mut cameras = BTreeMap::new();
     for _ in 0..cursor.count(LEAST[0])? {
@@ -217,7 +218,9 @@ fn cameras_bin(bytes: &[u8]) -> Result<BTreeMap<u32, Optics>> {
         let (_, count) =
             *MODELS.get(model).ok_or_else(|| unknown_model(&format!("{model}")).at(format!("camera {id}")))?;
         let parameters = (0..count).map(|_| Ok(cursor.f64s::<1>()?[0])).collect::<Result<Vec<f64>>>()?;
-        cameras.insert(id, optics(id, model, size, &parameters)?);
+        if used(id) {
+            cameras.insert(id, optics(id, model, size, &parameters)?);
+        }
     }
     Ok(cameras)
 }
@@ -270,11 +273,14 @@ fn numbers<'a, const N: usize>(words: &mut impl Iterator<Item = &'a str>, line: 
     Ok(out)
 }
 
-fn cameras_txt(text: &str) -> Result<BTreeMap<u32, Optics>> {
+fn cameras_txt(text: &str, used: impl Fn(u32) -> bool) -> Result<BTreeMap<u32, Optics>> {
     let mut cameras = BTreeMap::new();
     for (line, text) in lines(text).filter(|(_, l)| !l.is_empty()) {
         let mut words = text.split_ascii_whitespace();
         let id = word(&mut words, line, "camera id")?;
+        if !used(id) {
+            continue;
+        }
         let model: String = word(&mut words, line, "camera model")?;
         let known = MODELS.iter().position(|(name, _)| *name == model);
         let model = known.ok_or_else(|| unknown_model(&model).at(format!("line {line}")))?;
@@ -293,16 +299,29 @@ fn images_txt(text: &str) -> Result<Vec<Registered>> {
         if text.is_empty() {
             continue;
         }
-        let mut words = text.splitn(10, [' ', '\t']);
+        let (words, name) = image_words(text);
+        let mut words = words.into_iter();
         word::<u32>(&mut words, line, "image id")?;
         let (quat, translation) = (numbers(&mut words, line, "quaternion")?, numbers(&mut words, line, "translation")?);
         let camera = word(&mut words, line, "camera id")?;
-        let name: String = word(&mut words, line, "picture name")?;
-        images.push(Registered { quat, translation, camera, name: name.trim().to_string() });
+        let name = Some(name).filter(|n| !n.is_empty());
+        let name = name.ok_or_else(|| Error::input(format!("line {line} ends before the image's name")))?;
+        images.push(Registered { quat, translation, camera, name: name.to_string() });
         // The image's 2D points follow on a line of their own, which may be empty. Scripts that have poses only leave it out.
         lines.next_if(|(_, next)| !is_image_line(next));
     }
     Ok(images)
+}
+
+/// The first nine words of an image's line, and its name, which may hold spaces.
+fn image_words(text: &str) -> (Vec<&str>, &str) {
+    let (mut words, mut rest) = (Vec::with_capacity(9), text);
+    while words.len() < 9 && !rest.is_empty() {
+        let (word, after) = rest.split_at(rest.find(|c: char| c.is_ascii_whitespace()).unwrap_or(rest.len()));
+        words.push(word);
+        rest = after.trim_ascii_start();
+    }
+    (words, rest)
 }
 
 /// Whether a line of `images.txt` is an image's, not one of 2D points: its tenth word is a name, and no number; or its words
@@ -338,7 +357,7 @@ mod tests {
                     6 OPENCV_FISHEYE 8 6 5 6 4 3 .1 .2 .3 .4\n\
                     7 FULL_OPENCV 8 6 5 6 4 3 .1 .2 .3 .4 .5 .6 .7 .8\n8 SIMPLE_RADIAL_FISHEYE 8 6 5 4 3 .1\n\
                     9 RADIAL_FISHEYE 8 6 5 4 3 .1 .2\n";
-        let cameras = cameras_txt(text).unwrap();
+        let cameras = cameras_txt(text, |_| true).unwrap();
         let brown = |k, p| Lens::Brown { k, p, s: [0.0; 4] };
         let lenses = [
             Lens::Pinhole,
@@ -372,12 +391,12 @@ mod tests {
             Lens::Eucm { alpha: 0.6, beta: 1.1 },
             Lens::Pinhole,
         ];
-        assert_eq!(cameras_txt(text).unwrap().values().map(|c| c.lens).collect::<Vec<_>>(), lenses);
-        let panorama = cameras_txt("1 EQUIRECTANGULAR 80 40 80 40\n").unwrap().remove(&1).unwrap();
+        assert_eq!(cameras_txt(text, |_| true).unwrap().values().map(|c| c.lens).collect::<Vec<_>>(), lenses);
+        let panorama = cameras_txt("1 EQUIRECTANGULAR 80 40 80 40\n", |_| true).unwrap().remove(&1).unwrap();
         assert!(matches!(panorama.lens, Lens::Equirectangular { size: [80, 40], .. }));
         for error in [
-            cameras_txt("1 NEWER 8 6 5\n"),
-            cameras_bin(&[&1u64.to_le_bytes()[..], &[1, 0, 0, 0, 18], &[0; 43]].concat()),
+            cameras_txt("1 NEWER 8 6 5\n", |_| true),
+            cameras_bin(&[&1u64.to_le_bytes()[..], &[1, 0, 0, 0, 18], &[0; 43]].concat(), |_| true),
         ] {
             let error = error.unwrap_err().to_string();
             assert!(error.contains("is not known") && error.contains("image_undistorter"), "{error}");

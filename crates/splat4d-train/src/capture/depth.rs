@@ -65,6 +65,17 @@ pub(super) fn read(file: &DepthFile, frame: &Frame, downscale: usize) -> Result<
     Ok(reduce(&full, source.width, source.height, downscale))
 }
 
+/// A map's numbers at some pixels of the image file, in scene units; 0: not known. Errors: as [`read`].
+pub(super) fn at(file: &DepthFile, source: &Camera, pixels: &[[f64; 2]]) -> Result<Vec<f32>> {
+    let map = Map::read(file, source)?;
+    let (x, y) = (map.width as f64 / source.width as f64, map.height as f64 / source.height as f64);
+    let place = |[u, v]: &[f64; 2]| {
+        let (column, row) = ((u * x) as usize, (v * y) as usize);
+        map.values.get(row.min(map.height.saturating_sub(1)) * map.width + column).copied().unwrap_or(0.0)
+    };
+    Ok(pixels.iter().map(place).collect())
+}
+
 /// The mean of k×k boxes that lie on one surface; 0 where a box lies on several or any of its pixels is not known.
 pub(super) fn reduce(map: &[f32], width: usize, height: usize, k: usize) -> Vec<f32> {
     if k == 1 {

@@ -1,5 +1,6 @@
 //! JSON with named places: every error says which key of which file is wrong and, for a misspelt key, what was meant.
 
+use super::account::first_names;
 use super::convention::Poses;
 use crate::files;
 use crate::text;
@@ -80,6 +81,15 @@ impl<'a> Node<'a> {
     /// The value of `key`, which must be there.
     pub(crate) fn get(&self, key: &str) -> Result<Node<'a>> {
         self.opt(key)?.ok_or_else(|| self.error(format!("the key \"{key}\" is missing")).remedy("Add it."))
+    }
+
+    /// [`get`](Self::get), whose error lists the keys that are there.
+    pub(crate) fn needed(&self, key: &str) -> Result<Node<'a>> {
+        self.opt(key)?.ok_or_else(|| {
+            let keys: Vec<&str> = self.value.as_object().into_iter().flatten().map(|(k, _)| k.as_str()).collect();
+            let keys = first_names(&keys);
+            self.error(format!("the key \"{key}\" is missing")).remedy(format!("Add it; keys there are {keys:.200}."))
+        })
     }
 
     /// The elements of an array.

@@ -1,7 +1,7 @@
 //! Which layout a folder has: markers in a stated order, what lies beside the one that is taken, and what to do where there
 //! is none.
 
-use super::{CaptureOptions, Take, colmap, foreign, n3dv, nerfies, own, panoptic, rig, transforms};
+use super::{CaptureOptions, Take, colmap, foreign, n3dv, nerfies, own, panoptic, rig, stray, transforms};
 use splat4d::{Error, ErrorKind, Result};
 use std::path::Path;
 
@@ -21,10 +21,28 @@ const READERS: &[(&str, Reader)] = &[
     (colmap::MULTIVIEW, colmap::read),
     ("cameras.bin", colmap::read),
     ("cameras.txt", colmap::read),
+    (colmap::COLMAP, colmap::read),
+    (colmap::WORKSPACES[0], colmap::read),
+    (colmap::WORKSPACES[1], colmap::read),
+    (colmap::WORKSPACES[2], colmap::read),
+    (colmap::WORKSPACES[3], colmap::read),
 ];
 
 /// Markers of COLMAP models; poses of another layout use them for their points.
-const MODELS: &[&str] = &[colmap::SPARSE, colmap::NESTED, colmap::MULTIVIEW, "cameras.bin", "cameras.txt"];
+const MODELS: &[&str] = &[
+    colmap::SPARSE,
+    colmap::NESTED,
+    colmap::MULTIVIEW,
+    "cameras.bin",
+    "cameras.txt",
+    colmap::COLMAP,
+    colmap::WORKSPACES[0],
+    colmap::WORKSPACES[1],
+    colmap::WORKSPACES[2],
+    colmap::WORKSPACES[3],
+];
+/// A model's other files, which stand for it as its cameras do.
+const MODEL_FILES: [&str; 4] = ["images.bin", "images.txt", "points3D.bin", "points3D.txt"];
 
 /// N3DV's marker, which single-camera LLFF folders have too.
 const BOUNDS: &str = "poses_bounds.npy";
@@ -32,10 +50,6 @@ const BOUNDS: &str = "poses_bounds.npy";
 /// Markers of layouts that this version does not read, and what to do.
 const FOREIGN: &[(&str, &str)] =
     &[("reconstruction.json", "OpenSfM reconstructions"), ("sfm_data.json", "OpenMVG reconstructions")];
-
-/// Where the videos of a rig often lie.
-const VIDEO_FOLDER: &str = "videos";
-const VIDEO_ENDINGS: &[&str] = &["mp4", "mov", "mkv", "avi", "webm"];
 
 /// Reads the capture in a folder, or that of a marker file or of a COLMAP model's folder.
 pub(super) fn read(path: &Path, options: &CaptureOptions) -> Result<Take> {
@@ -46,8 +60,20 @@ pub(super) fn read(path: &Path, options: &CaptureOptions) -> Result<Take> {
     }
     if path.is_file() {
         let root = path.parent().unwrap_or(Path::new("."));
-        let known = READERS.iter().find(|(marker, _)| path.file_name().is_some_and(|name| name == *marker));
+        let is = |name: &str| path.file_name().is_some_and(|n| n.eq_ignore_ascii_case(name));
+        let known = READERS.iter().find(|(marker, _)| is(marker));
         let Some((_, reader)) = known else {
+            if MODEL_FILES.iter().any(|name| is(name)) {
+                return colmap::read(root, path, options);
+            }
+            if stray::is_archive(path) {
+                return Err(Error::input("is an archive, not a capture")
+                    .at(path.display())
+                    .remedy("Unpack it (it is a .zip if it ends in .r3d), and give the folder that it makes."));
+            }
+            if stray::is_transforms(path) {
+                return transforms::read(root, path, options);
+            }
             return foreign::read(path, options).unwrap_or_else(|| Err(unknown_layout(root, path)));
         };
         return reader(root, path, options);
@@ -60,21 +86,69 @@ pub(super) fn read(path: &Path, options: &CaptureOptions) -> Result<Take> {
     let Some(((marker, reader), others)) = there.split_first() else {
         return foreign::read(path, options).unwrap_or_else(|| Err(unknown_layout(path, path)));
     };
-    let mut take = reader(path, &path.join(marker), options)?;
+    let mut take = reader(path, &rig::spelled(path, marker), options)?;
     // Of several models the first is the capture's.
     let models = |m: &&str| MODELS.contains(m) && MODELS.contains(marker);
-    let others: Vec<&str> = others.iter().map(|(marker, _)| *marker).filter(|m| !models(m)).collect();
+    let (unread, others): (Vec<&str>, Vec<&str>) = others.iter().map(|(marker, _)| *marker).partition(models);
     remark(&mut take, path, marker, &others);
+    remark_models(&mut take, path, marker, &unread);
     Ok(take)
+}
+
+/// Says which of several COLMAP models was read.
+fn remark_models(take: &mut Take, path: &Path, marker: &str, unread: &[&str]) {
+    // One model as two files.
+    let unread: Vec<&&str> =
+        unread.iter().filter(|m| !(path.join(m).is_file() && path.join(marker).is_file())).collect();
+    if unread.is_empty() && !colmap::WORKSPACES.contains(&marker) {
+        return;
+    }
+    let mut note = format!("The COLMAP model in {marker} is read.");
+    if let Some(first) = unread.first() {
+        let names: Vec<&str> = unread.iter().map(|m| **m).collect();
+        let choose = path.join(first);
+        note += &format!(" Not read: {}. To read another, give its path: {}.", names.join(", "), choose.display());
+    }
+    take.notes.push(note);
 }
 
 fn is_there(path: &Path, marker: &str) -> bool {
     // A single camera's LLFF folder (LLFF, Mip-NeRF 360) is read from its COLMAP model.
-    let llff = || MODELS.iter().any(|model| path.join(model).exists()) && !n3dv::applies(path);
+    let llff = || MODELS.iter().any(|model| colmap::is_marker(&path.join(model))) && !n3dv::applies(path);
     // Others call their files so too.
     let foreign = marker == nerfies::MARKER && !nerfies::applies(path);
-    let model = !MODELS.contains(&marker) || colmap::is_marker(&path.join(marker));
-    path.join(marker).exists() && !(marker == BOUNDS && llff()) && !foreign && model
+    let file = rig::spelled(path, marker);
+    file.exists() && !(marker == BOUNDS && llff()) && !foreign && is_model(path, marker, &file)
+}
+
+/// Whether a marker is no model's, or that of a model which can be the capture's.
+fn is_model(path: &Path, marker: &str, file: &Path) -> bool {
+    if !MODELS.contains(&marker) {
+        return true;
+    }
+    if marker != colmap::SPARSE {
+        return colmap::is_marker(file);
+    }
+    // An empty `sparse` is said to be empty, and one without images to have none; but workspaces with images go first.
+    let own_images = |workspace: &&str| {
+        let model = path.join(workspace);
+        colmap::is_model(&model) && model.parent().is_some_and(|above| above != path && colmap::has_images(above))
+    };
+    colmap::is_model(file) && colmap::has_images(path) || !colmap::WORKSPACES.iter().any(|w| own_images(&w))
+}
+
+/// Whether a file's name is one that a capture's metadata can have.
+pub(super) fn is_metadata(path: &Path) -> bool {
+    const ENDINGS: [&str; 5] = ["json", "npy", "xml", "csv", "r3d"];
+    let ending = path.extension().is_some_and(|e| ENDINGS.iter().any(|v| e.eq_ignore_ascii_case(v)));
+    let name = path.file_name().unwrap_or_default();
+    let model = READERS.iter().map(|(marker, _)| *marker).chain(MODEL_FILES).any(|n| name.eq_ignore_ascii_case(n));
+    ending || model && path.is_file()
+}
+
+/// Whether a folder holds a capture of one of these layouts.
+pub(super) fn is_capture(folder: &Path) -> bool {
+    READERS.iter().any(|(marker, _)| is_there(folder, marker))
 }
 
 /// Says which of several layouts was read, why, and how to choose another.
@@ -111,34 +185,10 @@ fn unknown_layout(root: &Path, named: &Path) -> Error {
         }
     }
     let markers: Vec<&str> = READERS.iter().map(|(marker, _)| *marker).collect();
-    let mut error =
-        Error::input(format!("is not a capture: none of {} is there", markers.join(", "))).at(named.display());
-    let below = videos(&root.join(VIDEO_FOLDER)).into_iter().map(|name| format!("{VIDEO_FOLDER}/{name}"));
-    if let Some(video) = videos(root).into_iter().chain(below).next() {
-        error = error.remedy(format!(
-            "It holds videos, but no camera poses that are known here. Make a capture of them with `splat4d import`, which \
-             finds clocks and poses, or reads a calibration that you have (docs/filming.md); or extract frames with `{}` and \
-             write a capture.json (examples/rig_from_calibration.py, docs/capture-format.md).",
-            ffmpeg_command(&video)
-        ));
-    }
-    error.remedy(
-        "Write a capture.json with your cameras (docs/capture-format.md), or give the folder of a known layout.",
+    Error::input(format!("is not a capture: none of {} is there", markers.join(", "))).at(named.display()).remedy(
+        stray::advice(root).unwrap_or_else(|| {
+            "Write a capture.json with your cameras (docs/capture-format.md), or give the folder of a known layout."
+                .into()
+        }),
     )
-}
-
-/// Names of the video files in a folder, sorted.
-pub(super) fn videos(folder: &Path) -> Vec<String> {
-    let mut found: Vec<String> = rig::file_names(folder)
-        .into_iter()
-        .filter(|n| Path::new(n).extension().is_some_and(|e| VIDEO_ENDINGS.iter().any(|v| e.eq_ignore_ascii_case(v))))
-        .collect();
-    found.sort();
-    found
-}
-
-/// The command that turns one video into a folder of frames named as the readers expect.
-pub(super) fn ffmpeg_command(video: &str) -> String {
-    let stem = Path::new(video).file_stem().and_then(|s| s.to_str()).unwrap_or("cam00");
-    format!("mkdir -p images/{stem} && ffmpeg -i {video} -start_number 0 -qscale:v 2 images/{stem}/%06d.jpg")
 }

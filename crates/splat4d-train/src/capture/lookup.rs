@@ -22,7 +22,8 @@ const NO_IMAGES: [&str; 5] = ["depth", "normal", "seg", "flow", "."];
 const SAMPLE: usize = 32;
 /// Endings of images, readable ones first; a name with one of the others may be an image converted since.
 const KNOWN_ENDINGS: &[&str] = &[
-    "png", "jpg", "jpeg", "webp", "tif", "tiff", "bmp", "heic", "heif", "dng", "arw", "cr2", "nef", "ppm", "exr", "tga",
+    "png", "jpg", "jpeg", "webp", "tif", "tiff", "bmp", "heic", "heif", "avif", "jxl", "jp2", "gif", "dng", "arw",
+    "cr2", "cr3", "nef", "ppm", "pgm", "exr", "tga",
 ];
 
 /// How a name differs from the file found for it.
@@ -33,6 +34,7 @@ enum Way {
     Ending,
     Case,
     Unicode,
+    Codes,
 }
 
 impl Way {
@@ -43,6 +45,7 @@ impl Way {
             Self::Ending => "the ending",
             Self::Case => "letter case",
             Self::Unicode => "Unicode form",
+            Self::Codes => "percent codes, spaces or file://",
         }
     }
 }
@@ -77,6 +80,20 @@ pub(super) fn without_ending(name: &str) -> &str {
         Some((stem, ending)) if KNOWN_ENDINGS.iter().any(|e| ending.eq_ignore_ascii_case(e)) => stem,
         _ => name,
     }
+}
+
+/// A name without `file://` and spaces at its ends, and with its percent codes (`%20`) decoded.
+fn decoded(name: &str) -> String {
+    let trimmed = name.trim();
+    let plain = trimmed.strip_prefix("file://").unwrap_or(trimmed);
+    let (mut bytes, mut rest) = (Vec::with_capacity(plain.len()), plain.as_bytes());
+    while let Some((&first, after)) = rest.split_first() {
+        let code = after.get(..2).and_then(|c| u8::from_str_radix(std::str::from_utf8(c).ok()?, 16).ok());
+        let code = code.filter(|_| first == b'%');
+        bytes.push(code.unwrap_or(first));
+        rest = if code.is_some() { &after[2..] } else { after };
+    }
+    String::from_utf8(bytes).unwrap_or_else(|_| plain.to_owned())
 }
 
 /// A path's parts, whichever slashes it has; and whether it is absolute.
@@ -152,6 +169,17 @@ impl Lookup {
                 best = Some((count, folder));
             }
         }
+        if best.is_none() && self.chosen.is_none() {
+            // A folder of its own inside these (`images/images`), if it has all of them.
+            let mut outer = self.folders();
+            outer.extend(self.other_folders());
+            let inner = outer.iter().filter(|f| **f != self.root).flat_map(|f| folders_in(f));
+            let has_all =
+                |folder: &PathBuf| sample.iter().all(|name| matches!(self.walk(folder, &parts(name).0), Ok(Some(_))));
+            if let Some(folder) = inner.into_iter().find(has_all) {
+                return folder;
+            }
+        }
         let usual = || self.chosen.clone().unwrap_or_else(|| self.root.join(IMAGE_FOLDERS[0]));
         best.map_or_else(usual, |(_, folder)| folder)
     }
@@ -161,10 +189,8 @@ impl Lookup {
         if self.chosen.is_some() {
             return Vec::new();
         }
-        let names = rig::file_names(&self.root).into_iter();
-        let for_images = |n: &String| !NO_IMAGES.iter().any(|o| fold(n).starts_with(o)) && !masks::may_be(n);
-        let other = names.filter(|n| !is_image_folder(n) && for_images(n));
-        other.map(|name| self.root.join(name)).filter(|folder| folder.is_dir()).collect()
+        let is_usual = |folder: &PathBuf| is_image_folder(&folder.file_name().unwrap_or_default().to_string_lossy());
+        folders_in(&self.root).into_iter().filter(|folder| !is_usual(folder)).collect()
     }
 
     /// The capture's folder.
@@ -185,9 +211,39 @@ impl Lookup {
         if exact.is_some() {
             return Ok(exact);
         }
-        let (parts, absolute) = parts(name);
+        if let Some(found) = self.spelled_otherwise(bases, name, name)? {
+            return Ok(Some(found));
+        }
+        let plain = decoded(name);
+        if plain == name {
+            return Ok(None);
+        }
+        let exact = bases.iter().map(|base| base.join(&plain)).find(|p| p.is_file());
+        let found = match exact {
+            Some(found) => Some(found),
+            None => self.spelled_otherwise(bases, &plain, name)?,
+        };
+        if let Some(found) = &found {
+            self.loose.borrow_mut().entry(found.clone()).or_insert_with(|| name.to_owned());
+            *self.ways.borrow_mut().entry(Way::Codes).or_default() += 1;
+        }
+        Ok(found)
+    }
+
+    /// The image that `plain` leads to in another spelling, or after leading folders that are not there; `name` as it is
+    /// written. Errors: as [`Self::image`].
+    fn spelled_otherwise(&self, bases: &[PathBuf], plain: &str, name: &str) -> Result<Option<PathBuf>> {
+        let (parts, absolute) = parts(plain);
+        let there = |first: &str| {
+            let folder = fold(first);
+            bases.iter().any(|base| self.listing(base).names.contains_key(&folder))
+        };
+        // A relative path may have folders of another machine too, but none that is here with other files.
+        let elsewhere = parts.first().is_some_and(|first| !there(first));
         for skip in 0..parts.len() {
-            if !absolute && !parts[..skip].iter().all(|p| rig::is_plain(p)) {
+            // A folder right before the file may name a camera, whose image this is not.
+            let with_folder = elsewhere && parts.len() - skip > 1;
+            if !absolute && !with_folder && !parts[..skip].iter().all(|p| rig::is_plain(p)) {
                 break;
             }
             for base in bases {
@@ -203,6 +259,29 @@ impl Lookup {
             }
         }
         Ok(None)
+    }
+
+    /// The only image below the capture's folder with this name, whatever folder it is in. `None`: there is none, or there
+    /// are several.
+    pub(super) fn anywhere(&self, name: &str) -> Result<Option<PathBuf>> {
+        let mut folders = self.folders();
+        folders.extend(self.other_folders());
+        folders.dedup();
+        let inner: Vec<PathBuf> = folders.iter().filter(|f| **f != self.root).flat_map(|f| folders_in(f)).collect();
+        folders.retain(|folder| !is_reduced(folder));
+        let mut found: Option<PathBuf> = None;
+        for folder in folders.iter().chain(&inner) {
+            match (self.walk(folder, &parts(name).0)?, &found) {
+                (Some(_), Some(_)) => return Ok(None),
+                (Some(image), None) => found = Some(image),
+                (None, _) => {}
+            }
+        }
+        if let Some(found) = &found {
+            self.loose.borrow_mut().entry(found.clone()).or_insert_with(|| name.to_owned());
+            *self.ways.borrow_mut().entry(Way::Folders).or_default() += 1;
+        }
+        Ok(found)
     }
 
     /// [`Self::image`], or where it should be.
@@ -312,6 +391,22 @@ fn one<'a>(fitting: Option<&'a Vec<String>>, name: &str, folder: &Path) -> Resul
             .at(folder.display())
             .remedy("Rename the one that is meant, or remove the others.")),
     }
+}
+
+/// Folders in a folder that may hold images.
+fn folders_in(folder: &Path) -> Vec<PathBuf> {
+    let for_images = |n: &String| !NO_IMAGES.iter().any(|o| fold(n).starts_with(o)) && !masks::may_be(n);
+    let names = rig::file_names(folder).into_iter().filter(for_images);
+    names.map(|name| folder.join(name)).filter(|folder| folder.is_dir()).collect()
+}
+
+/// A file that is there in the place of a missing image, with the ending of a format that is not read.
+pub(super) fn unreadable(image: &Path) -> Option<PathBuf> {
+    let stem = fold(without_ending(&image.file_name()?.to_string_lossy()));
+    let folder = image.parent()?;
+    let named = rig::file_names(folder).into_iter().filter(|n| !rig::is_image(n) && !n.starts_with('.'));
+    let mut images = named.filter(|n| without_ending(n) != n && fold(without_ending(n)) == stem);
+    images.next().map(|name| folder.join(name))
 }
 
 /// Whether a name is that of a folder in which images usually lie.

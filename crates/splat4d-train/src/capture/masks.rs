@@ -62,7 +62,7 @@ pub(super) fn fill(take: &mut Take) -> Result<()> {
     let mut used: BTreeSet<&String> = BTreeSet::new();
     let mut filled = 0;
     for frame in take.frames.iter_mut().filter(|f| f.mask.is_none()) {
-        let relative = frame.image.strip_prefix(&take.root).unwrap_or(&frame.image).to_string_lossy().into_owned();
+        let relative = below(&take.root, &frame.image);
         let alone = || by_file.get(&short(&frame.image)).filter(|_| names.get(&short(&frame.image)) == Some(&1));
         let Some(fitting) = by_name.get(&key(&relative)).or_else(alone) else { continue };
         let name = relative.rsplit(['/', '\\']).next().unwrap_or_default();
@@ -88,13 +88,37 @@ pub(super) fn may_be(folder: &str) -> bool {
     MAYBE.iter().any(|word| fold(folder).contains(word))
 }
 
+/// An image's path below the capture's folder.
+fn below(root: &Path, image: &Path) -> String {
+    image.strip_prefix(root).unwrap_or(image).to_string_lossy().into_owned()
+}
+
 /// Names folders that may hold masks and are not read, where no frame has one.
 fn tell_of_others(take: &mut Take, folders: &[String]) {
     let others: Vec<&String> = folders.iter().filter(|n| may_be(n)).collect();
-    if !others.is_empty() && take.frames.iter().all(|f| f.mask.is_none()) {
-        let what = format!("Folders that may hold masks: {}. To use one, call it masks.", first_names(&others));
-        take.account.add(Aspect::NotRead, Severity::Note, what);
+    if others.is_empty() || take.frames.iter().any(|f| f.mask.is_some()) {
+        return;
     }
+    let images: BTreeSet<String> = take.frames.iter().map(|f| image_key(&below(&take.root, &f.image))).collect();
+    let fits = |folder: &&&String| {
+        let mut files = Vec::new();
+        list(&take.root.join(folder), String::new(), 0, &mut files);
+        files.iter().filter(|file| images.contains(&image_key(file))).count() >= take.frames.len().div_ceil(2)
+    };
+    let (severity, what) = match others.iter().find(fits) {
+        Some(folder) => (
+            Severity::Warning,
+            format!(
+                "The files in {folder}/ are named like the images and are probably masks, which are not read. To use them (white \
+                 counts), call the folder masks."
+            ),
+        ),
+        None => (
+            Severity::Note,
+            format!("Folders that may hold masks: {}. To use one, call it masks.", first_names(&others)),
+        ),
+    };
+    take.account.add(Aspect::NotRead, severity, what);
 }
 
 /// Says how many masks and images have no counterpart.

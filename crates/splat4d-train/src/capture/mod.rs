@@ -35,6 +35,7 @@ mod own;
 mod panoptic;
 mod panorama;
 mod picture;
+mod plausible;
 mod points;
 mod pose;
 mod posed;
@@ -44,6 +45,7 @@ mod rig;
 mod sequence;
 mod splits;
 mod store;
+mod stray;
 mod tracks;
 mod transforms;
 
@@ -409,6 +411,11 @@ impl Capture {
 
 #[cfg(test)]
 mod tests;
+
+/// Whether a file's name is one that a capture's metadata can have: [`Capture::open`] takes such files too.
+pub fn is_metadata(path: &Path) -> bool {
+    layout::is_metadata(path)
+}
 
 /// A coloured point cloud from a .ply file. Errors: not a point cloud, damage, absurd counts.
 pub(crate) fn read_points(path: &Path) -> Result<PointCloud> {

@@ -2,9 +2,9 @@
 
 use super::account::{Account, Aspect, first_names};
 use super::convention::{Convention, Poses};
-use super::layout::{ffmpeg_command, videos};
 use super::points::read_ply;
 use super::preflight::Severity;
+use super::stray::{ffmpeg_command, videos};
 use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take};
 use super::{json, llff, masks, picture, pose, rig, sequence};
 use splat4d::format::npy::Npy;
@@ -182,7 +182,9 @@ pub(super) fn camera_of(row: &[f64], (width, height): (usize, usize), poses: Pos
     let world_from_cam = Se3 { rotation, translation: std::array::from_fn(|r| at(r, 3)) };
     let cam_from_world = Convention::NERF.read_as(pose::checked(world_from_cam)?, poses)?;
     let aspect = (width as f64 / height as f64) / (stated_width / stated_height);
-    if aspect.is_nan() || (aspect - 1.0).abs() > MAX_ASPECT_CHANGE {
+    // Sides of reduced copies are rounded.
+    let rounding = 1.0 / width.min(height).max(1) as f64;
+    if aspect.is_nan() || (aspect - 1.0).abs() > MAX_ASPECT_CHANGE.max(rounding) {
         let what = format!("the pose is for pictures of {stated_width}x{stated_height}, not {width}x{height}");
         return Err(Error::input(what).remedy("Extract the frames without cropping."));
     }

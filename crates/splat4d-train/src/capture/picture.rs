@@ -6,7 +6,7 @@ use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageReader};
 use splat4d::scene::Camera;
 use splat4d::{Error, Result};
-use std::io::{BufRead, BufReader, Cursor, Seek};
+use std::io::{BufRead, BufReader, Cursor, Read, Seek, SeekFrom};
 use std::path::Path;
 use zune_core::colorspace::ColorSpace;
 use zune_core::options::DecoderOptions;
@@ -76,12 +76,59 @@ fn is_jpeg(bytes: &[u8]) -> bool {
     bytes.starts_with(&[0xFF, 0xD8])
 }
 
+/// Bytes at the start of a file that tell its format.
+const HEAD: usize = 64;
+
+/// What a file is instead of an image that can be read, by its first bytes, and what to do. `None`: that is not known.
+fn foreign(head: &[u8]) -> Option<(&'static str, &'static str)> {
+    const CONVERT: &str = "Convert the images to JPEG or PNG under the same names (for instance with ffmpeg or ImageMagick): \
+                           another ending is found.";
+    let format = match head {
+        [] => return Some(("the file is empty (0 bytes)", "Copy or extract it again, or delete it.")),
+        _ if head.starts_with(b"version https://git-lfs") => {
+            return Some(("the file is a pointer of Git LFS, not the image", "Fetch the images with `git lfs pull`."));
+        }
+        _ if head.trim_ascii_start().starts_with(b"<") => {
+            return Some(("the file is a web page or XML, not an image", "Download the image again."));
+        }
+        _ if head.get(4..8) == Some(b"ftyp") => match head.get(8..12).unwrap_or_default() {
+            b"avif" | b"avis" => "AVIF",
+            b"heic" | b"heix" | b"heim" | b"heis" | b"hevc" | b"mif1" | b"msf1" => "HEIC",
+            b"crx " => "a raw photo (CR3)",
+            _ => "a video",
+        },
+        _ if head.starts_with(b"II*\0") || head.starts_with(b"MM\0*") => "TIFF or a raw photo",
+        _ if head.starts_with(b"BM") => "BMP",
+        _ if head.starts_with(b"GIF8") => "GIF",
+        _ if head.get(4..8) == Some(b"jP  ") => "JPEG 2000",
+        _ if head.starts_with(&[0xFF, 0x0A]) || head.get(4..8) == Some(b"JXL ") => "JPEG XL",
+        _ if head.starts_with(&[0x76, 0x2F, 0x31, 0x01]) => "OpenEXR",
+        _ if head.starts_with(b"8BPS") => "PSD",
+        [b'P', b'1'..=b'7', b' ' | b'\n' | b'\r' | b'\t', ..] => "PNM (PPM, PGM)",
+        _ => return None,
+    };
+    Some((format, CONVERT))
+}
+
+/// The first bytes of a file.
+fn head(path: &Path) -> Vec<u8> {
+    let mut head = Vec::with_capacity(HEAD);
+    // A file that cannot be read has an error of its own.
+    let _ = files::open(path).map(|file| file.take(HEAD as u64).read_to_end(&mut head));
+    head
+}
+
 fn broken(path: &Path, detail: impl std::fmt::Display) -> Error {
+    if let Some((what, remedy)) = foreign(&head(path)) {
+        let what =
+            if what.starts_with("the file") { what.into() } else { format!("the image is {what}, which is not read") };
+        return Error::input(what).at(path.display()).remedy(remedy);
+    }
     // Some decoders' messages hold line breaks.
     let detail = detail.to_string().split_whitespace().collect::<Vec<_>>().join(" ");
     Error::input(format!("the picture is damaged, truncated or of another format than JPEG, PNG and WebP ({detail})"))
         .at(path.display())
-        .remedy("Copy or extract it again, or take the frame out of the capture.")
+        .remedy("Copy or extract it again, or delete it: an image that is missing is skipped.")
 }
 
 /// Reads size and channels; of the file no more than it takes.
@@ -105,6 +152,31 @@ pub(super) fn header(path: &Path) -> Result<Header> {
     };
     let orientation = orientation.unwrap_or(Orientation::NoTransforms);
     Ok(Header { stored: (width, height), alpha, orientation })
+}
+
+/// Bytes at the end of a file in which its end mark is, unless something else follows.
+const TAIL: u64 = 4096;
+
+/// An error if a picture's file is cut short, by its end mark; decodes a picture that has none near its end.
+pub(super) fn check_end(path: &Path) -> Result<()> {
+    let fail = |e| Error::io("cannot be read", e).at(path.display()).remedy("Check that you may read the file.");
+    let mut file = files::open(path)?;
+    let length = file.metadata().map_err(fail)?.len();
+    let mut head = Vec::with_capacity(HEAD);
+    (&mut file).take(HEAD as u64).read_to_end(&mut head).map_err(fail)?;
+    file.seek(SeekFrom::Start(length.saturating_sub(TAIL))).map_err(fail)?;
+    let mut tail = Vec::new();
+    file.take(TAIL).read_to_end(&mut tail).map_err(fail)?;
+    let whole = match &head[..] {
+        _ if is_jpeg(&head) => tail.windows(2).any(|w| w == [0xFF, 0xD9]),
+        _ if head.get(1..4) == Some(b"PNG") => tail.windows(4).any(|w| w == b"IEND"),
+        [b'R', b'I', b'F', b'F', a, b, c, d, ..] => u64::from(u32::from_le_bytes([*a, *b, *c, *d])) + 8 <= length,
+        _ => true,
+    };
+    if whole {
+        return Ok(());
+    }
+    decode(path, None).map(drop)
 }
 
 fn swaps_sides(orientation: Orientation) -> bool {

@@ -89,7 +89,7 @@ impl Capture {
         Some(Reach { center, degrees, distances, held })
     }
 
-    /// Looks for what commonly spoils results. Cheap: opens no picture.
+    /// Looks for what commonly spoils results. Cheap: opens a few depth maps, and no image.
     pub fn preflight(&self) -> Vec<Finding> {
         let mut findings = Vec::new();
         let aspect = |text: &String| self.account.iter().find(|r| r.what == *text).map(|r| r.aspect);
@@ -110,6 +110,7 @@ impl Capture {
         self.check_views(&views, &mut findings);
         self.check_clock(&mut findings);
         self.check_completeness(&mut findings);
+        findings.extend(self.check_points());
         if self.points.is_none() {
             findings.push(finding(
                 Severity::Note,

@@ -1,17 +1,39 @@
 //! Names and files: which pictures lie in a folder, and what a picture's name says about camera and frame number.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Endings of pictures that can be decoded.
 pub(super) const IMAGE_ENDINGS: &[&str] = &["png", "jpg", "jpeg", "webp"];
 
+/// What macOS puts next to every file on foreign disks, under its name after this.
+const APPLE_DOUBLE: &str = "._";
+
 /// Sorted names of the files and folders directly in `folder`; empty where it cannot be read.
 pub(super) fn file_names(folder: &Path) -> Vec<String> {
     let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
-    let mut names: Vec<String> = entries.flatten().filter_map(|e| e.file_name().into_string().ok()).collect();
+    let names = entries.flatten().filter_map(|e| e.file_name().into_string().ok());
+    let mut names: Vec<String> = names.filter(|n| !n.starts_with(APPLE_DOUBLE)).collect();
     names.sort();
     names
+}
+
+/// A file or folder below `folder`, whichever letter case its names have; where it should be if it is missing. Of several
+/// spellings the exact one goes first, and none is taken if two others fit.
+pub(super) fn spelled(folder: &Path, name: &str) -> PathBuf {
+    let exact = folder.join(name);
+    if exact.exists() {
+        return exact;
+    }
+    let mut at = folder.to_path_buf();
+    for part in name.split('/') {
+        let mut fitting = file_names(&at).into_iter().filter(|n| n.eq_ignore_ascii_case(part));
+        match (fitting.next(), fitting.next()) {
+            (Some(only), None) => at.push(only),
+            _ => return exact,
+        }
+    }
+    at
 }
 
 /// Whether a name ends like a picture.
@@ -40,6 +62,8 @@ pub(super) struct Naming {
     pub frames: Vec<(usize, usize)>,
     /// Whether the names tell cameras apart (`cam/frame`, `cam_frameN`), or all belong to one.
     pub told: bool,
+    /// The place of each picture among those of its camera, where no camera's numbers reach into those of another.
+    pub ranks: Option<Vec<usize>>,
 }
 
 /// Widest range of numbers that are frame numbers, not time stamps: nine hours at 30 frames per second.
@@ -82,15 +106,24 @@ pub(super) fn naming(names: &[&str]) -> Naming {
             let found: BTreeSet<usize> = members.iter().filter_map(|&i| numbers[i]).collect();
             found.len() == members.len()
         });
+    let range = |members: &Vec<usize>| {
+        let numbers = || members.iter().filter_map(|&i| numbers[i]);
+        Some((numbers().min()?, numbers().max()?))
+    };
+    let mut ranges: Vec<(usize, usize)> = groups.values().filter_map(range).collect();
+    ranges.sort_unstable();
+    let apart = distinct && groups.len() > 1 && ranges.windows(2).all(|w| w[0].1 < w[1].0);
+    let mut ranks = vec![0; names.len()];
     let mut frames = vec![(0, 0); names.len()];
     for (c, members) in groups.values().enumerate() {
         let mut ordered = members.clone();
         ordered.sort_by_key(|&i| names[i]);
         for (rank, i) in ordered.into_iter().enumerate() {
+            ranks[i] = rank;
             frames[i] = (c, numbers[i].filter(|_| distinct).map_or(rank, |n| n - first));
         }
     }
-    Naming { cameras: groups.into_keys().collect(), frames, told }
+    Naming { cameras: groups.into_keys().collect(), frames, told, ranks: apart.then_some(ranks) }
 }
 
 #[cfg(test)]

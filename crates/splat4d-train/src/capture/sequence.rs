@@ -82,6 +82,16 @@ pub(super) fn order(
     if moment && !one_each {
         return self::moment(names);
     }
+    let mut naming = naming;
+    if let Some(ranks) = naming.ranks.take().filter(|_| rig && !one_each && groups.iter().all(|g| still(g, poses))) {
+        // Fixed cameras that recorded together and count apart.
+        naming.frames.iter_mut().zip(ranks).for_each(|(frame, rank)| frame.1 = rank);
+        warnings.push(format!(
+            "Each camera's images have numbers of their own ({} and so on): they are matched by their order. Check that every \
+             camera starts at the same time.",
+            names[0]
+        ));
+    }
     let place = |&(camera, number): &(usize, usize)| {
         let number = if moment { 0 } else { number };
         (camera, number, number as f64 / fps)

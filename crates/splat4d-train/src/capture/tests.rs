@@ -5,6 +5,7 @@ mod depth;
 mod far;
 mod flow;
 mod forgiving;
+mod found;
 mod labels;
 mod layouts;
 mod mutants;

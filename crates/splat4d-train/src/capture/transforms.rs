@@ -180,6 +180,12 @@ impl Document {
             let what = format!("{} keys of the transforms file: {}.", unread.len(), first_names(&unread));
             account.add(Aspect::NotRead, Severity::Note, what);
         }
+        let mistaken = frame::mistaken(top);
+        if !mistaken.is_empty() {
+            let what =
+                format!("Keys of the transforms file that are not read: {}. Rename them.", first_names(&mistaken));
+            account.add(Aspect::NotRead, Severity::Warning, what);
+        }
         let (mut points, mut warning) = (None, None);
         if let Some(name) = top.opt("ply_file_path")? {
             let path = lookup.file(name.text()?)?;

@@ -12,11 +12,13 @@ mod silhouettes;
 #[cfg(test)]
 mod tests;
 
+use super::account::first_names;
 use super::preflight::{Finding, Severity};
 use super::{Aspect, Capture, Frame, Poses};
 use look::Look;
 pub use motion::Agreement;
 use splat4d::math::Se3;
+use std::collections::BTreeSet;
 
 /// Images that are looked at, at most; and at least, where they are large.
 const LOOKS: [usize; 2] = [4, 10];
@@ -46,6 +48,39 @@ impl Capture {
     /// Compares poses with points and images. Opens a few images; images that cannot be read are passed over.
     pub fn check_poses(&self) -> PoseCheck {
         self.judge(&mut look::take(self, &self.looked_at(), look::COARSE), &mut None)
+    }
+
+    /// Cameras that see none of the initial points where others see many, and metric depth maps in another unit than the
+    /// points. Opens a few depth maps.
+    pub(super) fn check_points(&self) -> Vec<Finding> {
+        let mut findings = Vec::new();
+        let warn = |what: String, remedy: &str| Finding {
+            severity: Severity::Warning,
+            aspect: Some(Aspect::Assumed),
+            what,
+            remedy: remedy.into(),
+        };
+        let blind = points::blind(self);
+        if !blind.is_empty() {
+            let names: Vec<String> = blind.iter().map(|&i| self.frames[i].image.display().to_string()).collect();
+            let what = format!(
+                "{} images see none of the initial points, which others see: {}. Their poses are probably wrong.",
+                names.len(),
+                first_names(&names)
+            );
+            findings.push(warn(what, "Correct their poses, or take these images out."));
+        }
+        if let Some((ratio, file)) = points::depth_unit(self) {
+            let what = format!(
+                "Depth maps and initial points do not fit: points are {ratio:.3} times as far away as depth maps say (such as {}). A \
+                 stored number is probably {:.3e} scene units, and is read as {:.3e}.",
+                file.path.display(),
+                ratio * file.scale,
+                file.scale
+            );
+            findings.push(warn(what, "State the unit (depth_unit_scale_factor; in capture.json depth_scale)."));
+        }
+        findings
     }
 
     /// The verdict by these images; features are found and matched if points do not say enough.
@@ -91,6 +126,17 @@ impl Capture {
         if fullest.len() >= LOOKS[0].min(self.train.len()) {
             return fullest.into_iter().take(most).collect();
         }
+        if self.fixed_cameras() {
+            // One image of each: more of a camera show the same again, and its mistakes would count several times.
+            let instant = fullest.first().map_or(0, |&i| self.frames[i].index);
+            let mut nearest: Vec<usize> = (0..self.frames.len()).collect();
+            nearest.sort_by_key(|&i| (self.frames[i].index.abs_diff(instant), i));
+            let mut cameras = BTreeSet::new();
+            nearest.retain(|&i| cameras.insert(self.frames[i].camera));
+            nearest.truncate(most);
+            nearest.sort_unstable();
+            return nearest;
+        }
         // Two runs of frames, a little apart from one another within each.
         let mut frames = self.train.clone();
         frames.sort_by(|&a, &b| self.frames[a].time.0.total_cmp(&self.frames[b].time.0));
@@ -118,8 +164,7 @@ impl Capture {
             .rev()
             .max_by(|&a, &b| measures[a].score().total_cmp(&measures[b].score()));
         let Some(best) = found.filter(|&k| measures[k].score() > stated.score()) else {
-            let unseen = stated.points.asked > 0 && stated.points.seen == 0.0;
-            let finding = if unseen { stated.points.elsewhere() } else { stated.agrees() };
+            let finding = stated.points.doubt(&stated.pairs).unwrap_or_else(|| stated.agrees());
             return PoseCheck { written_as: None, finding };
         };
         let (m, poses) = (&measures[best], conventions[best]);

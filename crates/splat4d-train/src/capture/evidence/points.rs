@@ -2,16 +2,25 @@
 
 use super::super::lens::Distortion;
 use super::super::preflight::{Finding, Severity};
-use super::super::{Aspect, Capture};
+use super::super::{Aspect, Capture, DepthFile, DepthKind, Frame, PointCloud, depth};
 use super::look::{Look, pixel_of};
 use super::pairs;
+use rayon::prelude::*;
 use splat4d::math::Se3;
+use std::collections::BTreeSet;
 
 /// Cameras and points that are asked, at most, evenly chosen.
 const CAMERAS: usize = 24;
 const POINTS: usize = 400;
 /// Share of points in images, and gain of colours, from which poses are right.
-const CONVINCES: (f64, f64) = (0.03, 0.12);
+const CONVINCES: (f64, f64) = (0.03, MISFIT);
+/// Gain of colours below which points do not fit their images, if that many were compared: chance gives 0, exchanged images of
+/// one scene 0.14, and real captures 0.38 and more (studies/records, 26 November 2026).
+const MISFIT: f64 = 0.2;
+const MANY: usize = 200;
+/// Share of points in images below which, of that many points, they are of another place.
+const APART: f64 = 0.05;
+const FEW: usize = 100;
 /// Share of points that another convention shows at least, and how many times that of the poses as read.
 const SHOWN: (f64, f64) = (0.25, 4.0);
 /// The same without colours that say anything.
@@ -31,11 +40,48 @@ pub(super) struct Measure {
     pub(super) seen: f64,
     /// How much nearer colours are to the image there than to that at other points: 0 by chance, 1 at best.
     pub(super) gain: Option<f64>,
+    /// Colours that were compared.
+    pub(super) compared: usize,
 }
 
 impl Measure {
+    /// The finding where points fit neither poses nor images. `None`: nothing speaks against them.
+    pub(super) fn doubt(&self, pairs: &pairs::Measure) -> Option<Finding> {
+        if self.asked > 0 && self.seen == 0.0 {
+            return Some(self.elsewhere());
+        }
+        let colours = self.gain.filter(|gain| *gain < MISFIT && self.compared >= MANY);
+        let apart = self.asked >= FEW && self.seen < APART && !self.convinces() && !pairs.convinces();
+        if colours.is_none() && !apart {
+            return None;
+        }
+        let fit = colours.map_or_else(String::new, |gain| {
+            format!(
+                ", and colours of points fit these by {:.0} %, where those of good captures do by 35 % and more",
+                100.0 * gain
+            )
+        });
+        let matches = match pairs.matches {
+            0 => String::new(),
+            n => format!(" {} of {n} matches between images fit the poses.", pairs.fitting),
+        };
+        Some(Finding {
+            severity: Severity::Warning,
+            aspect: Some(Aspect::Assumed),
+            what: format!(
+                "Initial points and images do not fit: {:.0} % of {} points are in front of the cameras and in their \
+                 images{fit}.{matches}",
+                100.0 * self.seen,
+                self.asked
+            ),
+            remedy: "Check that images are not exchanged, that intrinsics are for these images, and that points and poses are of \
+                     one export; or find points in the images: --set init=pictures."
+                .into(),
+        })
+    }
+
     /// The finding where no camera sees a point.
-    pub(super) fn elsewhere(&self) -> Finding {
+    fn elsewhere(&self) -> Finding {
         Finding {
             severity: Severity::Warning,
             aspect: Some(Aspect::Assumed),
@@ -69,8 +115,7 @@ pub(super) fn measure(
     (looks, look_poses): (&[Look], &[Se3]),
 ) -> Measure {
     let Some(cloud) = &capture.points else { return Measure::default() };
-    let step = cloud.points.len().div_ceil(POINTS).max(1);
-    let chosen: Vec<usize> = (0..cloud.points.len()).step_by(step).collect();
+    let chosen: Vec<usize> = (0..cloud.points.len()).step_by(step(cloud)).collect();
     let mut seen = 0;
     for (&i, pose) in frames.iter().zip(poses) {
         let camera = &capture.frames[i].source;
@@ -78,19 +123,91 @@ pub(super) fn measure(
         seen += chosen.iter().filter(|&&p| pixel_of(camera, &lens, pose, cloud.points[p]).is_some()).count();
     }
     let share = seen as f64 / (chosen.len() * frames.len()).max(1) as f64;
-    Measure { asked: chosen.len(), seen: share, gain: gain(capture, &chosen, looks, look_poses) }
+    let (gain, compared) = gain(capture, &chosen, looks, look_poses).unzip();
+    Measure { asked: chosen.len(), seen: share, gain, compared: compared.unwrap_or(0) }
+}
+
+/// Every how many points one is asked.
+fn step(cloud: &PointCloud) -> usize {
+    cloud.points.len().div_ceil(POINTS).max(1)
+}
+
+/// The points that a frame's camera has in its image: their pixels of the file, and how far in front of it they are.
+fn in_image<'a>(frame: &Frame, points: impl Iterator<Item = &'a [f64; 3]>) -> Vec<([f64; 2], f64)> {
+    let (camera, pose) = (&frame.source, &frame.source.cam_from_world);
+    let lens = Distortion::new(camera.lens);
+    points.filter_map(|&p| Some((pixel_of(camera, &lens, pose, p)?, pose.apply(p)[2]))).collect()
+}
+
+/// Part of the points that a camera has in its image in the middle, from which one that has none is remarkable, and part of the
+/// cameras that have none at most.
+const USUAL: f64 = 0.1;
+const EXCEPTIONS: f64 = 0.2;
+
+/// The training frames of cameras that have none of the points in their images, where most cameras have many.
+pub(super) fn blind(capture: &Capture) -> Vec<usize> {
+    let Some(cloud) = capture.points.as_ref().filter(|c| c.points.len() >= FEW) else { return Vec::new() };
+    let mut known = BTreeSet::new();
+    let new = |&i: &usize| {
+        let camera = capture.frames[i].camera;
+        !capture.cameras[camera].fixed || known.insert(camera)
+    };
+    let frames: Vec<usize> = capture.train.iter().copied().filter(new).collect();
+    let chosen: Vec<[f64; 3]> = cloud.points.iter().step_by(step(cloud)).copied().collect();
+    let counts: Vec<usize> = frames.par_iter().map(|&i| in_image(&capture.frames[i], chosen.iter()).len()).collect();
+    let mut sorted = counts.clone();
+    sorted.sort_unstable();
+    let usual = sorted.get(sorted.len() / 2).copied().unwrap_or(0) as f64 / chosen.len() as f64;
+    let none: Vec<usize> = frames.iter().zip(&counts).filter(|(_, c)| **c == 0).map(|(i, _)| *i).collect();
+    if usual < USUAL || none.len() as f64 > EXCEPTIONS * frames.len() as f64 {
+        return Vec::new();
+    }
+    none.into_iter().filter(|&i| in_image(&capture.frames[i], cloud.points.iter()).is_empty()).collect()
+}
+
+/// Depth maps that are compared with points, points in one at least, and by how much their unit may be off.
+const MAPS: usize = 3;
+const IN_MAP: usize = 30;
+const SAME_UNIT: f64 = 2.0;
+/// Between the quarters of the ratios: where they are farther apart than this factor, they tell no unit.
+const STEADY: f64 = 3.0;
+
+/// How many times as far away points are as metric depth maps say, and a map's file. `None`: about as far, or it cannot be told.
+pub(super) fn depth_unit(capture: &Capture) -> Option<(f64, &DepthFile)> {
+    let cloud = capture.points.as_ref()?;
+    let metric = |f: &&Frame| f.depth.as_ref().is_some_and(|d| d.kind == DepthKind::Metric);
+    let frames: Vec<&Frame> = capture.train.iter().map(|&i| &capture.frames[i]).filter(metric).collect();
+    let chosen: Vec<&Frame> = frames.iter().step_by(frames.len().div_ceil(MAPS).max(1)).copied().collect();
+    let mut ratios = Vec::new();
+    for frame in &chosen {
+        let seen = in_image(frame, cloud.points.iter().step_by(step(cloud)));
+        let pixels: Vec<[f64; 2]> = seen.iter().map(|(pixel, _)| *pixel).collect();
+        // A map that cannot be read has an error of its own when it is needed.
+        let Ok(depths) = depth::at(frame.depth.as_ref()?, &frame.source, &pixels) else { continue };
+        let known = seen.iter().zip(depths).filter(|(_, d)| *d > 0.0);
+        ratios.extend(known.map(|((_, z), d)| z / f64::from(d)));
+    }
+    if ratios.len() < IN_MAP {
+        return None;
+    }
+    ratios.sort_by(f64::total_cmp);
+    let quarter = |k: usize| ratios[k * ratios.len() / 4];
+    let steady = quarter(3) <= STEADY * quarter(1);
+    let ratio = quarter(2);
+    let off = ratio.max(1.0 / ratio) > SAME_UNIT;
+    Some((ratio, chosen.first()?.depth.as_ref()?)).filter(|_| steady && off)
 }
 
 /// How much nearer colours of some points are to the images there than to those at other points.
 pub(super) fn gain_of(capture: &Capture, looks: &[Look], poses: &[Se3]) -> Option<f64> {
     let count = capture.points.as_ref()?.points.len();
     let chosen: Vec<usize> = (0..count).step_by(count.div_ceil(POINTS).max(1)).collect();
-    gain(capture, &chosen, looks, poses)
+    gain(capture, &chosen, looks, poses).map(|(gain, _)| gain)
 }
 
-/// How much nearer colours are to the image there than to that at other points. `None`: points have one colour, or too few
-/// are in images.
-fn gain(capture: &Capture, chosen: &[usize], looks: &[Look], poses: &[Se3]) -> Option<f64> {
+/// How much nearer colours are to the image there than to that at other points, and how many were compared. `None`: points
+/// have one colour, or too few are in images.
+fn gain(capture: &Capture, chosen: &[usize], looks: &[Look], poses: &[Se3]) -> Option<(f64, usize)> {
     let cloud = capture.points.as_ref()?;
     let apart = |a: &[f32; 3], b: &[f32; 3]| a.iter().zip(b).map(|(x, y)| f64::from((x - y).abs())).sum::<f64>();
     let (mut own, mut other, mut count) = (0.0, 0.0, 0);
@@ -110,7 +227,7 @@ fn gain(capture: &Capture, chosen: &[usize], looks: &[Look], poses: &[Se3]) -> O
         }
         count += n;
     }
-    (count >= ENOUGH && other > 1e-3 * count as f64).then(|| 1.0 - own / other)
+    (count >= ENOUGH && other > 1e-3 * count as f64).then(|| (1.0 - own / other, count))
 }
 
 /// Whether points say that poses are written in the convention of `m`, and not as `stated`.

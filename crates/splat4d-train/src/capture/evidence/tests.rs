@@ -1,7 +1,7 @@
 //! Poses in every convention, with and without points: named, and right ones not.
 
 use super::super::tests::samples::Sample;
-use super::super::{CaptureKind, CaptureOptions, Convention};
+use super::super::{CaptureKind, CaptureOptions, Convention, DepthFile, DepthKind};
 use super::*;
 use image::{ImageBuffer, Rgb, Rgba};
 use serde_json::json;
@@ -275,4 +275,58 @@ fn what_says_too_little_is_not_checked() {
     capture.train.truncate(1);
     let check = capture.check_poses();
     assert_eq!((check.written_as, check.finding.aspect), (None, Some(Aspect::NotChecked)));
+}
+
+#[test]
+fn exchanged_images_do_not_fit_their_points() {
+    let mut capture = photos(true);
+    let images: Vec<_> = capture.frames.iter().map(|f| f.image.clone()).collect();
+    let count = images.len();
+    capture.frames.iter_mut().enumerate().for_each(|(i, f)| f.image.clone_from(&images[(5 * i + 3) % count]));
+    let check = capture.check_poses();
+    assert_eq!((check.written_as, check.finding.severity), (None, Severity::Warning), "{}", check.finding.what);
+    assert!(check.finding.what.contains("Initial points and images do not fit"), "{}", check.finding.what);
+}
+
+#[test]
+fn a_camera_that_sees_no_point_is_named() {
+    let mut capture = photos(true);
+    assert!(capture.check_points().is_empty());
+    let frame = capture.train[4];
+    capture.frames[frame].source.cam_from_world.translation[0] += 1e3;
+    let found = capture.check_points();
+    let name = capture.frames[frame].image.display().to_string();
+    assert!(
+        found.len() == 1 && found[0].what.contains("1 images see none") && found[0].what.contains(&name),
+        "{found:?}"
+    );
+}
+
+#[test]
+fn depth_maps_in_another_unit_are_named() {
+    let mut capture = photos(true);
+    let folder = tempfile::tempdir().unwrap();
+    for i in capture.train.clone() {
+        let z = |x: u32, y: u32| shown(i, x, y).map_or(0.0, |(p, _)| pose(i).apply(p)[2]);
+        let map = ImageBuffer::from_fn(WIDTH, HEIGHT, |x, y| image::Luma([(1e3 * z(x, y)).round() as u16]));
+        let path = folder.path().join(format!("{i}.png"));
+        map.save(&path).unwrap();
+        capture.frames[i].depth = Some(DepthFile { path, scale: 1e-3, kind: DepthKind::Metric });
+    }
+    assert!(capture.check_points().is_empty(), "millimetres");
+    for frame in &mut capture.frames {
+        frame.depth.as_mut().into_iter().for_each(|d| d.scale = 1.0);
+    }
+    let found = capture.check_points();
+    assert!(found.len() == 1 && found[0].what.contains("points are 0.001 times"), "{found:?}");
+}
+
+#[test]
+fn fixed_cameras_are_looked_at_once() {
+    let mut capture = photos(false);
+    let frame = |(t, c): (usize, usize)| Frame { index: t, ..capture.frames[c].clone() };
+    capture.frames = (0..4).flat_map(|t| (0..3).map(move |c| (t, c))).map(frame).collect();
+    capture.train = (0..capture.frames.len()).collect();
+    let cameras: Vec<usize> = capture.looked_at().iter().map(|&i| capture.frames[i].camera).collect();
+    assert_eq!(cameras, [0, 1, 2]);
 }

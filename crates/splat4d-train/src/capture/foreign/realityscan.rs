@@ -37,10 +37,15 @@ fn is(path: &Path) -> bool {
     read && COLUMNS.iter().all(|c| columns.contains_key(*c))
 }
 
+/// What separates the cells: spreadsheets of countries with decimal commas write semicolons or tabs.
+fn separator(header: &str) -> char {
+    [';', '\t'].into_iter().find(|c| header.contains(*c)).unwrap_or(',')
+}
+
 /// Names of columns and their places.
 fn columns(line: &str) -> BTreeMap<String, usize> {
     let line = line.trim_start_matches('\u{feff}').trim_start_matches('#');
-    line.split(',').enumerate().map(|(i, name)| (name.trim().trim_matches('"').to_lowercase(), i)).collect()
+    line.split(separator(line)).enumerate().map(|(i, name)| (name.trim().trim_matches('"').to_lowercase(), i)).collect()
 }
 
 fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
@@ -48,7 +53,8 @@ fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
     let text = text::decode(&bytes).unwrap_or_else(|_| String::from_utf8_lossy(&bytes));
     let place = |e: Error| e.at(marker.display());
     let mut lines = text.lines().enumerate().map(|(i, l)| (i + 1, l.trim())).filter(|(_, l)| !l.is_empty());
-    let columns = columns(lines.next().map_or("", |l| l.1));
+    let header = lines.next().map_or("", |l| l.1);
+    let (columns, separator) = (columns(header), separator(header));
     let missing: Vec<&str> = COLUMNS.into_iter().filter(|c| !columns.contains_key(*c)).collect();
     if !missing.is_empty() {
         return Err(place(Error::input(format!("it lacks the columns {}", missing.join(", "))))
@@ -56,7 +62,7 @@ fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
     }
     let images = Images::below(root);
     let rows: Vec<(usize, Row<'_>)> =
-        lines.map(|(number, line)| (number, Row { columns: &columns, words: words(line) })).collect();
+        lines.map(|(number, line)| (number, Row { columns: &columns, words: words(line, separator) })).collect();
     let found =
         rows.iter().map(|(number, row)| images.named(row.name()).map_err(|e| place(e.at(format!("line {number}")))));
     let found = found.collect::<Result<Vec<PathBuf>>>()?;
@@ -82,8 +88,8 @@ fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
 }
 
 /// A line's cells.
-fn words(line: &str) -> Vec<&str> {
-    line.split(',').map(|w| w.trim().trim_matches('"')).collect()
+fn words(line: &str, separator: char) -> Vec<&str> {
+    line.split(separator).map(|w| w.trim().trim_matches('"')).collect()
 }
 
 struct Row<'a> {
@@ -96,7 +102,7 @@ impl Row<'_> {
     fn number(&self, name: &str) -> Result<f64> {
         let Some(&column) = self.columns.get(name) else { return Ok(0.0) };
         let word = self.words.get(column).copied().unwrap_or_default();
-        word.parse().ok().filter(|x: &f64| x.is_finite()).ok_or_else(|| {
+        word.replace(',', ".").parse().ok().filter(|x: &f64| x.is_finite()).ok_or_else(|| {
             Error::input(format!("{name} is \"{word:.40}\", not a number")).remedy("Export the cameras again.")
         })
     }

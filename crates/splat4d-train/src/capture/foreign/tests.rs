@@ -143,6 +143,10 @@ fn realityscan_cameras_come_back() {
     assert!(off < 1e-9, "{off}");
     let k = capture.frames[0].source.intrinsics;
     assert!((k.fx - FOCAL).abs() < 1e-9 && (k.cx - 12.5).abs() < 1e-9 && (k.cy - 7.8).abs() < 1e-9, "{k:?}");
+    // A spreadsheet with decimal commas.
+    let other = csv.replace(',', ";").replace('.', ",").replace(",png", ".png");
+    sample.write("cameras.csv", other.as_bytes());
+    assert_eq!(apart(&open(&sample), samples::pose), off);
     sample.write("cameras.csv", csv.replacen(",0.75,", ",wide,", 1).as_bytes());
     let wrong = refuse(&sample);
     assert!(wrong.contains("line 2") && wrong.contains("px is \"wide\""), "{wrong}");

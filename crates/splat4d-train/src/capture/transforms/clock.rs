@@ -159,6 +159,8 @@ fn read(
 fn tell(reading: &Reading, instants: &[f64], rate: Rate, account: &mut Account) {
     let [Some(first), Some(last)] = [instants.first(), instants.last()] else { return };
     if first == last {
+        let what = format!("All times are {first}: the images show one instant, and nothing moves.");
+        account.add(Aspect::Assumed, Severity::Note, what);
         return;
     }
     let word = match reading.times {

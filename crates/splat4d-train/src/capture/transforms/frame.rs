@@ -48,13 +48,15 @@ pub(super) struct File<'a> {
 
 /// Reads `node`, a frame of the file.
 pub(super) fn read(file: &File<'_>, node: &Node<'_>) -> Result<Entry> {
-    let name = node.get("file_path")?.text()?;
+    let name = node.needed("file_path")?.text()?;
     let image = file.lookup.image_or_place(file.bases, name).map_err(|e| node.at(e))?;
     let (source, by_angle) = camera(file, node, &image)?;
     let time = node.opt("time")?.map(|n| n.number()).transpose()?;
     let beside = |n: Node<'_>| file.lookup.file(n.text()?).map_err(|e| n.at(e));
-    let mask = node.opt("mask_path")?.map(beside).transpose()?;
-    let depth = node.opt("depth_file_path")?.map(|n| depth(file.top, node, beside(n)?)).transpose()?;
+    // An empty path is none.
+    let path = |key: &str| Ok::<_, Error>(node.opt(key)?.filter(|n| n.value.as_str() != Some("")));
+    let mask = path("mask_path")?.map(beside).transpose()?;
+    let depth = path("depth_file_path")?.map(|n| depth(file.top, node, beside(n)?)).transpose()?;
     // Names tell cameras apart by forward slashes.
     Ok(Entry { name: name.replace('\\', "/"), image, source, by_angle, time, mask, depth, split: Split::Train })
 }
@@ -87,12 +89,12 @@ pub(super) fn posed(file: &File<'_>, node: &Node<'_>) -> Result<(String, Camera)
 /// stated.
 fn camera(file: &File<'_>, node: &Node<'_>, image: &Path) -> Result<(Camera, bool)> {
     let top = file.top;
-    let matrix = node.get("transform_matrix")?;
+    let matrix = node.needed("transform_matrix")?;
     let raw = pose::checked(Se3::from_rows(&matrix.pose4(file.poses)?)).map_err(|e| matrix.at(e))?;
     let cam_from_world = Convention::NERF.read_as(raw, file.poses)?;
     let (width, height) = size(file, node, image)?;
     let model = value(top, node, "camera_model")?.map(|n| n.text()).transpose()?;
-    if model == Some(PANORAMA) {
+    if model.is_some_and(|m| m.eq_ignore_ascii_case(PANORAMA)) {
         let (intrinsics, lens) = panorama::whole([width, height]);
         return Ok((Camera { cam_from_world, intrinsics, lens, width, height, near: Camera::NEAR }, false));
     }
@@ -189,7 +191,8 @@ fn lens(top: &Node<'_>, node: &Node<'_>) -> Result<Lens> {
             .or_else(|| n.value.as_f64().map(|x| x != 0.0))
             .ok_or_else(|| n.error("is_fisheye is neither true nor false").remedy("Write true or false."))?,
     };
-    let model = value(top, node, "camera_model")?.map(|n| n.text()).transpose()?;
+    let model = value(top, node, "camera_model")?.map(|n| n.text()).transpose()?.map(str::to_ascii_uppercase);
+    let model = model.as_deref();
     match model.unwrap_or(if fisheye { "OPENCV_FISHEYE" } else { "OPENCV" }) {
         "OPENCV_FISHEYE" if k[4..] != [0.0; 2] || p != [0.0; 2] || s != [0.0; 4] => {
             Err(unsupported("a fisheye lens has k1 to k4; k5, k6, p1, p2 or s1 to s4 are not zero".into()))
@@ -289,6 +292,51 @@ const HARMLESS: &[&str] = &[
     "n_extra_learnable_dims",
     "comment",
 ];
+
+/// Words of other programs for keys that are read.
+const OTHER_WORDS: &[(&str, &str)] = &[
+    ("width", "w"),
+    ("height", "h"),
+    ("fx", "fl_x"),
+    ("fy", "fl_y"),
+    ("focal_x", "fl_x"),
+    ("focal_y", "fl_y"),
+    ("focal", "fl_x"),
+    ("focal_length", "fl_x"),
+    ("px", "cx"),
+    ("py", "cy"),
+    ("fov", "camera_angle_x"),
+    ("fov_x", "camera_angle_x"),
+    ("fovx", "camera_angle_x"),
+    ("model", "camera_model"),
+    ("distortion", "distortion_params"),
+    ("distortion_coeffs", "distortion_params"),
+    ("mask", "mask_path"),
+    ("mask_file_path", "mask_path"),
+    ("ply_path", "ply_file_path"),
+    ("train_files", "train_filenames"),
+    ("test_files", "test_filenames"),
+    ("framerate", "fps"),
+    ("frame_rate", "fps"),
+];
+
+/// Keys that are not read and are like others that are, which are missing there: each with the one that it is like.
+pub(super) fn mistaken(top: &Node<'_>) -> Vec<String> {
+    let frames = top.value.get("frames").and_then(|v| v.as_array()).map_or(&[][..], Vec::as_slice);
+    let folded = |key: &str| key.to_ascii_lowercase().replace(['_', '-'], "");
+    let mut found = BTreeSet::new();
+    for object in frames.iter().chain([top.value]).filter_map(|v| v.as_object()) {
+        for key in object.keys().filter(|key| !READ.contains(&key.as_str())) {
+            let other = OTHER_WORDS.iter().find(|(word, _)| folded(word) == folded(key)).map(|(_, meant)| *meant);
+            let meant = READ.iter().find(|read| folded(read) == folded(key)).copied().or(other);
+            let missing = |meant: &&str| !object.contains_key(*meant) && top.value.get(*meant).is_none();
+            if let Some(meant) = meant.filter(missing) {
+                found.insert(format!("{key:.40} (meant {meant}?)"));
+            }
+        }
+    }
+    found.into_iter().collect()
+}
 
 /// Keys of a file that are not read and might matter, each once.
 pub(super) fn unread(top: &Node<'_>) -> Vec<String> {

@@ -1,0 +1,106 @@
+//! What a folder holds that is no capture, and the way from there to one: archives, captures above and below, files under
+//! other names, images and videos without poses.
+
+use super::{colmap, layout, lookup, rig, sequence};
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+/// Where the videos of a rig often lie.
+const VIDEO_FOLDER: &str = "videos";
+const VIDEO_ENDINGS: &[&str] = &["mp4", "mov", "mkv", "avi", "webm"];
+const ARCHIVE_ENDINGS: &[&str] = &["zip", "7z", "rar", "tar", "tgz", "gz", "r3d"];
+/// COLMAP's features and matches.
+const DATABASE: &str = "database.db";
+/// The cameras of a 3DGS output: names of images and poses, without the images.
+const OUTPUT_CAMERAS: &str = "cameras.json";
+/// Bytes of a JSON file in which its keys are looked for.
+const HEAD: u64 = 1 << 16;
+/// Folders that are looked into for a capture.
+const MOST_FOLDERS: usize = 100;
+
+/// What to do with a folder that is no capture, by what it holds. `None`: it holds nothing that is known.
+pub(super) fn advice(root: &Path) -> Option<String> {
+    let names = rig::file_names(root);
+    let folders = || names.iter().map(|n| root.join(n)).filter(|p| p.is_dir()).take(MOST_FOLDERS);
+    if let Some(inner) = folders().find(|folder| layout::is_capture(folder)) {
+        return Some(format!("A folder in it is a capture: give {}.", inner.display()));
+    }
+    if let Some(above) = above(root).filter(|folder| is_part(root) && layout::is_capture(folder)) {
+        return Some(format!("The folder that holds it is a capture: give {}.", above.display()));
+    }
+    if let Some(name) = names.iter().find(|n| is_transforms(&root.join(n))) {
+        return Some(format!("{name} has poses as transforms.json has them: give its path, or rename it."));
+    }
+    if let Some(name) = names.iter().find(|n| ends(Path::new(n), ARCHIVE_ENDINGS)) {
+        return Some(format!("{name} is an archive: unpack it, and give the folder that it makes."));
+    }
+    if root.join(OUTPUT_CAMERAS).is_file() {
+        return Some(format!(
+            "{OUTPUT_CAMERAS} is that of a 3DGS output, which has no images: give the capture that it was trained on."
+        ));
+    }
+    if let Some(video) = first_video(root) {
+        return Some(format!(
+            "It holds videos, but no camera poses that are known here. Make a capture of them with `splat4d import`, which \
+             finds clocks and poses, or reads a calibration that you have (docs/filming.md); or extract frames with `{}` and \
+             write a capture.json (examples/rig_from_calibration.py, docs/capture-format.md).",
+            ffmpeg_command(&video)
+        ));
+    }
+    let reconstruct = "reconstruct them with COLMAP (`colmap automatic_reconstructor`) and give its folder; `splat4d import` \
+                       finds poses of videos and of folders of frames (docs/filming.md)";
+    if root.join(DATABASE).is_file() {
+        return Some(format!("{DATABASE} holds no poses yet (`colmap mapper` finds them): {reconstruct}."));
+    }
+    colmap::has_images(root).then(|| format!("It holds images, but no camera poses: {reconstruct}."))
+}
+
+/// Whether a name ends in one of these.
+fn ends(path: &Path, endings: &[&str]) -> bool {
+    path.extension().is_some_and(|e| endings.iter().any(|v| e.eq_ignore_ascii_case(v)))
+}
+
+/// Whether a file is an archive by its name, which is to be unpacked.
+pub(super) fn is_archive(path: &Path) -> bool {
+    ends(path, ARCHIVE_ENDINGS)
+}
+
+/// Whether a folder is called like the images of a capture, or like one of its cameras.
+fn is_part(root: &Path) -> bool {
+    let name = root.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    lookup::is_image_folder(&name) || rig::is_plain(&name) || sequence::are_cameras(&[name])
+}
+
+/// The folder that holds this one.
+fn above(root: &Path) -> Option<PathBuf> {
+    let full = std::path::absolute(root).ok()?;
+    full.parent().map(Path::to_path_buf)
+}
+
+/// Whether a JSON file, whatever its name, lists frames with matrices as a transforms file does.
+pub(super) fn is_transforms(path: &Path) -> bool {
+    if !ends(path, &["json"]) || !path.is_file() {
+        return false;
+    }
+    let mut head = Vec::new();
+    let read = crate::files::open(path).is_ok_and(|f| f.take(HEAD).read_to_end(&mut head).is_ok());
+    read && String::from_utf8_lossy(&head).contains("\"transform_matrix\"")
+}
+
+/// The first video in a folder, or in the usual one below it.
+fn first_video(root: &Path) -> Option<String> {
+    let below = videos(&root.join(VIDEO_FOLDER)).into_iter().map(|name| format!("{VIDEO_FOLDER}/{name}"));
+    videos(root).into_iter().chain(below).next()
+}
+
+/// Names of the video files in a folder, sorted.
+pub(super) fn videos(folder: &Path) -> Vec<String> {
+    let video = |n: &String| !n.starts_with('.') && ends(Path::new(n), VIDEO_ENDINGS);
+    rig::file_names(folder).into_iter().filter(video).collect()
+}
+
+/// The command that turns one video into a folder of frames named as the readers expect.
+pub(super) fn ffmpeg_command(video: &str) -> String {
+    let stem = Path::new(video).file_stem().and_then(|s| s.to_str()).unwrap_or("cam00");
+    format!("mkdir -p images/{stem} && ffmpeg -i {video} -start_number 0 -qscale:v 2 images/{stem}/%06d.jpg")
+}
