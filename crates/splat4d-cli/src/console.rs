@@ -6,8 +6,10 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::{Value, json};
 use splat4d::text;
 use splat4d_train::event::Event;
+use splat4d_train::path_text::in_command;
 use std::cell::RefCell;
 use std::io::{IsTerminal, Write};
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 /// How much is said.
@@ -88,9 +90,14 @@ impl Console {
     }
 
     /// A file was written.
-    pub fn written(&self, path: &std::path::Path) {
+    pub fn written(&self, path: &Path) {
         self.say(&format!("wrote {}", path.display()));
         self.emit(&json!({"type": "written", "path": path.to_string_lossy()}));
+    }
+
+    /// The next command to type, as the last line of a verb.
+    pub(crate) fn next(&self, verb: &str, path: &Path) {
+        self.say(&format!("next: splat4d {verb} {}", in_command(path)));
     }
 
     /// A warning: always said, and kept for the report.

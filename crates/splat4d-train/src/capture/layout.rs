@@ -2,6 +2,7 @@
 //! is none.
 
 use super::{CaptureOptions, Take, colmap, foreign, n3dv, nerfies, own, panoptic, rig, transforms};
+use crate::path_text::in_command;
 use splat4d::{Error, ErrorKind, Result};
 use std::path::Path;
 
@@ -116,15 +117,27 @@ fn unknown_layout(root: &Path, named: &Path) -> Error {
     let below = videos(&root.join(VIDEO_FOLDER)).into_iter().map(|name| format!("{VIDEO_FOLDER}/{name}"));
     if let Some(video) = videos(root).into_iter().chain(below).next() {
         error = error.remedy(format!(
-            "It holds videos, but no camera poses that are known here. Make a capture of them with `splat4d import`, which \
-             finds clocks and poses, or reads a calibration that you have (docs/filming.md); or extract frames with `{}` and \
-             write a capture.json (examples/rig_from_calibration.py, docs/capture-format.md).",
+            "It holds videos, but no camera poses that are known here. Make a capture of them with `splat4d import {} -o TAKE`, \
+             which finds clocks and poses, or reads a calibration that you have (docs/filming.md); or extract frames with `{}` \
+             and write a capture.json (examples/rig_from_calibration.py, docs/capture-format.md).",
+            in_command(named),
             ffmpeg_command(&video)
+        ));
+    } else if holds_images(root) {
+        error = error.remedy(format!(
+            "It holds images without camera poses. Make a capture of them with `splat4d import {} -o TAKE`.",
+            in_command(named)
         ));
     }
     error.remedy(
         "Write a capture.json with your cameras (docs/capture-format.md), or give the folder of a known layout.",
     )
+}
+
+/// Whether image files lie in a folder, or in one directly below it.
+fn holds_images(folder: &Path) -> bool {
+    let below = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|e| e.path()).filter(|p| p.is_dir());
+    std::iter::once(folder.to_owned()).chain(below).any(|f| !rig::image_names(&f).is_empty())
 }
 
 /// Names of the video files in a folder, sorted.
@@ -140,5 +153,8 @@ pub(super) fn videos(folder: &Path) -> Vec<String> {
 /// The command that turns one video into a folder of frames named as the readers expect.
 pub(super) fn ffmpeg_command(video: &str) -> String {
     let stem = Path::new(video).file_stem().and_then(|s| s.to_str()).unwrap_or("cam00");
-    format!("mkdir -p images/{stem} && ffmpeg -i {video} -start_number 0 -qscale:v 2 images/{stem}/%06d.jpg")
+    let folder = in_command(&Path::new("images").join(stem));
+    let frames = in_command(&Path::new("images").join(stem).join("%06d.jpg"));
+    let video = in_command(Path::new(video));
+    format!("mkdir -p {folder} && ffmpeg -i {video} -start_number 0 -qscale:v 2 {frames}")
 }
