@@ -643,6 +643,9 @@ fn a_playback_file_is_told_exported_and_refused_when_damaged() {
     std::fs::write(&spoilt, &bytes).unwrap();
     let told = splat4d(&["info", str(&spoilt)]).run().refused();
     assert!(told.contains("checksum") && told.contains("spoilt.s4d"), "{told}");
+    let page = work.path().join("page.html");
+    let told = splat4d(&["export", str(&spoilt), "-o", str(&page)]).run().refused();
+    assert!(told.contains("checksum") && !page.exists(), "{told}");
 
     // What a file is called is shown, and no terminal obeys it.
     #[cfg(unix)]
