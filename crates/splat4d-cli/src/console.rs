@@ -82,6 +82,16 @@ impl Console {
         self.above_bar(|| print(text));
     }
 
+    /// The same of a report on something's health: its lines of trouble (`! …`) and its last line, the verdict, have
+    /// colours on a terminal.
+    pub(crate) fn report(&self, text: &str, healthy: bool) {
+        let text = text::shown(text);
+        let colours = std::io::stdout().is_terminal()
+            && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty())
+            && std::env::var_os("TERM").is_none_or(|t| t != "dumb");
+        self.above_bar(|| print_shown(&if colours { painted(&text, healthy) } else { text.into_owned() }));
+    }
+
     /// One JSON line; only with `--json`.
     pub fn emit(&self, value: &Value) {
         if self.json {
@@ -305,10 +315,27 @@ fn one_json_line(value: &Value) -> String {
     line.chars().map(|c| if text::acts(c) { format!("\\u{:04x}", u32::from(c)) } else { c.into() }).collect()
 }
 
-/// Prints a line on stdout, safe for a terminal. A reader that has gone (`| head`) ends the program in peace; a full disk is an error.
+/// A report in colours of ECMA-48: lines of trouble yellow, the verdict green or red.
+fn painted(report: &str, healthy: bool) -> String {
+    let paint = |line: &str, colour: u8| format!("\x1b[{colour}m{line}\x1b[0m");
+    let verdict = paint(report.lines().last().unwrap_or_default(), if healthy { 32 } else { 31 });
+    let above = report.lines().count().saturating_sub(1);
+    let body = report.lines().take(above).map(|line| match line.trim_start().starts_with("! ") {
+        true => paint(line, 33) + "\n",
+        false => format!("{line}\n"),
+    });
+    body.collect::<String>() + &verdict
+}
+
+/// Prints a line on stdout, safe for a terminal.
 fn print(line: &str) {
+    print_shown(&text::shown(line));
+}
+
+/// Prints on stdout what is safe. A reader that has gone (`| head`) ends the program in peace; a full disk is an error.
+fn print_shown(line: &str) {
     let mut out = std::io::stdout().lock();
-    if let Err(error) = writeln!(out, "{}", text::shown(line)).and_then(|()| out.flush()) {
+    if let Err(error) = writeln!(out, "{line}").and_then(|()| out.flush()) {
         if error.kind() == std::io::ErrorKind::BrokenPipe {
             std::process::exit(0);
         }
@@ -325,6 +352,17 @@ pub(crate) fn eprint_line(line: &str) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn trouble_and_verdict_have_colours() {
+        let text = "cameras          3\n  ! one is dark\n! no points\ndoes not look healthy";
+        let painted = painted(text, false);
+        assert_eq!(
+            painted,
+            "cameras          3\n\x1b[33m  ! one is dark\x1b[0m\n\x1b[33m! no points\x1b[0m\n\x1b[31mdoes not look healthy\x1b[0m"
+        );
+        assert_eq!(super::painted("looks healthy", true), "\x1b[32mlooks healthy\x1b[0m");
+    }
 
     #[test]
     fn json_lines_hold_nothing_that_a_terminal_obeys() {

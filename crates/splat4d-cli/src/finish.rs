@@ -539,7 +539,7 @@ fn orbit(run: &Path, scene: &Scene<f32>, console: &Console) -> anyhow::Result<Pa
     let mp4 = have_ffmpeg();
     let (name, other, fps) =
         if mp4 { ("orbit.mp4", "orbit.png", ORBIT_FPS) } else { ("orbit.png", "orbit.mp4", ORBIT_FPS_PNG) };
-    let clock = Clock { from: scene.clip[0], to: scene.clip[1], freeze: None, slow_motion: None, fps };
+    let clock = Clock { from: scene.clip[0], to: scene.clip[1], freeze: None, slow_motion: None, seconds: None, fps };
     let size = (!mp4).then(|| small([stage.template.width, stage.template.height]));
     let shots = shots(&Route::Orbit, &clock, &views, &stage, size)?;
     let antialias = opened.recipe().is_ok_and(|r| r.appearance.antialias);

@@ -132,7 +132,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         let _ = writeln!(told.text, "! {}", in_line(trouble));
     }
     let verdict = if healthy { "looks healthy" } else { "does not look healthy, see above" };
-    console.result(&format!("{}{verdict}", told.text));
+    console.report(&format!("{}{verdict}", told.text), healthy);
     Ok(())
 }
 

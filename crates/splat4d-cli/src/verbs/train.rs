@@ -232,7 +232,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         // Of a long take no more is listed than tells that it is one.
         let capture = Arc::new(open_frames(&source, &recipe, look_ahead(&recipe))?);
         let output = again.as_ref().map(|(run, _)| run).or(args.output.as_ref());
-        let asked = Asked::new(&capture.root, &recipe, minutes, predict);
+        let asked = Asked::of(&capture, &recipe, minutes, predict);
         let place = || place(args, output, &capture, &asked, console);
         // A take that is not told to be cut keeps to its minutes at once.
         let at_once = minutes.is_some() && recipe.chunks.frames == 0;
