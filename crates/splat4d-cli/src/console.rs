@@ -112,6 +112,7 @@ impl Console {
 
     /// A warning: always said, and kept for the report.
     pub(crate) fn warn(&self, message: &str) {
+        let message = &linked(message);
         self.state.borrow_mut().warnings.push(message.to_owned());
         if self.json {
             self.emit(&json!({"type": "warning", "message": message}));
@@ -140,7 +141,7 @@ impl Console {
     /// The error that ends the program: one paragraph.
     pub(crate) fn error(&self, message: &str, code: u8) {
         self.clear();
-        let paragraph = message.split_whitespace().collect::<Vec<_>>().join(" ");
+        let paragraph = linked(&message.split_whitespace().collect::<Vec<_>>().join(" "));
         let end = if paragraph.ends_with(['.', '?', '!']) { "" } else { "." };
         eprint_line(&format!("error: {paragraph}{end}"));
         self.emit(&json!({"type": "error", "message": paragraph, "code": code}));
@@ -306,6 +307,24 @@ fn bar(total: usize) -> ProgressBar {
     bar
 }
 
+/// The text with pages of the documentation, of which an installed program has no copy, as links.
+fn linked(text: &str) -> String {
+    const FOLDER: &str = "docs/";
+    let mut out = String::with_capacity(text.len());
+    let mut rest = text;
+    while let Some(at) = rest.find(FOLDER) {
+        let name = at + FOLDER.len();
+        let end = rest[name..].find(|c: char| !(c.is_ascii_lowercase() || c == '-')).map_or(rest.len(), |n| name + n);
+        // A path that the user gave stands at the beginning or behind another folder.
+        let ours = rest[..at].ends_with([' ', '(']) && rest[end..].starts_with(".md");
+        out += &rest[..at];
+        out += if ours { concat!(env!("CARGO_PKG_REPOSITORY"), "/blob/main/") } else { "" };
+        out += &rest[at..end];
+        rest = &rest[end..];
+    }
+    out + rest
+}
+
 /// JSON in one line, in which no character acts on a terminal: outside strings JSON has none, and inside they are escaped.
 fn one_json_line(value: &Value) -> String {
     let line = value.to_string();
@@ -352,6 +371,16 @@ pub(crate) fn eprint_line(line: &str) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn pages_of_the_documentation_are_links() {
+        let pages = concat!(env!("CARGO_PKG_REPOSITORY"), "/blob/main/docs/");
+        assert!(pages.starts_with("https://"), "{pages}");
+        let text = "docs/a.json: is no list (docs/capture-format.md). See docs/edit.md, my/docs/edit.md or docs/";
+        let wanted =
+            format!("docs/a.json: is no list ({pages}capture-format.md). See {pages}edit.md, my/docs/edit.md or docs/");
+        assert_eq!(linked(text), wanted);
+    }
 
     #[test]
     fn trouble_and_verdict_have_colours() {

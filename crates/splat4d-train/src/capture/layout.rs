@@ -119,7 +119,7 @@ fn unknown_layout(root: &Path, named: &Path) -> Error {
         error = error.remedy(format!(
             "It holds videos, but no camera poses that are known here. Make a capture of them with `splat4d import {} -o TAKE`, \
              which finds clocks and poses, or reads a calibration that you have (docs/filming.md); or extract frames with `{}` \
-             and write a capture.json (examples/rig_from_calibration.py, docs/capture-format.md).",
+             and write a capture.json (docs/capture-format.md).",
             in_command(named),
             ffmpeg_command(&video)
         ));
