@@ -5,7 +5,6 @@ use splat4d::flow::query::{Followed, Place, Query, Sight, follow, sights};
 use splat4d::layers::Scene;
 use splat4d::scene::{Camera, Time};
 use splat4d::{Error, Result};
-use std::fmt::Write as _;
 
 /// Most points of a file.
 const MOST_POINTS: usize = 1_000_000;
@@ -182,18 +181,22 @@ impl Answer {
     /// As CSV: `point,time,x,y,z,camera,u,v,visible`, a line for every moment at which a point is there. `point` counts the
     /// file's lines from 0; without a camera the last four are empty.
     pub(crate) fn to_csv(&self) -> String {
-        let mut out = "point,time,x,y,z,camera,u,v,visible\n".to_owned();
+        let mut out = csv::Writer::from_writer(Vec::new());
+        let header = ["point", "time", "x", "y", "z", "camera", "u", "v", "visible"];
+        out.write_record(header).expect("memory takes every row");
         for (i, asked) in self.asked.iter().enumerate() {
             for (k, (t, place)) in self.followed.times.iter().zip(self.followed.path(i)).enumerate() {
                 let Some([x, y, z]) = place else { continue };
-                let _ = write!(out, "{i},{t},{x},{y},{z},{}", asked.camera.as_deref().unwrap_or(""));
-                let _ = match self.sights[i * self.followed.times.len() + k] {
-                    Some(s) => writeln!(out, ",{},{},{}", s.pixel[0], s.pixel[1], u8::from(s.visible)),
-                    None => writeln!(out, ",,,"),
+                let seen = match self.sights[i * self.followed.times.len() + k] {
+                    Some(s) => [s.pixel[0].to_string(), s.pixel[1].to_string(), u8::from(s.visible).to_string()],
+                    None => Default::default(),
                 };
+                let camera = asked.camera.clone().unwrap_or_default();
+                let place = [i.to_string(), t.to_string(), x.to_string(), y.to_string(), z.to_string(), camera];
+                out.write_record(place.iter().chain(&seen)).expect("memory takes every row");
             }
         }
-        out
+        String::from_utf8(out.into_inner().expect("memory takes every row")).expect("all of it is text")
     }
 
     /// As JSON: `{"version": 1, "times": [s], "points": [{"start": [x, y, z], "camera": name, "path": [[x, y, z] or null],

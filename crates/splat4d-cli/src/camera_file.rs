@@ -21,6 +21,10 @@ pub(crate) const MAX_SIDE: usize = 16_384;
 pub(crate) const MAX_PIXELS: usize = 1 << 26;
 /// Largest |R Rᵀ − I| that counts as rounding of the file.
 const MAX_SHEAR: f64 = 0.01;
+/// Largest number of a camera that is accepted: sums of squares and cubes of it still fit 32-bit floats.
+const LARGEST: f64 = 1e12;
+/// Shortest focal length that is accepted, pixels.
+const SHORTEST: f64 = 1e-3;
 
 /// Reads the camera and its background, if it tells one.
 pub(crate) fn read(path: &Path) -> Result<(Camera, Option<[f32; 3]>)> {
@@ -43,8 +47,9 @@ pub(crate) fn parse(text: &str) -> Result<(Camera, Option<[f32; 3]>)> {
     }
     let number = |key: &str| {
         let value = value.get(key).ok_or_else(|| missing(key))?;
-        value.as_f64().filter(|x| x.is_finite()).ok_or_else(|| {
-            Error::input(format!("\"{key}\" is {value}, not a finite number")).remedy("Write a plain number.")
+        value.as_f64().filter(|x| x.abs() <= LARGEST).ok_or_else(|| {
+            Error::input(format!("\"{key}\" is {value}, not a number up to {LARGEST:e}"))
+                .remedy("Write a plain number.")
         })
     };
     // capture.json and Python write the whole words.
@@ -64,7 +69,7 @@ pub(crate) fn parse(text: &str) -> Result<(Camera, Option<[f32; 3]>)> {
         Ok(n as usize)
     };
     let intrinsics = Intrinsics { fx: number("fx")?, fy: number("fy")?, cx: number("cx")?, cy: number("cy")? };
-    if intrinsics.fx <= 0.0 || intrinsics.fy <= 0.0 {
+    if intrinsics.fx < SHORTEST || intrinsics.fy < SHORTEST {
         return Err(Error::input(format!("the focal length is {} x {}", intrinsics.fx, intrinsics.fy))
             .remedy("Give \"fx\" and \"fy\" in pixels, above zero."));
     }
@@ -136,9 +141,9 @@ pub(crate) fn pose(value: &Value) -> Result<Se3> {
     Ok(pose)
 }
 
-/// A list of finite numbers.
+/// A list of numbers that 32-bit floats can compute with.
 pub(crate) fn numbers(value: &Value) -> Option<Vec<f64>> {
-    value.as_array()?.iter().map(|v| v.as_f64().filter(|x| x.is_finite())).collect()
+    value.as_array()?.iter().map(|v| v.as_f64().filter(|x| x.abs() <= LARGEST)).collect()
 }
 
 fn missing(key: &str) -> Error {
@@ -204,6 +209,9 @@ mod tests {
             (change("near", json!(-1)), "\"near\""),
             (change("near", json!(null)), "\"near\""),
             (change("background", json!([1])), "background"),
+            (change("fx", json!(1e-320)), "focal length"),
+            (change("cx", json!(1e39)), "\"cx\""),
+            (good().to_string().replace("0.5]", "-1e308]"), "4x4"),
             (change("backgroud", json!([1, 1, 1])), "\"background\""),
             (good().to_string().replace("0.5", "NaN"), "NaN"),
             (good().to_string()[..40].to_owned(), "truncated"),

@@ -19,6 +19,7 @@ use splat4d_train::capture::{Capture, ImageStore};
 use splat4d_train::compress::{self, Compression, Job};
 use splat4d_train::eval::run::{EvalOptions, Scores, assess};
 use splat4d_train::output::{Found, Input, Mixes, OutputFolder, Request};
+use splat4d_train::path_text::in_command;
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::{TrainOptions, checkpoint};
 use std::path::{Path, PathBuf};
@@ -258,7 +259,7 @@ impl Work {
 
     fn interrupted(&self, step: usize) -> Error {
         Error::new(ErrorKind::Interrupted, format!("compressing was stopped after step {step} and saved"))
-            .remedy(format!("Continue with: splat4d compress --resume {}", self.dir.display()))
+            .remedy(format!("Continue with: splat4d compress --resume {}", in_command(&self.dir)))
     }
 
     /// Where the file must stay within a size, the gentlest settings that do.

@@ -6,8 +6,10 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::{Value, json};
 use splat4d::text;
 use splat4d_train::event::Event;
+use splat4d_train::path_text::in_command;
 use std::cell::RefCell;
 use std::io::{IsTerminal, Write};
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 /// How much is said.
@@ -80,6 +82,16 @@ impl Console {
         self.above_bar(|| print(text));
     }
 
+    /// The same of a report on something's health: its lines of trouble (`! …`) and its last line, the verdict, have
+    /// colours on a terminal.
+    pub(crate) fn report(&self, text: &str, healthy: bool) {
+        let text = text::shown(text);
+        let colours = std::io::stdout().is_terminal()
+            && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty())
+            && std::env::var_os("TERM").is_none_or(|t| t != "dumb");
+        self.above_bar(|| print_shown(&if colours { painted(&text, healthy) } else { text.into_owned() }));
+    }
+
     /// One JSON line; only with `--json`.
     pub fn emit(&self, value: &Value) {
         if self.json {
@@ -88,13 +100,19 @@ impl Console {
     }
 
     /// A file was written.
-    pub fn written(&self, path: &std::path::Path) {
+    pub fn written(&self, path: &Path) {
         self.say(&format!("wrote {}", path.display()));
         self.emit(&json!({"type": "written", "path": path.to_string_lossy()}));
     }
 
+    /// The next command to type, as the last line of a verb.
+    pub(crate) fn next(&self, verb: &str, path: &Path) {
+        self.say(&format!("next: splat4d {verb} {}", in_command(path)));
+    }
+
     /// A warning: always said, and kept for the report.
     pub(crate) fn warn(&self, message: &str) {
+        let message = &linked(message);
         self.state.borrow_mut().warnings.push(message.to_owned());
         if self.json {
             self.emit(&json!({"type": "warning", "message": message}));
@@ -123,7 +141,7 @@ impl Console {
     /// The error that ends the program: one paragraph.
     pub(crate) fn error(&self, message: &str, code: u8) {
         self.clear();
-        let paragraph = message.split_whitespace().collect::<Vec<_>>().join(" ");
+        let paragraph = linked(&message.split_whitespace().collect::<Vec<_>>().join(" "));
         let end = if paragraph.ends_with(['.', '?', '!']) { "" } else { "." };
         eprint_line(&format!("error: {paragraph}{end}"));
         self.emit(&json!({"type": "error", "message": paragraph, "code": code}));
@@ -289,6 +307,24 @@ fn bar(total: usize) -> ProgressBar {
     bar
 }
 
+/// The text with pages of the documentation, of which an installed program has no copy, as links.
+fn linked(text: &str) -> String {
+    const FOLDER: &str = "docs/";
+    let mut out = String::with_capacity(text.len());
+    let mut rest = text;
+    while let Some(at) = rest.find(FOLDER) {
+        let name = at + FOLDER.len();
+        let end = rest[name..].find(|c: char| !(c.is_ascii_lowercase() || c == '-')).map_or(rest.len(), |n| name + n);
+        // A path that the user gave stands at the beginning or behind another folder.
+        let ours = rest[..at].ends_with([' ', '(']) && rest[end..].starts_with(".md");
+        out += &rest[..at];
+        out += if ours { concat!(env!("CARGO_PKG_REPOSITORY"), "/blob/main/") } else { "" };
+        out += &rest[at..end];
+        rest = &rest[end..];
+    }
+    out + rest
+}
+
 /// JSON in one line, in which no character acts on a terminal: outside strings JSON has none, and inside they are escaped.
 fn one_json_line(value: &Value) -> String {
     let line = value.to_string();
@@ -298,10 +334,27 @@ fn one_json_line(value: &Value) -> String {
     line.chars().map(|c| if text::acts(c) { format!("\\u{:04x}", u32::from(c)) } else { c.into() }).collect()
 }
 
-/// Prints a line on stdout, safe for a terminal. A reader that has gone (`| head`) ends the program in peace; a full disk is an error.
+/// A report in colours of ECMA-48: lines of trouble yellow, the verdict green or red.
+fn painted(report: &str, healthy: bool) -> String {
+    let paint = |line: &str, colour: u8| format!("\x1b[{colour}m{line}\x1b[0m");
+    let verdict = paint(report.lines().last().unwrap_or_default(), if healthy { 32 } else { 31 });
+    let above = report.lines().count().saturating_sub(1);
+    let body = report.lines().take(above).map(|line| match line.trim_start().starts_with("! ") {
+        true => paint(line, 33) + "\n",
+        false => format!("{line}\n"),
+    });
+    body.collect::<String>() + &verdict
+}
+
+/// Prints a line on stdout, safe for a terminal.
 fn print(line: &str) {
+    print_shown(&text::shown(line));
+}
+
+/// Prints on stdout what is safe. A reader that has gone (`| head`) ends the program in peace; a full disk is an error.
+fn print_shown(line: &str) {
     let mut out = std::io::stdout().lock();
-    if let Err(error) = writeln!(out, "{}", text::shown(line)).and_then(|()| out.flush()) {
+    if let Err(error) = writeln!(out, "{line}").and_then(|()| out.flush()) {
         if error.kind() == std::io::ErrorKind::BrokenPipe {
             std::process::exit(0);
         }
@@ -318,6 +371,27 @@ pub(crate) fn eprint_line(line: &str) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn pages_of_the_documentation_are_links() {
+        let pages = concat!(env!("CARGO_PKG_REPOSITORY"), "/blob/main/docs/");
+        assert!(pages.starts_with("https://"), "{pages}");
+        let text = "docs/a.json: is no list (docs/capture-format.md). See docs/edit.md, my/docs/edit.md or docs/";
+        let wanted =
+            format!("docs/a.json: is no list ({pages}capture-format.md). See {pages}edit.md, my/docs/edit.md or docs/");
+        assert_eq!(linked(text), wanted);
+    }
+
+    #[test]
+    fn trouble_and_verdict_have_colours() {
+        let text = "cameras          3\n  ! one is dark\n! no points\ndoes not look healthy";
+        let painted = painted(text, false);
+        assert_eq!(
+            painted,
+            "cameras          3\n\x1b[33m  ! one is dark\x1b[0m\n\x1b[33m! no points\x1b[0m\n\x1b[31mdoes not look healthy\x1b[0m"
+        );
+        assert_eq!(super::painted("looks healthy", true), "\x1b[32mlooks healthy\x1b[0m");
+    }
 
     #[test]
     fn json_lines_hold_nothing_that_a_terminal_obeys() {

@@ -117,8 +117,8 @@ struct Pulled {
 #[derive(Clone, Debug, Deserialize)]
 #[serde(tag = "do", rename_all = "kebab-case", deny_unknown_fields)]
 enum Ask {
-    /// What there is, and the list as it is.
-    Open,
+    /// What there is, and the list as it is; `kept`: the list that the page has in its place.
+    Open { kept: Option<Vec<Step>> },
     /// The edited scene as a picture.
     Show { steps: Vec<Step>, view: Eye, t: f64 },
     /// The edited scene as a playback file.
@@ -160,6 +160,9 @@ struct State {
     bends: u64,
     /// The list's file as it was read or written last; none: it was not there.
     saved: Option<String>,
+    /// The list in that file, and the one of the scene that pages get.
+    listed: Vec<Step>,
+    shown: Vec<Step>,
 }
 
 /// Edits one scene by one list.
@@ -185,7 +188,8 @@ impl Editor {
         let text = file.exists().then(|| files::read_text(file)).transpose()?;
         let listed = if text.is_some() { editing::read(file)? } else { Edits::default() };
         listed.check(&title).map_err(|e| e.at(file.display()))?;
-        let state = Mutex::new(State { saved: text, ..State::default() });
+        let [shown, steps] = [0; 2].map(|_| listed.steps.clone());
+        let state = Mutex::new(State { saved: text, listed: steps, shown, ..State::default() });
         Ok(Self { source, title, file: file.to_owned(), listed, state, bakings: AtomicU64::new(0) })
     }
 
@@ -210,7 +214,7 @@ impl Editor {
         })?;
         let told = |told: Value| Ok(EditAnswer { told, scene: None });
         match ask {
-            Ask::Open => told(self.open()),
+            Ask::Open { kept } => told(self.open(kept)),
             Ask::Show { steps, view, t } => {
                 let camera = view.camera()?;
                 let (scene, done) = self.replayed(&steps)?;
@@ -224,6 +228,9 @@ impl Editor {
                 let bytes = self.bake(&scene, &quiet())?;
                 // Who asked again in the meantime wants to see that.
                 let newest = self.bakings.load(Ordering::SeqCst) == number;
+                if newest {
+                    self.lock().shown = steps;
+                }
                 Ok(EditAnswer { told: json!({ "stale": !newest }), scene: newest.then(|| bytes.into()) })
             }
             Ask::Save { steps } => self.save(steps).and_then(told),
@@ -254,14 +261,17 @@ impl Editor {
         }
     }
 
-    fn open(&self) -> Value {
+    fn open(&self, kept: Option<Vec<Step>>) -> Value {
+        let state = self.lock();
+        let stale = kept.as_ref().unwrap_or(&state.listed) != &state.shown;
         let scene = &self.source.scene;
         let mut layers: Vec<&str> = scene.layers.iter().map(|l| l.name.as_str()).collect();
         layers.dedup();
         let name = self.file.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
         json!({
-            "title": self.title, "file": name, "steps": self.listed.steps, "layers": layers, "clip": scene.clip,
-            "fps": scene.fps, "moving": scene.is_moving(), "gaussians": scene.len(),
+            "title": self.title, "file": name, "steps": state.listed, "layers": layers, "clip": scene.clip, "fps": scene.fps,
+            // Another page, or this one before it was loaded again, has changed the scene that pages get.
+            "stale": stale, "moving": scene.is_moving(), "gaussians": scene.len(),
             // A playback file's Gaussians are pieces of time, which no node carries through all of it.
             "drag": self.source.playback.is_none(), "floaters": self.source.run.is_some(),
         })
@@ -336,7 +346,8 @@ impl Editor {
         }
         editing::write(&self.file, &edits)?;
         state.saved = Some(files::read_text(&self.file)?);
-        Ok(json!({ "saved": edits.steps.len() }))
+        state.listed = edits.steps;
+        Ok(json!({ "saved": state.listed.len() }))
     }
 
     fn select(&self, text: &str, scene: &Scene<f32>) -> Result<Selected> {
@@ -690,7 +701,11 @@ mod tests {
         let scene = splat4d::format::playback::read(&baked.scene.unwrap()).unwrap();
         assert_eq!(scene.len(), 200);
         assert!(!bench.list().exists());
+        // A page that is loaded again has no list; one that kept it has that of the scene.
+        let stale = |kept: &Value| bench.ask(json!({"do": "open", "kept": kept}))["stale"].clone();
+        assert_eq!([stale(&Value::Null), stale(&steps)], [true, false]);
         bench.ask(json!({"do": "save", "steps": steps}));
+        assert_eq!(stale(&Value::Null), false);
         let edits = editing::read(&bench.list()).unwrap();
         assert_eq!((edits.scene.as_deref(), edits.steps.len()), (Some("balls"), 1));
         bench.ask(json!({"do": "save", "steps": []}));

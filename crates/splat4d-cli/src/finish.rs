@@ -24,6 +24,7 @@ use splat4d_train::eval::points::point_errors;
 use splat4d_train::eval::run::{EvalOptions, Measured, Scores, evaluate};
 use splat4d_train::eval::tracks::track_error;
 use splat4d_train::eval::trajectory::trajectory_error;
+use splat4d_train::path_text::in_command;
 use splat4d_train::recipe::{MotionName, Recipe};
 use splat4d_train::run::chunks::Chunked;
 use splat4d_train::run::{Stopwatch, capture_options, corrected};
@@ -178,7 +179,7 @@ impl Times {
             "{missing}: about {} are needed, and {} are left of --minutes. `splat4d eval {}` makes up for it.",
             human_seconds(seconds),
             human_seconds(left - kept),
-            run.display()
+            in_command(run)
         ));
         false
     }
@@ -472,8 +473,9 @@ fn flow(run: &Path, scene: &Scene<f32>, capture: &Capture, recipe: &Recipe, cons
 
 /// The report, and the scores on the console.
 pub(crate) fn write_report(run: &Path, console: &Console) -> anyhow::Result<()> {
+    write_page(run, console)?;
     say_scores(&Run::open(run)?, console);
-    write_page(run, console)
+    Ok(())
 }
 
 /// The report alone.
@@ -537,7 +539,7 @@ fn orbit(run: &Path, scene: &Scene<f32>, console: &Console) -> anyhow::Result<Pa
     let mp4 = have_ffmpeg();
     let (name, other, fps) =
         if mp4 { ("orbit.mp4", "orbit.png", ORBIT_FPS) } else { ("orbit.png", "orbit.mp4", ORBIT_FPS_PNG) };
-    let clock = Clock { from: scene.clip[0], to: scene.clip[1], freeze: None, slow_motion: None, fps };
+    let clock = Clock { from: scene.clip[0], to: scene.clip[1], freeze: None, slow_motion: None, seconds: None, fps };
     let size = (!mp4).then(|| small([stage.template.width, stage.template.height]));
     let shots = shots(&Route::Orbit, &clock, &views, &stage, size)?;
     let antialias = opened.recipe().is_ok_and(|r| r.appearance.antialias);

@@ -108,6 +108,7 @@ struct Cli {
 
 /// Options of every verb.
 #[derive(Debug, clap::Args)]
+#[command(next_help_heading = "Global options")]
 pub struct Globals {
     /// Print one JSON object per line (docs/events.md)
     #[arg(long, global = true)]

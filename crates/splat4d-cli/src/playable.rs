@@ -7,7 +7,7 @@ use crate::files::{self, cannot_read};
 use crate::run_folder::Run;
 use crate::source::{Source, not_empty};
 use splat4d::Result;
-use splat4d::format::playback::{EXTENSION, HEADER_BYTES, Index, MAGIC, OLD_EXTENSION};
+use splat4d::format::playback::{self, EXTENSION, HEADER_BYTES, Index, MAGIC, OLD_EXTENSION};
 use splat4d_serve::Content;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
@@ -52,10 +52,14 @@ impl Playable {
         Ok(Self { title, content: Content::Bytes(packed.bytes.into()) })
     }
 
-    /// The whole file.
+    /// The whole file. Errors: damaged anywhere.
     pub(crate) fn bytes(&self) -> Result<Vec<u8>> {
         match &self.content {
-            Content::File(path) => files::read(path),
+            Content::File(path) => {
+                let bytes = files::read(path)?;
+                playback::read(&bytes).map_err(|e| e.at(path.display()))?;
+                Ok(bytes)
+            }
             Content::Bytes(bytes) => Ok(bytes.to_vec()),
             _ => Ok(Vec::new()),
         }

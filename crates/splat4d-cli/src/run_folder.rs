@@ -14,6 +14,7 @@ use splat4d_train::output::{Found, Input, Mixes, OutputFolder, Owner, Request, S
 use splat4d_train::path_text::of_text;
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::checkpoint;
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 /// Files that mark a folder as a run.
@@ -141,17 +142,17 @@ impl Run {
     }
 
     fn read_metrics(&mut self, csv: &str) {
-        let mut lines = csv.lines();
-        let header: Vec<&str> = lines.next().unwrap_or_default().split(',').map(str::trim).collect();
-        let column = |name: &str| header.iter().position(|h| *h == name);
+        let mut table = csv::ReaderBuilder::new().flexible(true).trim(csv::Trim::All).from_reader(csv.as_bytes());
+        let Ok(header) = table.headers().cloned() else { return };
+        let column = |name: &str| header.iter().position(|h| h == name);
         let stages: Vec<(usize, &str)> =
             header.iter().enumerate().filter_map(|(i, h)| Some((i, h.strip_suffix("_ms")?))).collect();
         self.stages = stages.iter().map(|s| s.1.to_owned()).collect();
         let (iteration, loss, psnr, gaussians) =
             (column("iteration"), column("loss"), column("psnr"), column("gaussians"));
-        for line in lines {
-            let cells: Vec<f64> = line.split(',').map(|c| c.trim().parse().unwrap_or(f64::NAN)).collect();
-            let stage = column("stage").and_then(|i| line.split(',').nth(i)).unwrap_or_default().to_owned();
+        for line in table.records().flatten() {
+            let cells: Vec<f64> = line.iter().map(|c| c.parse().unwrap_or(f64::NAN)).collect();
+            let stage = column("stage").and_then(|i| line.get(i)).unwrap_or_default().to_owned();
             let get = |i: Option<usize>| i.and_then(|i| cells.get(i).copied()).unwrap_or(f64::NAN);
             self.metrics.push(Metrics {
                 iteration: get(iteration),
@@ -364,12 +365,21 @@ pub struct Asked {
     pub minutes: Option<f64>,
     /// Whether the time is foretold.
     pub predict: bool,
+    /// Folders elsewhere that the capture holds by links.
+    #[serde(skip)]
+    linked: BTreeSet<PathBuf>,
 }
 
 impl Asked {
     pub fn new(capture: &Path, recipe: &Recipe, minutes: Option<f64>, predict: bool) -> Self {
         let capture = capture.canonicalize().unwrap_or_else(|_| capture.to_owned());
-        Self { version: env!("CARGO_PKG_VERSION").into(), capture, recipe: recipe.to_toml(), minutes, predict }
+        let (version, recipe) = (env!("CARGO_PKG_VERSION").into(), recipe.to_toml());
+        Self { version, capture, recipe, minutes, predict, linked: BTreeSet::new() }
+    }
+
+    /// The same of an opened capture, whose linked folders hold no output either.
+    pub fn of(capture: &Capture, recipe: &Recipe, minutes: Option<f64>, predict: bool) -> Self {
+        Self { linked: capture.linked_folders(), ..Self::new(&capture.root, recipe, minutes, predict) }
     }
 
     /// Of a run that ended before its first checkpoint, so that there is nothing else to continue from.
@@ -385,7 +395,8 @@ impl Asked {
     /// Takes the folder of the run for a new training or the rest of one. What is there of one that took no step is removed.
     pub fn begin(&self, run: &Path, force: bool, command: &str) -> Result<(OutputFolder, Found)> {
         let asked = serde_json::to_string(self).expect("it is plain data");
-        let inputs = [Input::new(&self.capture, "the capture")];
+        let linked = self.linked.iter().map(|folder| Input::new(folder, "a folder of the capture's images,"));
+        let inputs: Vec<Input<'_>> = std::iter::once(Input::new(&self.capture, "the capture")).chain(linked).collect();
         let request = Request { command, inputs: &inputs, asked: &asked, force, mixes: Mixes::Anything };
         let (folder, found) = OutputFolder::begin(run, &request)?;
         if found == Found::Unfinished && checkpoint::list(run).is_empty() {

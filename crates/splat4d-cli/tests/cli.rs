@@ -76,6 +76,10 @@ fn help_teaches_and_completions_complete() {
         let own = splat4d(&[verb, "--help"]).run().ok();
         assert!(own.contains("Examples:") && own.contains(&format!("splat4d {verb}")), "{verb} --help teaches nothing");
     }
+    // Options of every verb stand under their own heading, behind the verb's.
+    let own = splat4d(&["predict", "--help"]).run().ok();
+    let (of_verb, global) = own.split_once("Global options:").expect("a heading");
+    assert!(of_verb.contains("--horizon") && !of_verb.contains("--threads") && global.contains("--threads"), "{own}");
     let knobs = splat4d(&["train", "--help-knobs"]).run().ok();
     for knob in ["position_lr_init", "densify_until_iter", "lambda_dssim", "densify.max_cap"] {
         assert!(knobs.contains(knob), "{knob} is missing");
@@ -138,6 +142,10 @@ fn a_capture_becomes_a_run_and_everything_follows() {
     let run = work.path().join("run");
     let said = train(&capture, &run).ok();
     assert!(said.contains("PSNR") && said.contains("report.html"), "{said}");
+    // The scores are the last line but one, the next command is the last.
+    let lines: Vec<&str> = said.lines().collect();
+    assert_eq!(lines[lines.len() - 1], format!("next: splat4d view {}", run.display()));
+    assert!(lines[lines.len() - 2].starts_with("held-out views: PSNR"), "{said}");
     for file in [
         "recipe.toml",
         "run.json",
@@ -635,6 +643,9 @@ fn a_playback_file_is_told_exported_and_refused_when_damaged() {
     std::fs::write(&spoilt, &bytes).unwrap();
     let told = splat4d(&["info", str(&spoilt)]).run().refused();
     assert!(told.contains("checksum") && told.contains("spoilt.s4d"), "{told}");
+    let page = work.path().join("page.html");
+    let told = splat4d(&["export", str(&spoilt), "-o", str(&page)]).run().refused();
+    assert!(told.contains("checksum") && !page.exists(), "{told}");
 
     // What a file is called is shown, and no terminal obeys it.
     #[cfg(unix)]

@@ -16,8 +16,9 @@ usage: fuzz [--minutes N | --seconds N] [--executions N] [--seed S] [--reader NA
   --seed S         other inputs (default 1)
   --reader NAME    this reader alone";
 
-/// Address space of a process, kB: what threads and libraries take, and 1 GiB for the reader.
-const MEMORY: u64 = 3 << 20;
+/// Address space of a process, kB: 1 GiB for the reader, and 128 MiB for the program, its seeds and its threads (16 to 20 MiB
+/// measured).
+const MEMORY: u64 = (1 << 20) + (128 << 10);
 /// A reader that takes longer for one input hangs.
 const SLOWEST: Duration = Duration::from_secs(10);
 /// Inputs between two looks at the clock.

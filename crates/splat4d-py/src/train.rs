@@ -58,7 +58,7 @@ pub(crate) fn train(
     listener.drive(py, options, |options, listen| {
         let capture = open_capture(&path, &recipe)?;
         let run = out.unwrap_or_else(|| run_folder::free_folder(&run_folder::usual_folder(&capture.name)));
-        let asked = run_folder::Asked::new(&capture.root, &recipe, minutes, false);
+        let asked = run_folder::Asked::of(&capture, &recipe, minutes, false);
         let (folder, found) = asked.begin(&run, false, "train (Python)")?;
         let stop = &listener.raised.stop;
         let mut hear = |event: &Event| {

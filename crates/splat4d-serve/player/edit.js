@@ -140,8 +140,10 @@ export class Editing {
   }
 
   async #open() {
-    this.about = await this.ask({ do: 'open' });
+    const kept = this.#kept(s => JSON.parse(s.getItem(this.#keptAs)));
+    this.about = await this.ask({ do: 'open', ...(kept && { kept: ready(kept) }) });
     this.history = new History(this.about.steps);
+    if (kept) this.history.push(kept);
     this.overlay = new Overlay(this.player);
     const sheet = new CSSStyleSheet();
     sheet.replaceSync(STYLE);
@@ -151,6 +153,16 @@ export class Editing {
     this.#listen();
     this.refresh();
     this.toggle(true);
+    // The scene that was loaded is of another list: another page's, or one that was not saved.
+    if (this.about.stale) this.#apply();
+  }
+
+  /** Edits that are not saved outlive a reload of this tab, and nothing else. */
+  get #keptAs() { return `splat4d-edits-${this.token}`; }
+  #kept(f) { try { return f(sessionStorage); } catch { return null; /* Storage may be shut. */ } }
+  #keep() {
+    const { dirty } = this.history;
+    this.#kept(s => (dirty ? s.setItem(this.#keptAs, JSON.stringify(this.steps)) : s.removeItem(this.#keptAs)));
   }
 
   #build() {
@@ -284,6 +296,7 @@ export class Editing {
     this.undoTool.disabled = !history.undoable;
     this.redoTool.disabled = !history.redoable;
     this.saveTool.disabled = !history.dirty;
+    this.#keep();
     this.#numbers(this.overlay.box = this.active < 0 && this.open ? boxOf(this.text) : null);
     this.overlay.redraw();
     this.list.hidden = !this.steps.length;

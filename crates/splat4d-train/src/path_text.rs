@@ -20,6 +20,14 @@ pub fn of_text(text: &str) -> PathBuf {
     text.strip_prefix(BYTES).and_then(of_escaped).unwrap_or_else(|| PathBuf::from(text))
 }
 
+/// The path as a word of a command that a POSIX shell takes as it is: quoted where it must be.
+pub fn in_command(path: &Path) -> String {
+    let text = path.to_string_lossy();
+    let plain = |c: char| c.is_alphanumeric() || "/._-+=:,@%".contains(c);
+    let text = if text.starts_with('-') { format!("./{text}") } else { text.into_owned() };
+    if !text.is_empty() && text.chars().all(plain) { text } else { format!("'{}'", text.replace('\'', r"'\''")) }
+}
+
 /// For `#[serde(with = "…::path_text")]`: text that comes back as the same path.
 pub fn serialize<S: Serializer>(path: &Path, to: S) -> Result<S::Ok, S::Error> {
     to.serialize_str(&to_text(path))
@@ -77,6 +85,20 @@ pub fn of_escaped(line: &str) -> Option<PathBuf> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn paths_are_words_of_commands() {
+        for (path, word) in [
+            ("runs/a-1.s4d", "runs/a-1.s4d"),
+            ("my take/ü", "'my take/ü'"),
+            ("it's", r"'it'\''s'"),
+            ("-x y", "'./-x y'"),
+            ("", "''"),
+            ("$(rm)", "'$(rm)'"),
+        ] {
+            assert_eq!(in_command(Path::new(path)), word);
+        }
+    }
 
     #[test]
     fn paths_come_back_as_they_were() {

@@ -78,6 +78,8 @@ pub(crate) struct Clock {
     pub freeze: Option<f64>,
     /// How many times slower than life; `None`: as the route likes.
     pub slow_motion: Option<f64>,
+    /// Length of the film, in place of `slow_motion`; `None`: as the route likes.
+    pub seconds: Option<f64>,
     /// Frames a second of the film.
     pub fps: f64,
 }
@@ -97,7 +99,7 @@ const MAX_FRAMES: f64 = 200_000.0;
 impl Clock {
     /// Seconds of film when the scene plays by itself.
     fn playing(&self) -> f64 {
-        (self.to - self.from) * self.slow_motion.unwrap_or(1.0)
+        self.seconds.unwrap_or((self.to - self.from) * self.slow_motion.unwrap_or(1.0))
     }
 
     /// The scene's second, `share` (0 to 1) of the way through the film.
@@ -125,10 +127,14 @@ pub(crate) fn shots(
     size: Option<[usize; 2]>,
 ) -> Result<Vec<Shot>> {
     let fit = |camera: &Camera| size.map_or_else(|| camera.clone(), |s| resized(camera, s));
+    if clock.seconds.is_some() && !matches!(route, Route::Orbit | Route::Camera(_)) {
+        return Err(Error::input("--seconds sets the length of an orbit or of the film of one camera")
+            .remedy("Leave it out: views and key frames have times of their own."));
+    }
     match route {
         Route::Orbit => {
-            let seconds = match (clock.freeze, clock.slow_motion) {
-                (None, Some(_)) => clock.playing(),
+            let seconds = match (clock.seconds, clock.freeze, clock.slow_motion) {
+                (Some(_), ..) | (None, None, Some(_)) => clock.playing(),
                 _ => orbit_seconds(clock.playing()),
             };
             let frames = clock.frames(seconds)?;
@@ -166,7 +172,8 @@ pub(crate) fn shots(
             let Some(view) = views.iter().find(|v| v.name == *name) else {
                 return Err(Error::input(format!("the data set has no camera `{name}`")).remedy(known_cameras(views)));
             };
-            let seconds = if clock.freeze.is_some() { 1.0 / clock.fps } else { clock.playing() };
+            let still = clock.freeze.is_some() && clock.seconds.is_none();
+            let seconds = if still { 1.0 / clock.fps } else { clock.playing() };
             // One frame more, so that both ends of the range are shown at the film's own frame times.
             let frames = clock.frames(seconds)? + usize::from(clock.freeze.is_none() && clock.to > clock.from);
             let last = (frames - 1).max(1) as f64;
@@ -243,7 +250,7 @@ mod tests {
     }
 
     fn clock() -> Clock {
-        Clock { from: 0.0, to: 1.0, freeze: None, slow_motion: None, fps: 10.0 }
+        Clock { from: 0.0, to: 1.0, freeze: None, slow_motion: None, seconds: None, fps: 10.0 }
     }
 
     #[test]
@@ -259,6 +266,11 @@ mod tests {
         assert_eq!(times(&frozen, Route::Test), [0.3]);
         let playing = times(&Clock { slow_motion: Some(2.0), ..clock() }, Route::Camera("b".into()));
         assert_eq!((playing.len(), playing[0], playing[20]), (21, 0.0, 1.0));
+        let short = Clock { seconds: Some(0.5), ..clock() };
+        assert_eq!(times(&short, Route::Camera("b".into())).len(), 6, "both ends of the range are shown");
+        let orbit = times(&short, Route::Orbit);
+        assert_eq!((orbit.len(), orbit[0], orbit[4]), (5, 0.0, 1.0), "shorter than an orbit is by itself");
+        assert!(shots(&Route::Test, &short, &views, &stage, None).unwrap_err().to_string().contains("--seconds"));
         let message = shots(&Route::Camera("c".into()), &clock(), &views, &stage, None).unwrap_err().to_string();
         assert!(message.contains("a, b"), "{message}");
         assert!(shots(&Route::Test, &Clock { from: 2.0, to: 3.0, ..clock() }, &views, &stage, None).is_err());

@@ -15,6 +15,7 @@ use chart::{Series, bars, escape, lines, short};
 pub(crate) use refined::refined_in_words;
 use serde_json::Value;
 use splat4d::Result;
+use splat4d_train::path_text::in_command;
 use std::fmt::Write;
 use std::path::PathBuf;
 
@@ -360,9 +361,9 @@ fn again(out: &mut String, run: &Run) {
     if let Some(capture) = run.capture() {
         let _ = writeln!(
             lines,
-            "splat4d train {} --recipe {}/recipe.toml -o NEW_RUN",
-            capture.display(),
-            run.path.display()
+            "splat4d train {} --recipe {} -o NEW_RUN",
+            in_command(&capture),
+            in_command(&run.path.join("recipe.toml"))
         );
     }
     for (key, name) in [

@@ -86,5 +86,6 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         files::write(path, serde_json::to_string_pretty(&report)?.as_bytes())?;
         console.written(path);
     }
+    console.next("view", out);
     Ok(())
 }

@@ -8,6 +8,7 @@ use crate::paths::parse_size;
 use crate::run_folder::{self, Run};
 use splat4d::{Error, Result};
 use splat4d_train::compress::{Compression, Level, MOST_PRUNED};
+use splat4d_train::path_text::in_command;
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
@@ -98,7 +99,7 @@ fn begin(args: &Args, console: &Console) -> anyhow::Result<Work> {
     if !Run::is_finished(source) {
         return Err(Error::input("the run is unfinished")
             .at(source.display())
-            .remedy(format!("Finish it first: splat4d train --resume {}", source.display()))
+            .remedy(format!("Finish it first: splat4d train --resume {}", in_command(source)))
             .into());
     }
     let iterations = run.iteration().or_else(|| run.recipe().ok().map(|r| r.run.iterations)).unwrap_or(1);

@@ -168,7 +168,9 @@ impl Target {
             Some("safetensors") => return Ok(Self::Scene),
             Some(playback::EXTENSION | playback::OLD_EXTENSION) => return Ok(Self::Playback),
             Some("ksplat" | "glb" | "4dgs") => ("this format is not written", "Write .ply or .spz.".into()),
-            _ => ("has no ending that names a format", format!("Use {}.", written(|_| true).join(" "))),
+            _ => {
+                ("has no ending that names a format", format!("Use {} .safetensors .s4d.", written(|_| true).join(" ")))
+            }
         };
         Err(Error::new(ErrorKind::Unsupported, what).at(path.display()).remedy(remedy))
     }

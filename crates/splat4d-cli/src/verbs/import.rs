@@ -177,6 +177,10 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         Some(doctor::made(&capture, &folder.join("import"), console)?)
     };
     told(&report, looked.as_ref(), console);
+    if report.cameras.len() > 1 && args.rig != "moving" {
+        console.say("all cameras train; to measure new views, hold one out: --hold-out camera=NAME");
+    }
+    console.next("train", folder);
     Ok(())
 }
 

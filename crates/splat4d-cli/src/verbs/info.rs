@@ -19,7 +19,7 @@ use splat4d::text::in_line;
 use splat4d_train::capture::{self, Aspect, Capture, Finding, Frame, Reach, Severity, Timing};
 use splat4d_train::event::Event;
 use splat4d_train::output::{Input, check_apart};
-use splat4d_train::path_text::to_text;
+use splat4d_train::path_text::{in_command, to_text};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::chunks::Outlook;
 use splat4d_train::run::{Stopwatch, memory_estimate, open_capture};
@@ -132,7 +132,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         let _ = writeln!(told.text, "! {}", in_line(trouble));
     }
     let verdict = if healthy { "looks healthy" } else { "does not look healthy, see above" };
-    console.result(&format!("{}{verdict}", told.text));
+    console.report(&format!("{}{verdict}", told.text), healthy);
     Ok(())
 }
 
@@ -328,7 +328,7 @@ fn of_run(path: &Path) -> anyhow::Result<Told> {
         &format!("{state}, step {} of {}", grouped(done), grouped(total.unwrap_or(0.0) as usize)),
     );
     if !finished {
-        troubles.push(format!("It is unfinished: splat4d train --resume {} continues it.", path.display()));
+        troubles.push(format!("It is unfinished: splat4d train --resume {} continues it.", in_command(path)));
     }
     if let Some(seconds) = run.number("seconds") {
         line(&mut text, "time", &human_seconds(seconds));

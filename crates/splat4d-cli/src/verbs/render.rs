@@ -60,7 +60,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "PATH", help_heading = "Camera")]
     path: Option<Route>,
     /// One image from this camera (JSON)
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["path", "from", "to", "slow_motion", "fps", "size"],
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["path", "from", "to", "slow_motion", "seconds", "fps", "size"],
         help_heading = "Camera")]
     camera: Option<PathBuf>,
     /// Image size [default: the training cameras']
@@ -79,6 +79,9 @@ pub(crate) struct Args {
     /// Slow-motion factor
     #[arg(long, value_name = "F", value_parser = factor, help_heading = "Time")]
     slow_motion: Option<f64>,
+    /// Length of the film: the time range is stretched to it
+    #[arg(long, value_name = "S", value_parser = length, conflicts_with = "slow_motion", help_heading = "Time")]
+    seconds: Option<f64>,
     /// Frames per second of the film [default: 30, or the key frame file's]
     #[arg(long, value_name = "N", value_parser = fps, help_heading = "Time")]
     fps: Option<f64>,
@@ -214,6 +217,7 @@ fn film(args: &Args, path: &Path, console: &Console) -> anyhow::Result<()> {
         to: args.to.unwrap_or(scene.clip[1]),
         freeze: args.freeze,
         slow_motion: args.slow_motion,
+        seconds: args.seconds,
         fps: args.fps.or(told).unwrap_or(FPS),
     };
     if clock.to < clock.from {
@@ -351,6 +355,13 @@ fn factor(text: &str) -> Result<f64, String> {
     match number(text) {
         Ok(f) if (0.001..=1000.0).contains(&f) => Ok(f),
         _ => Err("give a factor from 0.001 to 1000; 4 is four times slower than life".into()),
+    }
+}
+
+fn length(text: &str) -> Result<f64, String> {
+    match number(text) {
+        Ok(s) if (0.01..=36_000.0).contains(&s) => Ok(s),
+        _ => Err("give the film's length in seconds, 0.01 to 36000".into()),
     }
 }
 

@@ -15,6 +15,7 @@ use splat4d_import::shipped;
 use splat4d_train::capture::{Capture, Severity, Timing};
 use splat4d_train::event::{Event, Progress};
 use splat4d_train::output::{Found, OutputFolder, Owner};
+use splat4d_train::path_text::in_command;
 use splat4d_train::recipe::{MotionName, Quality, Recipe};
 use splat4d_train::run::chunks::{Chunked, Outlook, look_ahead};
 use splat4d_train::run::{self, Outcome, Stopwatch, TrainOptions};
@@ -231,7 +232,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         // Of a long take no more is listed than tells that it is one.
         let capture = Arc::new(open_frames(&source, &recipe, look_ahead(&recipe))?);
         let output = again.as_ref().map(|(run, _)| run).or(args.output.as_ref());
-        let asked = Asked::new(&capture.root, &recipe, minutes, predict);
+        let asked = Asked::of(&capture, &recipe, minutes, predict);
         let place = || place(args, output, &capture, &asked, console);
         // A take that is not told to be cut keeps to its minutes at once.
         let at_once = minutes.is_some() && recipe.chunks.frames == 0;
@@ -333,7 +334,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             ErrorKind::Interrupted,
             format!("training was stopped after step {} and saved", outcome.iteration),
         )
-        .remedy(format!("Continue with: splat4d train --resume {}", run.display()))
+        .remedy(format!("Continue with: splat4d train --resume {}", in_command(&run)))
         .into());
     }
     console.say(&format!("wrote {}", run.join("scene.safetensors").display()));
@@ -352,6 +353,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     }
     folder.finished();
     watch.show(&run, outcome.iteration);
+    console.next("view", &run);
     console.emit(&json!({"type": "done", "run": run.to_string_lossy()}));
     if watch.is_on() && console.terminal() {
         console.say("the player stays until Ctrl-C");
@@ -385,7 +387,7 @@ fn in_chunks(
     console.clear();
     if outcome?.is_some_and(|o| o.interrupted) {
         return Err(Error::new(ErrorKind::Interrupted, "training was stopped and saved")
-            .remedy(format!("Continue with: splat4d train --resume {}", run.display()))
+            .remedy(format!("Continue with: splat4d train --resume {}", in_command(run)))
             .into());
     }
     match args.chunk {
@@ -395,6 +397,7 @@ fn in_chunks(
             let _owner = Owner::wait(run, JOIN, &mut |_| !stop.load(Ordering::Relaxed))?;
             let deadline = Deadline::of(clock, args.minutes);
             chunked::join(run, chunked, args.no_eval, &args.measure, &deadline, stop, console)?;
+            console.next("view", run);
             console.emit(&json!({"type": "done", "run": run.to_string_lossy()}));
         }
     }
@@ -481,7 +484,7 @@ fn place(
     let run = run_folder::free_folder(&wanted);
     if run != wanted {
         let hint = if Run::is(&wanted) && !Run::is_finished(&wanted) {
-            format!(" (it is unfinished: --resume {} would continue it)", wanted.display())
+            format!(" (it is unfinished: --resume {} would continue it)", in_command(&wanted))
         } else {
             String::new()
         };

@@ -133,6 +133,17 @@ fn no_output_replaces_what_is_read() {
     splat4d(&["export", str(&ply), "-o", str(&page)]).run().ok();
     assert!(std::fs::read(&page).unwrap().starts_with(b"<!doctype html>"), "a page");
     splat4d(&["convert", str(&ply), str(&at("frames/1.ply"))]).run().ok();
+    // Images that the capture holds by a link are as much its own.
+    #[cfg(unix)]
+    {
+        let capture = Capture::new(&at("linked")).write();
+        std::fs::rename(capture.join("images"), at("images")).unwrap();
+        std::os::unix::fs::symlink(at("images"), capture.join("images")).unwrap();
+        for output in ["images", "images/new"] {
+            let said = splat4d(&["train", str(&capture), "-o", str(&at(output))]).args(&TINY).run().refused();
+            assert!(said.contains("a folder of the capture's images"), "{said}");
+        }
+    }
 }
 
 #[test]

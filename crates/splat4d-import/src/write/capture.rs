@@ -47,7 +47,7 @@ pub struct Take {
     pub up: Option<[f64; 3]>,
     /// The initial cloud, from the folder on.
     pub points: Option<PathBuf>,
-    /// Cameras that are kept from training.
+    /// Cameras that are kept from training. None: of a rig of fixed cameras all train, because each was placed with care.
     pub hold_out: Vec<String>,
     /// Anything else for those who read the file; training does not.
     pub extra: Map<String, Value>,
@@ -79,8 +79,11 @@ pub fn capture(folder: &Path, take: &Take, cameras: &[Placed]) -> Result<PathBuf
     if let Some(points) = &take.points {
         set("points", json!(points.to_string_lossy().replace('\\', "/")));
     }
+    let is_rig = cameras.len() > 1 && cameras.iter().all(|c| matches!(c.poses, Poses::Fixed(_)));
     if !take.hold_out.is_empty() {
         set("hold_out", json!({"cameras": take.hold_out}));
+    } else if is_rig {
+        set("hold_out", json!("none"));
     }
     if !take.extra.is_empty() {
         set("extra", Value::Object(take.extra.clone()));

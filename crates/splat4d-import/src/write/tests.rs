@@ -201,6 +201,11 @@ fn the_capture_is_read_as_it_was_meant() {
     let (found, truth) = (read.frames[20 + 4].source.cam_from_world, pose(1.4));
     let off = found.rotation.iter().flatten().zip(truth.rotation.iter().flatten()).map(|(a, b)| (a - b).abs());
     assert!(off.fold(0.0, f64::max) < 1e-12 && found.translation == truth.translation);
+    // All cameras of a fixed rig train.
+    let rig = [cameras[0].clone(), Placed { poses: Poses::Fixed(pose(1.0)), ..cameras[1].clone() }];
+    capture(out.path(), &Take::default(), &rig).unwrap();
+    let all = Capture::open(out.path(), &CaptureOptions::default()).unwrap();
+    assert_eq!((all.train.len(), all.held.len()), (all.frames.len(), 0));
     let picture = ImageStore::new(Arc::clone(&read), 0).load(2).unwrap().to_picture();
     assert_eq!((picture.color.width, picture.color.height), (32, 24));
     if let Poses::Moving(all) = &mut cameras[1].poses {

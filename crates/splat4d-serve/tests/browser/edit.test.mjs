@@ -268,11 +268,41 @@ test('without the token a page only looks, and other origins cannot ask', option
   await foreign.close();
 });
 
+test('after a reload unsaved edits are in the list; another page begins with what is saved', options, async () => {
+  const url = await view(KNIGHT, path.join(work, 'kept.toml'));
+  const e = await edit(url), { page, panel } = e, whole = await e.gaussians();
+  page.on('dialog', (d) => d.accept());
+  assert.equal(await panel.getByRole('button', { name: 'Delete', exact: true }).getAttribute('title'), 'Select something first');
+  await panel.getByRole('button', { name: 'Speed', exact: true }).click();
+  assert.match(await page.evaluate(() => document.querySelector('splat-4d').face.editing.text), /^speed\(/);
+  const area = panel.getByLabel('Selection in words');
+  await area.fill('box(-99,-99,-99, 0,99,99)');
+  await area.blur();
+  await page.waitForFunction(() => /Gaussians/.test(document.querySelector('splat-4d').shadowRoot.querySelector('.said').textContent));
+  await e.act('Delete');
+  await e.idle();
+  const less = await e.gaussians();
+  assert.ok(less < whole);
+  await page.reload();
+  await panel.waitFor({ timeout: PATIENCE });
+  await e.idle();
+  assert.deepEqual([await e.gaussians(), (await e.steps()).length, await panel.getByRole('listitem').count()], [less, 1, 1]);
+  // Another tab has no part in it, and gets the scene of the saved list.
+  const other = await edit(url);
+  await other.idle();
+  assert.deepEqual([await other.gaussians(), await other.steps()], [whole, []]);
+  await other.page.close();
+  await page.keyboard.press('Control+z');
+  await e.idle();
+  assert.deepEqual([await e.gaussians(), await e.steps()], [whole, []]);
+  assert.deepEqual([e.errors, other.errors], [[], []]);
+  await page.close();
+});
+
 test('the box of a selection has numbers and faces that can be pulled', options, async () => {
   const e = await edit(await view(KNIGHT, path.join(work, 'box.toml'))), { page, panel } = e;
   const area = panel.getByLabel('Selection in words'), text = () => page.evaluate(() => document.querySelector('splat-4d').face.editing.text);
   assert.equal(await panel.getByRole('group', { name: 'Box' }).isVisible(), false);
-  assert.equal(await panel.getByRole('button', { name: 'Delete', exact: true }).getAttribute('title'), 'Select something first');
   await area.fill('box(-1,0,-1, 1,2,1)');
   await area.blur();
   await e.idle();

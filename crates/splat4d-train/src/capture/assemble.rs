@@ -175,8 +175,9 @@ fn check_frame(frame: &mut RawFrame, camera: &str, options: &CaptureOptions) -> 
     let source = &mut frame.source;
     pose::check_intrinsics(&source.intrinsics, source.width, source.height).map_err(place)?;
     source.cam_from_world = pose::checked(source.cam_from_world).map_err(place)?;
-    if !frame.time.is_finite() {
-        return Err(place(Error::input("its time is not finite").remedy("Give its time in seconds.")));
+    if frame.time.is_nan() || frame.time.abs() > pose::LATEST {
+        let what = format!("its time is {} s", pose::short(frame.time));
+        return Err(place(Error::input(what).remedy("Give its time in seconds from the start of the clip.")));
     }
     if source.width < options.downscale || source.height < options.downscale {
         let what =

@@ -186,7 +186,7 @@ fn unknown_layout(root: &Path, named: &Path) -> Error {
     }
     let markers: Vec<&str> = READERS.iter().map(|(marker, _)| *marker).collect();
     Error::input(format!("is not a capture: none of {} is there", markers.join(", "))).at(named.display()).remedy(
-        stray::advice(root).unwrap_or_else(|| {
+        stray::advice(root, named).unwrap_or_else(|| {
             "Write a capture.json with your cameras (docs/capture-format.md), or give the folder of a known layout."
                 .into()
         }),

@@ -72,8 +72,9 @@ use splat4d::Result;
 use splat4d::math::se3::{norm, sub};
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, Time};
+use std::collections::BTreeSet;
 use std::ops::Range;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 use std::sync::Arc;
 
 /// Which layout a capture was read from.
@@ -338,6 +339,21 @@ impl Capture {
     pub fn open(path: &Path, options: &CaptureOptions) -> Result<Self> {
         options.check()?;
         assemble::assemble(layout::read(path, options)?, options)
+    }
+
+    /// Real folders outside of its own that it holds by links, as `images` often is.
+    pub fn linked_folders(&self) -> BTreeSet<PathBuf> {
+        let files = self.frames.iter().flat_map(|f| {
+            let priors = [f.depth.as_ref().map(|d| &d.path), f.flow.as_ref().map(|f| &f.path)];
+            let others = [f.mask.as_ref(), f.labels.as_ref(), f.features.as_ref()];
+            std::iter::once(&f.image).chain(priors.into_iter().chain(others).flatten())
+        });
+        let held = |p: &&Path| p.starts_with(&self.root) && !p.components().any(|c| c == Component::ParentDir);
+        let folders = files.filter_map(|file| file.parent()).filter(held);
+        let below_root = folders.flat_map(|p| p.ancestors().take_while(|above| *above != self.root));
+        let named: BTreeSet<&Path> = below_root.collect();
+        let Ok(root) = self.root.canonicalize() else { return BTreeSet::new() };
+        named.into_iter().filter_map(|p| p.canonicalize().ok()).filter(|p| !p.starts_with(&root)).collect()
     }
 
     /// The first and last time of all frames, seconds.

@@ -1,6 +1,7 @@
 //! Initial point clouds.
 
 use super::json::read_bytes;
+use super::pose::FARTHEST;
 use rayon::prelude::*;
 use splat4d::Result;
 use splat4d::format::ply;
@@ -8,10 +9,6 @@ use std::path::Path;
 
 /// Colour of points that have none.
 const GREY: f32 = 0.5;
-
-/// Farthest coordinate of a point that is believed, scene units: sums of squares and cubes of it still fit 32-bit floats.
-/// Metres of a map are a hundred thousand times smaller.
-const FARTHEST: f64 = 1e12;
 
 /// Reads the points of a .ply file with their colours and, where it says them, their times.
 pub(super) fn read_ply(path: &Path) -> Result<PointCloud> {

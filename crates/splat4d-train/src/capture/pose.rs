@@ -12,6 +12,14 @@ const MAX_SHEAR: f64 = 0.02;
 const POLAR_STEPS: usize = 4;
 /// Longest side of a picture, pixels: twice the largest sensors in use.
 pub(super) const MAX_SIDE: usize = 1 << 15;
+/// Farthest coordinate of a camera or a point that is accepted, scene units: sums of squares and cubes of it still fit 32-bit
+/// floats. Metres of a map are a hundred thousand times smaller.
+pub(super) const FARTHEST: f64 = 1e12;
+/// Shortest and longest focal length that is accepted, and farthest principal point, pixels: their products with
+/// [`FARTHEST`] and their reciprocals stay finite in 32-bit floats.
+const FOCAL: std::ops::RangeInclusive<f64> = 1e-3..=1e9;
+/// Latest time of an image that is accepted, seconds (thirty thousand years): frames of it are still told apart.
+pub(super) const LATEST: f64 = 1e12;
 /// Most pixels of a picture (134 million): decoding one takes below 1 GiB.
 pub(super) const MAX_PIXELS: usize = 1 << 27;
 
@@ -20,6 +28,10 @@ pub(super) fn checked(pose: Se3) -> Result<Se3> {
     let finite = pose.rotation.iter().flatten().chain(&pose.translation).all(|x| x.is_finite());
     if !finite {
         return Err(Error::input("the pose holds NaN or infinity")
+            .remedy("Calibrate that camera again or leave its frames out."));
+    }
+    if let Some(far) = pose.translation.iter().find(|x| x.abs() > FARTHEST) {
+        return Err(Error::input(format!("invalid pose: a coordinate is {far:e}, beyond {FARTHEST:e}"))
             .remedy("Calibrate that camera again or leave its frames out."));
     }
     if pose.det() < 0.0 {
@@ -50,15 +62,20 @@ fn nearest_rotation(mut r: [[f64; 3]; 3]) -> [[f64; 3]; 3] {
 /// Checks focal lengths, principal point and size.
 pub(super) fn check_intrinsics(k: &Intrinsics, width: usize, height: usize) -> Result<()> {
     let [fx, fy] = [k.fx, k.fy];
-    if !(fx.is_finite() && fy.is_finite() && fx > 0.0 && fy > 0.0) {
-        return Err(Error::input(format!("the focal length is {fx} x {fy}"))
+    if ![fx, fy].iter().all(|f| FOCAL.contains(f)) {
+        return Err(Error::input(format!("the focal length is {} x {}", short(fx), short(fy)))
             .remedy("Give focal lengths in pixels, above zero."));
     }
-    if !(k.cx.is_finite() && k.cy.is_finite()) {
-        return Err(Error::input(format!("the principal point is {} {}", k.cx, k.cy))
+    if ![k.cx, k.cy].iter().all(|c| c.abs() <= *FOCAL.end()) {
+        return Err(Error::input(format!("the principal point is {} {}", short(k.cx), short(k.cy)))
             .remedy("Give it in pixels; the middle of the image is width/2, height/2."));
     }
     check_size(width, height)
+}
+
+/// A number in a message: not three hundred digits of one that is absurd.
+pub(super) fn short(x: f64) -> String {
+    if x == 0.0 || (1e-3..1e9).contains(&x.abs()) { x.to_string() } else { format!("{x:e}") }
 }
 
 /// Checks that a picture of this size can be handled at all.
@@ -91,5 +108,26 @@ mod tests {
         let mut nan = good;
         nan.translation[1] = f64::NAN;
         assert!(checked(nan).unwrap_err().to_string().contains("NaN"));
+    }
+
+    #[test]
+    fn cameras_that_cannot_be_computed_with_are_refused() {
+        let good = Se3::look_at([1.0, 2.0, 3.0], [0.0; 3], [0.0, 0.0, 1.0]);
+        for far in [1e13, -1e39, 1e308] {
+            let mut pose = good;
+            pose.translation[0] = far;
+            assert!(checked(pose).unwrap_err().to_string().contains(&format!("a coordinate is {far:e}")));
+        }
+        let k = Intrinsics { fx: 50.0, fy: 50.0, cx: 16.0, cy: 12.0 };
+        assert!(check_intrinsics(&k, 32, 24).is_ok());
+        for fx in [0.0, -1e308, 1e-320, 1e39, f64::NAN, f64::INFINITY] {
+            let text = check_intrinsics(&Intrinsics { fx, ..k }, 32, 24).unwrap_err().to_string();
+            assert!(text.contains("focal length") && text.len() < 120, "{text}");
+        }
+        for cy in [-1e308, 1e39, f64::NAN] {
+            assert!(
+                check_intrinsics(&Intrinsics { cy, ..k }, 32, 24).unwrap_err().to_string().contains("principal point")
+            );
+        }
     }
 }

@@ -2,6 +2,7 @@
 //! other names, images and videos without poses.
 
 use super::{colmap, layout, lookup, rig, sequence};
+use crate::path_text::in_command;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -18,8 +19,9 @@ const HEAD: u64 = 1 << 16;
 /// Folders that are looked into for a capture.
 const MOST_FOLDERS: usize = 100;
 
-/// What to do with a folder that is no capture, by what it holds. `None`: it holds nothing that is known.
-pub(super) fn advice(root: &Path) -> Option<String> {
+/// What to do with a folder that is no capture, which the user called `named`, by what it holds. `None`: it holds nothing
+/// that is known.
+pub(super) fn advice(root: &Path, named: &Path) -> Option<String> {
     let names = rig::file_names(root);
     let folders = || names.iter().map(|n| root.join(n)).filter(|p| p.is_dir()).take(MOST_FOLDERS);
     if let Some(inner) = folders().find(|folder| layout::is_capture(folder)) {
@@ -41,14 +43,18 @@ pub(super) fn advice(root: &Path) -> Option<String> {
     }
     if let Some(video) = first_video(root) {
         return Some(format!(
-            "It holds videos, but no camera poses that are known here. Make a capture of them with `splat4d import`, which \
-             finds clocks and poses, or reads a calibration that you have (docs/filming.md); or extract frames with `{}` and \
-             write a capture.json (examples/rig_from_calibration.py, docs/capture-format.md).",
+            "It holds videos, but no camera poses that are known here. Make a capture of them with `splat4d import {} -o TAKE`, \
+             which finds clocks and poses, or reads a calibration that you have (docs/filming.md); or extract frames with `{}` \
+             and write a capture.json (docs/capture-format.md).",
+            in_command(named),
             ffmpeg_command(&video)
         ));
     }
-    let reconstruct = "reconstruct them with COLMAP (`colmap automatic_reconstructor`) and give its folder; `splat4d import` \
-                       finds poses of videos and of folders of frames (docs/filming.md)";
+    let reconstruct = format!(
+        "make a capture of them with `splat4d import {} -o TAKE` (docs/filming.md), or reconstruct them with COLMAP \
+         (`colmap automatic_reconstructor`) and give its folder",
+        in_command(named)
+    );
     if root.join(DATABASE).is_file() {
         return Some(format!("{DATABASE} holds no poses yet (`colmap mapper` finds them): {reconstruct}."));
     }
@@ -102,5 +108,8 @@ pub(super) fn videos(folder: &Path) -> Vec<String> {
 /// The command that turns one video into a folder of frames named as the readers expect.
 pub(super) fn ffmpeg_command(video: &str) -> String {
     let stem = Path::new(video).file_stem().and_then(|s| s.to_str()).unwrap_or("cam00");
-    format!("mkdir -p images/{stem} && ffmpeg -i {video} -start_number 0 -qscale:v 2 images/{stem}/%06d.jpg")
+    let folder = in_command(&Path::new("images").join(stem));
+    let frames = in_command(&Path::new("images").join(stem).join("%06d.jpg"));
+    let video = in_command(Path::new(video));
+    format!("mkdir -p {folder} && ffmpeg -i {video} -start_number 0 -qscale:v 2 {frames}")
 }

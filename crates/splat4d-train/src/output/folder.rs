@@ -5,6 +5,7 @@ use super::owner::{Owner, in_use};
 use super::place::{Input, check_apart};
 use super::write::{cannot_write, is_temporary};
 use super::{STATE, legacy, write_atomically};
+use crate::path_text::in_command;
 use crate::{Error, Result};
 use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
@@ -339,7 +340,7 @@ fn plan_all(folder: &Path, request: &Request<'_>, there: &[OsString]) -> Result<
         let what = if folder.join(FINISHED).is_file() { "a finished run" } else { "an unfinished run" };
         Error::input(format!("holds {what} already")).remedy(format!(
             "Continue it with --resume {}, replace it with --force, or choose another folder with -o.",
-            folder.display()
+            in_command(folder)
         ))
     } else {
         Error::input("is not empty and is not a run").remedy("Choose another folder with -o.")

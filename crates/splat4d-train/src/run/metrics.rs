@@ -37,8 +37,8 @@ impl Totals {
 /// A row of metrics.csv: what is known of a step when it was begun, and the whole once it was measured.
 struct Row {
     iteration: usize,
-    begun: Option<[String; 2]>,
-    text: String,
+    begun: Option<[Vec<String>; 2]>,
+    cells: Vec<String>,
 }
 
 /// metrics.csv: kept in memory, written whole at every checkpoint, so that it never runs ahead of one.
@@ -48,16 +48,11 @@ pub(super) struct Metrics {
 }
 
 impl Metrics {
-    const HEADER: &'static str = "iteration,stage,loss,l1,ssim,psnr,gaussians,seconds,motion_ms,render_ms,loss_ms,\
-        render_backward_ms,motion_backward_ms,adam_ms,load_ms,other_ms";
+    const HEADER: [&'static str; 8] = ["iteration", "stage", "loss", "l1", "ssim", "psnr", "gaussians", "seconds"];
 
     pub(super) fn open(run: &Path, iteration: usize, iterations: usize) -> Self {
         let text = crate::files::read_text(&run.join("metrics.csv")).unwrap_or_default();
-        let row = |line: &str| {
-            Some(Row { iteration: line.split(',').next()?.parse().ok()?, begun: None, text: line.to_owned() })
-        };
-        let rows = text.lines().skip(1).filter_map(row).filter(|row| row.iteration <= iteration).collect();
-        Self { rows, every: (iterations / METRIC_ROWS).max(1) }
+        Self { rows: rows(&text, iteration), every: (iterations / METRIC_ROWS).max(1) }
     }
 
     /// After a step; whatever it measured may come later.
@@ -66,10 +61,10 @@ impl Metrics {
         if !i.is_multiple_of(self.every) && !trainer.is_done() {
             return;
         }
-        let ms: Vec<String> = Totals::of(s).iter().map(|t| format!("{:.3}", t * 1e3)).collect();
-        let after = format!("{},{:.2},{}", trainer.scene().len(), state.seconds, ms.join(","));
-        let begun = [format!("{i},{}", trainer.stage_name()), after];
-        self.rows.push(Row { iteration: i, begun: Some(begun), text: String::new() });
+        let ms = Totals::of(s).map(|t| format!("{:.3}", t * 1e3));
+        let after = [trainer.scene().len().to_string(), format!("{:.2}", state.seconds)].into_iter().chain(ms);
+        let begun = [vec![i.to_string(), trainer.stage_name().to_owned()], after.collect()];
+        self.rows.push(Row { iteration: i, begun: Some(begun), cells: Vec::new() });
     }
 
     /// What a step measured.
@@ -77,7 +72,8 @@ impl Metrics {
         if let Some(row) = self.rows.iter_mut().rev().find(|row| row.iteration == m.iteration)
             && let Some([before, after]) = row.begun.take()
         {
-            row.text = format!("{before},{:.6},{:.6},{:.6},{:.4},{after}", m.loss, m.l1, m.ssim, psnr(m.mse));
+            let scores = [m.loss, m.l1, m.ssim].map(|x| format!("{x:.6}"));
+            row.cells = before.into_iter().chain(scores).chain([format!("{:.4}", psnr(m.mse))]).chain(after).collect();
         }
     }
 
@@ -87,15 +83,46 @@ impl Metrics {
     }
 
     pub(super) fn write(&self, run: &Path) -> Result<()> {
-        let mut text = Self::HEADER.to_owned() + "\n";
-        for row in &self.rows {
-            text += &row.text;
-            text.push('\n');
-        }
-        write_atomically(&run.join("metrics.csv"), text.as_bytes())
+        let times = STAGE_NAMES.iter().map(|name| format!("{name}_ms"));
+        let header: Vec<String> = Self::HEADER.iter().map(|&name| name.to_owned()).chain(times).collect();
+        let measured = self.rows.iter().map(|row| &row.cells).filter(|cells| !cells.is_empty());
+        write_atomically(&run.join("metrics.csv"), &table(std::iter::once(&header).chain(measured)))
     }
+}
+
+/// Rows as CSV (RFC 4180, lines end in a line feed).
+fn table<'a>(rows: impl Iterator<Item = &'a Vec<String>>) -> Vec<u8> {
+    let mut out = csv::WriterBuilder::new().flexible(true).from_writer(Vec::new());
+    rows.for_each(|row| out.write_record(row).expect("memory takes every row"));
+    out.into_inner().expect("memory takes every row")
+}
+
+/// The rows of a table up to an iteration.
+fn rows(text: &str, iteration: usize) -> Vec<Row> {
+    let records = csv::ReaderBuilder::new().flexible(true).from_reader(text.as_bytes()).into_records();
+    let row = |record: csv::StringRecord| {
+        let iteration = record.get(0)?.parse().ok()?;
+        Some(Row { iteration, begun: None, cells: record.iter().map(str::to_owned).collect() })
+    };
+    records.filter_map(|record| row(record.ok()?)).filter(|row| row.iteration <= iteration).collect()
 }
 
 pub(super) fn psnr(mse: f64) -> f64 {
     -10.0 * mse.max(1e-10).log10()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_stage_with_a_comma_stays_one_cell() {
+        let row = |cells: &[&str]| cells.iter().map(|&c| c.to_owned()).collect::<Vec<_>>();
+        let written =
+            [row(&["iteration", "stage", "loss"]), row(&["1", "deform-mlp, still", "0.5"]), row(&["2", "a\"b", "0.4"])];
+        let text = String::from_utf8(table(written.iter())).unwrap();
+        assert_eq!(text, "iteration,stage,loss\n1,\"deform-mlp, still\",0.5\n2,\"a\"\"b\",0.4\n");
+        let read = rows(&text, 1);
+        assert_eq!((read.len(), &read[0].cells), (1, &written[1]));
+    }
 }

@@ -87,17 +87,18 @@ impl Tracks {
 
     /// With `offset` added in f64. As CSV: a header `layer,gaussian,time,x,y,z` and a line for every moment at which a Gaussian is alive.
     pub fn to_csv<F: Real>(&self, scene: &Scene<F>, offset: [f64; 3]) -> String {
-        let mut out = "layer,gaussian,time,x,y,z\n".to_owned();
+        let mut out = csv::Writer::from_writer(Vec::new());
+        out.write_record(["layer", "gaussian", "time", "x", "y", "z"]).expect("memory takes every row");
         for (i, m) in self.members.iter().enumerate() {
-            let name = quoted(&scene.layers[m.layer].name);
+            let (name, row) = (&scene.layers[m.layer].name, m.row.to_string());
             for (t, point) in self.times.iter().zip(self.track(i)) {
                 if let Some(p) = point {
                     let [x, y, z] = placed(*p, offset);
-                    let _ = writeln!(out, "{name},{},{t},{x},{y},{z}", m.row);
+                    out.write_record([name, &row, &t.to_string(), &x, &y, &z]).expect("memory takes every row");
                 }
             }
         }
-        out
+        String::from_utf8(out.into_inner().expect("memory takes every row")).expect("all of it is text")
     }
 }
 
@@ -107,12 +108,6 @@ fn placed(p: [f32; 3], offset: [f64; 3]) -> [String; 3] {
         true => p[k].to_string(),
         false => (f64::from(p[k]) + offset[k]).to_string(),
     })
-}
-
-/// A field as CSV takes it (RFC 4180).
-fn quoted(text: &str) -> String {
-    let plain = !text.contains([',', '"', '\n', '\r']);
-    if plain { text.to_owned() } else { format!("\"{}\"", text.replace('"', "\"\"")) }
 }
 
 /// Every n-th Gaussian of a scene. Panics: `every` is 0.

@@ -215,6 +215,7 @@ mod tests {
     use crate::format::kinematic::tests::moving as moving_scene;
     use crate::format::samples::gaussians;
     use crate::format::{gltf, ply, sog, splat, splatv};
+    use crate::scene::GEOMETRY;
 
     /// A scene that every dialect can hold.
     fn sample(moves: bool) -> Scene<f32> {
@@ -246,6 +247,21 @@ mod tests {
             }
         }
         assert_eq!(Dialect::of(b""), None);
+    }
+
+    #[test]
+    fn no_dialect_writes_what_is_not_finite() {
+        for dialect in DIALECTS.iter().filter(|d| d.is_written()) {
+            for bad in [f32::NAN, f32::INFINITY] {
+                let (mut scene, mut bytes) = (sample(dialect.moves), Vec::new());
+                scene.layers[0].params[GEOMETRY].set(7, 1, bad);
+                let told = dialect.write(&scene, &WriteOptions::default(), &mut bytes).unwrap_err().to_string();
+                assert!(
+                    told.contains("finite") && told.contains("Gaussian 7") && bytes.is_empty(),
+                    "{dialect:?}: {told}"
+                );
+            }
+        }
     }
 
     #[test]

@@ -13,7 +13,7 @@ struct Foreign {
 }
 
 /// Known by their first bytes. Sources: the formats' specifications, or the programs' own readers.
-const FOREIGN: [Foreign; 8] = [
+const FOREIGN: [Foreign; 10] = [
     Foreign {
         is: |b| b.starts_with(b"SP4D"),
         what: "a .splat4d of the program splats4D, another format under a similar name",
@@ -24,6 +24,13 @@ const FOREIGN: [Foreign; 8] = [
         is: |b| b.starts_with(b"\x894DGS"),
         what: "a .4dgs of the fourdgs libraries",
         remedy: "Convert it to numbered .ply files with those libraries.",
+    },
+    Foreign { is: <[u8]>::is_empty, what: "an empty file", remedy: "Copy or write it again." },
+    Foreign {
+        // A safetensors file whose header is 640 to 1,408 bytes long begins alike.
+        is: |b| matches!(b, [0x80, 2..=5, ..]) && b.get(8) != Some(&b'{'),
+        what: "a Python pickle, such as an old checkpoint of PyTorch, which may hold code and is not read",
+        remedy: "Export .ply from its program.",
     },
     Foreign {
         is: |b| b.starts_with(b"PXR-USDC") || b.starts_with(b"#usda"),
@@ -58,9 +65,15 @@ const FOREIGN: [Foreign; 8] = [
 ];
 
 /// Endings of formats without a mark.
-const ENDINGS: [(&str, &str, &str); 3] = [
+const ENDINGS: [(&str, &str, &str); 5] = [
     (".ksplat", "a .ksplat of GaussianSplats3D", "Convert it to .ply first, for instance with splat-transform."),
     (".usdz", "a USD archive", "Export .ply from the program that wrote it."),
+    (
+        ".splat4d",
+        "a .splat4d of another program: those of splat4d begin with S4D",
+        "Convert it to numbered .ply or .splat files with the program that wrote it.",
+    ),
+    (".4dgs", "a .4dgs of another program", "Convert it to numbered .ply files with the program that wrote it."),
     (".gltf", "a glTF", "Export .ply or .spz from the program that wrote it."),
 ];
 
@@ -106,13 +119,18 @@ mod tests {
             (b"SP4D", "a.s4d", "splats4D"),
             (b"\x894DGS1\r\n", "a.4dgs", "fourdgs"),
             (b"\0\x01\0\0", "A.KSPLAT", "GaussianSplats3D"),
+            (b"SPLAT4D\0", "a.splat4d", "another program"),
+            (b"\0\0\0\0", "a.4DGS", "another program"),
+            (b"\x80\x02}q\0.", "a.pth", "pickle"),
+            (b"", "a.s4d", "empty"),
             (b"\x93NUMPY\x01\0", "a.npy", "NumPy"),
             (b"\0\0\0\x18ftypisom", "a.mp4", "import"),
         ] {
             let error = unread(name, bytes).map(|e| e.to_string()).unwrap_or_default();
             assert!(error.contains(says), "{name}: {error}");
         }
-        assert!(unread("a.ply", b"ply\n").is_none() && unread("", b"").is_none());
+        assert!(unread("a.ply", b"ply\n").is_none() && unread("", b"S4D").is_none());
+        assert!(unread("", b"\x80\x02\0\0\0\0\0\0{}").is_none(), "safetensors");
     }
 
     #[test]

@@ -81,6 +81,10 @@ impl<'a> Archive<'a> {
             let start = c.u32()? as usize;
             let name = String::from_utf8_lossy(c.take(name.into())?).into_owned();
             c.take(usize::from(extra) + usize::from(comment))?;
+            if [packed, plain, start].contains(&(ZIP64 as usize)) {
+                let error = Error::new(ErrorKind::Unsupported, "a file of 2 GiB or more in a zip64 archive");
+                return Err(error.at(&name).remedy("Smaller files are read; save it in parts."));
+            }
             let body = body(bytes, start, packed).map_err(|e| e.at(&name))?;
             places.push(start..body.end);
             if entries.contains_key(&name) {

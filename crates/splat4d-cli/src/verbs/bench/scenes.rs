@@ -13,8 +13,6 @@ use std::sync::Arc;
 
 /// Views of a scene; figures are means over them.
 pub(super) const VIEWS: usize = 8;
-/// Where scene S lies unless told: the robot among the sample files of the project's data folder.
-const PLAYBOT: &str = "../shared/data/gaussian-files/playbot-sog-lod/0_0";
 /// The trained scene of the bundled capture, from the root of the repository.
 const KNIGHT: &str = "examples/knight.s4d";
 /// Between the cameras of neighbouring views of T and U: coprime to the capture's 20, so that all sides are seen.
@@ -80,10 +78,10 @@ pub(super) struct Places {
 }
 
 impl Places {
-    fn of(&self, name: Name) -> (&Path, &'static str) {
+    fn of(&self, name: Name) -> (Option<&Path>, &'static str) {
         match name {
-            Name::S => (self.playbot.as_deref().unwrap_or(Path::new(PLAYBOT)), "--playbot FOLDER"),
-            _ => (self.file.as_deref().unwrap_or(Path::new(KNIGHT)), "--file FILE"),
+            Name::S => (self.playbot.as_deref(), "--playbot FOLDER"),
+            _ => (Some(self.file.as_deref().unwrap_or(Path::new(KNIGHT))), "--file FILE"),
         }
     }
 }
@@ -113,10 +111,12 @@ impl Pinned {
             return Ok(Ok(made_up(name.letter(), count, size)));
         }
         let (path, option) = places.of(name);
-        if !path.exists() {
-            let (letter, path) = (name.letter(), path.display());
-            return Ok(Err(Skipped(format!("scene {letter} is skipped: there is no {path}; name it with {option}"))));
-        }
+        let Some(path) = path.filter(|p| p.exists()) else {
+            let letter = name.letter();
+            let missing =
+                path.map_or_else(|| "its file is not known".into(), |p| format!("there is no {}", p.display()));
+            return Ok(Err(Skipped(format!("scene {letter} is skipped: {missing}; name it with {option}"))));
+        };
         let source = Source::open(path)?;
         crate::source::not_empty(&source.scene, path)?;
         let views = match name {

@@ -35,7 +35,15 @@ fn no_capture_and_no_frames() {
     assert_says(&say(&empty.path().join("nowhere")), &["nowhere", "no such file"]);
     assert_says(&say(empty.path()), &["not a capture", "capture.json", "docs/capture-format.md"]);
     std::fs::write(empty.path().join("cam00.mp4"), b"").unwrap();
-    assert_says(&say(empty.path()), &["videos", "ffmpeg -i cam00.mp4"]);
+    assert_says(&say(empty.path()), &["videos", "ffmpeg -i cam00.mp4", "`splat4d import "]);
+    let photos = tempfile::tempdir().unwrap();
+    let folder = photos.path().join("my photos/cam 1");
+    std::fs::create_dir_all(&folder).unwrap();
+    std::fs::write(folder.join("1.jpg"), b"").unwrap();
+    let quoted = format!("`splat4d import '{}' -o TAKE`", folder.parent().unwrap().display());
+    assert_says(&say(folder.parent().unwrap()), &["images without camera poses", &quoted]);
+    std::fs::write(folder.join("cam 1.mp4"), b"").unwrap();
+    assert_says(&say(&folder), &["ffmpeg -i 'cam 1.mp4'", "'images/cam 1/%06d.jpg'"]);
     std::fs::write(empty.path().join("sfm_data.json"), b"{}").unwrap();
     assert_says(&say(empty.path()), &["OpenMVG", "COLMAP"]);
     let sample = samples::own();

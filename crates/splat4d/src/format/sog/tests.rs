@@ -143,6 +143,9 @@ fn archives_are_inflated_no_further_than_a_scene_needs() {
     let packed = u32::from_le_bytes(long[last + 20..last + 24].try_into().unwrap());
     long[last + 20..last + 24].copy_from_slice(&(packed + 1).to_le_bytes());
     assert!(error(&long).contains("overlap"), "{}", error(&long));
+    let mut huge = zip.clone();
+    huge[at[0] + 24..at[0] + 28].copy_from_slice(&u32::MAX.to_le_bytes());
+    assert!(error(&huge).contains("zip64"), "{}", error(&huge));
     // meta.json is the first: nobody inflates 100 MiB of it.
     let mut meta = zip.clone();
     meta[at[0] + 24..at[0] + 28].copy_from_slice(&(100u32 << 20).to_le_bytes());
