@@ -10,7 +10,7 @@ use crate::optim::{MCMC_EXTENT, Noise};
 use crate::recipe::Recipe;
 use crate::settings::{Choice, settings};
 use crate::upkeep;
-use crate::upkeep::Strategy;
+use crate::upkeep::{LEAST, Strategy};
 use splat4d::motion::Spec;
 use splat4d::scene::LifeKind;
 
@@ -43,10 +43,11 @@ settings! {
 settings! {
     /// Learning rates of parameters that all Gaussians have.
     pub struct RateSettings {
-        /// Rate of positions at the start, of the extent.
-        position_init: f64 = 2e-3 => positive().unit("extents");
-        /// Rate of positions at the end, of the extent.
-        position_final: f64 = 5e-5 => positive().unit("extents");
+        /// Rate of positions at the start, of the extent; 0: 0.002, and less in proportion if `densify.max_cap` is above
+        /// 30,000.
+        position_init: f64 = 0.0 => any().unit("extents");
+        /// Rate of positions at the end, of the extent; 0: 0.00005, and less in the same way.
+        position_final: f64 = 0.0 => any().unit("extents");
         /// Share to which rates without a final value (colour, opacity, scale, rotation, lifespan) decay.
         decay: f64 = 1.0 => positive();
         /// Rate of base colour; higher SH degrees learn 20 times more slowly.
@@ -57,6 +58,24 @@ settings! {
         scaling: f64 = 0.015 => positive();
         /// Rate of quaternions.
         rotation: f64 = 1e-3 => positive();
+    }
+}
+
+/// Rates of positions at the start and at the end for up to [`LEAST`] Gaussians, of the extent: on small captures, which
+/// have few steps, better than the 1.6e-4 and 1.6e-6 of Kerbl et al. 2023 (studies/records/2026-11-26-recipe-trials.md).
+const POSITIONS: [f64; 2] = [2e-3, 5e-5];
+/// Lowest share of them, with many Gaussians: the rate of Kerbl et al. 2023, who have some millions.
+const FINEST: f64 = 0.08;
+
+impl RateSettings {
+    /// Rates of positions at the start and at the end, of the extent. More Gaussians are smaller and lie closer, and the
+    /// steps of the few throw them about: a real room with 70,000 gains 0.4 dB with a third of the rates, an object with 90,000
+    /// neither gains nor loses (studies/records/2026-11-26-real-size.md).
+    fn positions(&self, cap: usize) -> [f64; 2] {
+        let share = (LEAST as f64 / cap.max(1) as f64).clamp(FINEST, 1.0);
+        let [start, end] = POSITIONS.map(|rate| rate * if cap == 0 { 1.0 } else { share });
+        let stated = |rate: f64, by_count: f64| if rate > 0.0 { rate } else { by_count };
+        [stated(self.position_init, start), stated(self.position_final, end)]
     }
 }
 
@@ -122,7 +141,8 @@ impl Program for StillProgram {
 
 /// The groups of geometry and colour.
 pub(crate) fn groups(r: &Recipe, extent: f64) -> Vec<Group> {
-    let positions = Rate { start: r.rates.position_init * extent, end: r.rates.position_final * extent };
+    let [start, end] = r.rates.positions(r.densify.max_cap).map(|rate| rate * extent);
+    let positions = Rate { start, end };
     let mut groups = vec![
         Group::new("means", positions),
         Group::new("quats", r.falling(r.rates.rotation)),
@@ -198,5 +218,23 @@ pub fn stage(name: &str, plan: &Plan) -> Stage {
         sh_interval: r.appearance.sh_degree_interval,
         half_size_steps: (r.run.half_size_until * r.run.iterations as f64) as usize,
         ..Stage::new(name, r.run.iterations)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn many_gaussians_take_smaller_steps_unless_told() {
+        let of = |words: &[&str]| {
+            let r = Recipe::of(words).unwrap().resolve();
+            groups(&r, 2.0).iter().find(|g| g.column == "means").map(|g| [g.rate.start, g.rate.end]).unwrap()
+        };
+        let near = |a: [f64; 2], b: [f64; 2]| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-12);
+        assert!(near(of(&["max_cap=500"]), [4e-3, 1e-4]) && near(of(&[]), [4e-3, 1e-4]));
+        assert!(near(of(&["max_cap=120000"]), [1e-3, 2.5e-5]));
+        assert!(near(of(&["max_cap=5000000"]), [3.2e-4, 8e-6]), "not without end");
+        assert!(near(of(&["max_cap=120000", "rates.position_init=0.002"]), [4e-3, 2.5e-5]), "a stated rate stays");
     }
 }

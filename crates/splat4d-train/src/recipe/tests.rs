@@ -102,7 +102,7 @@ fn words_come_back_and_wrong_ones_get_a_suggestion() {
             assert!(error.contains(&format!("did you mean `{first}`")), "{error}");
         }
     }
-    assert_eq!(Recipe::knobs().iter().filter(|k| !k.choices.is_empty()).count(), 19);
+    assert_eq!(Recipe::knobs().iter().filter(|k| !k.choices.is_empty()).count(), 20);
     for (set, back) in [("init=my/points.ply", "my/points.ply"), ("init=hull", "hull")] {
         assert_eq!(Recipe::of(&[set]).unwrap().get("init.source").unwrap().as_str(), Some(back));
     }

@@ -41,7 +41,7 @@ fn no_capture_and_no_frames() {
     std::fs::create_dir_all(&folder).unwrap();
     std::fs::write(folder.join("1.jpg"), b"").unwrap();
     let quoted = format!("`splat4d import '{}' -o TAKE`", folder.parent().unwrap().display());
-    assert_says(&say(folder.parent().unwrap()), &["images without camera poses", &quoted]);
+    assert_says(&say(folder.parent().unwrap()), &["images, but no camera poses", &quoted]);
     std::fs::write(folder.join("cam 1.mp4"), b"").unwrap();
     assert_says(&say(&folder), &["ffmpeg -i 'cam 1.mp4'", "'images/cam 1/%06d.jpg'"]);
     std::fs::write(empty.path().join("sfm_data.json"), b"{}").unwrap();
