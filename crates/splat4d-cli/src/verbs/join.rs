@@ -32,5 +32,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let stop = interrupt::flag("stopping");
     let chunked = Chunked::open(&args.run)?;
     let _folder = OutputFolder::amend(&args.run, "join")?;
-    chunked::join(&args.run, &chunked, args.no_eval, &args.measure, &Deadline::default(), &stop, console)
+    chunked::join(&args.run, &chunked, args.no_eval, &args.measure, &Deadline::default(), &stop, console)?;
+    console.next("view", &args.run);
+    Ok(())
 }
