@@ -246,10 +246,17 @@ fn jerk(paths: &[Path]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::sync::OnceLock;
+
+    /// The default experiment, which several tests look at.
+    fn mixed() -> &'static Findings {
+        static FOUND: OnceLock<Findings> = OnceLock::new();
+        FOUND.get_or_init(|| run(Scene::Mixed, &Settings::default()))
+    }
 
     #[test]
     fn a_network_of_4546_numbers_beats_standing_still_at_every_time() {
-        let f = run(Scene::Mixed, &Settings::default());
+        let f = mixed();
         assert_eq!(f.parameters, 4546);
         assert!(f.worst() >= 0.39, "{:?}", f.improvements());
         // The observations' own noise is the measure: 2σ² is what copying one of them would cost.
@@ -259,10 +266,9 @@ mod tests {
 
     #[test]
     fn a_penalty_on_speed_makes_it_smoother_and_worse() {
-        let of = |lambda_velocity| run(Scene::Mixed, &Settings { lambda_velocity, ..Settings::default() });
-        let found = [of(0.0), of(10.0)];
-        assert!(found[1].jerk < 0.9 * found[0].jerk, "{:?}", [found[0].jerk, found[1].jerk]);
-        assert!(found[1].mse > 1.5 * found[0].mse, "{:?}", [found[0].mse, found[1].mse]);
+        let (free, calm) = (mixed(), run(Scene::Mixed, &Settings { lambda_velocity: 10.0, ..Settings::default() }));
+        assert!(calm.jerk < 0.9 * free.jerk, "{:?}", [free.jerk, calm.jerk]);
+        assert!(calm.mse > 1.5 * free.mse, "{:?}", [free.mse, calm.mse]);
     }
 
     #[test]

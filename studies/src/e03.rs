@@ -11,6 +11,7 @@ use splat4d_cli::draw::antialias;
 use splat4d_cli::files::{self, human_seconds};
 use splat4d_cli::interrupt;
 use splat4d_cli::measure::{Look, SIZE, Side, Subject, What, in_turns, looks};
+use splat4d_cli::paths::parse_size;
 use splat4d_cli::run_folder::Run;
 use splat4d_cli::source::{not_empty, read_scene};
 use splat4d_train::capture::{Capture, ImageStore};
@@ -58,6 +59,9 @@ pub(crate) struct Args {
     /// Steps of fine-tuning [default: a sixth of the run's]
     #[arg(long, value_name = "STEPS")]
     fine_tune: Option<usize>,
+    /// Image size at which playback is timed [default: 800x800, with --quick 200x200]
+    #[arg(long, value_name = "WxH", value_parser = parse_size)]
+    size: Option<[usize; 2]>,
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
@@ -159,7 +163,8 @@ impl Trial {
         let share = if args.quick { QUICK_SHARE } else { STEPS_SHARE };
         let own = run.iteration().unwrap_or(recipe.resolve().run.iterations);
         let steps = args.fine_tune.unwrap_or(((own as f64 * share) as usize).max(1));
-        let looks = looks(&run.views()?, scene.clip, if args.quick { QUICK_SIZE } else { SIZE });
+        let size = args.size.unwrap_or(if args.quick { QUICK_SIZE } else { SIZE });
+        let looks = looks(&run.views()?, scene.clip, size);
         let grid = if args.quick { Grid::quick(steps) } else { Grid::full(steps) };
         let folder = path.file_name().map_or_else(|| run.name(), |n| n.to_string_lossy().into_owned());
         Ok(Self { path: path.to_owned(), name: plain(&folder), print, scene, capture, recipe, store, looks, grid })

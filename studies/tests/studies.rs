@@ -33,7 +33,9 @@ fn a_study_of_pruning_measures_every_cell_once() {
     let run = work.path().join("run");
     studies(&["train", str(&Capture::new(work.path()).write()), "-o", str(&run)]).args(&TINY).run().ok();
     let folder = work.path().join("study");
-    let study = || studies(&["e03", str(&run), "-o", str(&folder), "--quick", "--fine-tune", "4"]);
+    // As small as the capture: how long a render takes is not what is tested.
+    let order = ["e03", str(&run), "-o", str(&folder), "--quick", "--fine-tune", "4", "--size", "32x24"];
+    let study = || studies(&order);
     let lines = study().args(&["--json"]).run().ok();
     let events: Vec<Value> = lines.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
     let told = events.iter().filter(|e| e["type"] == "cell").count();

@@ -230,7 +230,7 @@ pub(crate) fn resized(camera: &Camera, [width, height]: [usize; 2]) -> Camera {
 }
 
 /// Reads `640x480`.
-pub(crate) fn parse_size(text: &str) -> std::result::Result<[usize; 2], String> {
+pub fn parse_size(text: &str) -> std::result::Result<[usize; 2], String> {
     let (w, h) = text.split_once(['x', 'X', '×']).ok_or("write width x height, for instance 1280x720")?;
     let side = |t: &str| t.trim().parse::<usize>().ok().filter(|n| (1..=MAX_SIDE).contains(n));
     match (side(w), side(h)) {

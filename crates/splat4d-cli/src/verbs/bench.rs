@@ -212,9 +212,11 @@ pub(crate) fn run(args: &Args, threads: Option<u16>, console: &Console) -> anyho
 #[cfg(feature = "gpu")]
 fn on_gpu(scenes: &[Pinned], way: Way, args: &Args, console: &Console) -> anyhow::Result<Vec<Row>> {
     let pool = pool(way.threads)?;
+    let defaults = splat4d::gpu::Tuning::default();
+    let tunings = if args.sweep { splat4d::gpu::Tuning::sweep() } else { vec![defaults] };
     Ok(match &args.beside {
         Some(folder) => gpu::beside(scenes, folder, way, &pool, &|text| console.aside(text))?,
-        None => gpu::measure(scenes, way, args.sweep, &pool, &|text| console.note(text))?,
+        None => gpu::measure(scenes, way, &tunings, &pool, &|text| console.note(text))?,
     })
 }
 

@@ -12,6 +12,8 @@ const CAMERAS: [(&str, usize); 6] =
     [("cam06", 0), ("cam07", 2), ("cam08", 1), ("cam09", 3), ("cam10", 0), ("cam11", 2)];
 /// Frames that each films.
 const FRAMES: usize = 14;
+/// Half of the images' shorter side, for tests that do not measure how exactly lenses are found: a quarter of the work.
+const SMALL: [&str; 2] = ["--size", "150"];
 
 fn bundled() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/knight")
@@ -113,7 +115,9 @@ fn videos_with_sound_become_a_capture_whose_clocks_were_heard() {
     let (films, take) = (dir.path().join("films"), dir.path().join("take"));
     std::fs::create_dir_all(&films).unwrap();
     let taken = 20;
-    for (k, (name, begin)) in CAMERAS[..5].iter().enumerate() {
+    // Of three cameras geometry does not tell clocks: only what they hear does.
+    let cameras = &CAMERAS[..3];
+    for (k, (name, begin)) in cameras.iter().enumerate() {
         let wave = dir.path().join(format!("{name}.wav"));
         let seconds = taken as f64 / SLOW as f64;
         std::fs::write(&wave, heard(*begin as f64 / SLOW as f64, seconds, k as u64)).unwrap();
@@ -129,9 +133,9 @@ fn videos_with_sound_become_a_capture_whose_clocks_were_heard() {
             .unwrap();
         assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
     }
-    splat4d(&["import", str(&films), "-o", str(&take), "--no-doctor"]).run().ok();
+    splat4d(&["import", str(&films), "-o", str(&take), "--no-doctor"]).args(&SMALL).run().ok();
     let report = json_of(&take.join("import/report.json"));
-    for (k, (name, begin)) in CAMERAS[..5].iter().enumerate() {
+    for (k, (name, begin)) in cameras.iter().enumerate() {
         let camera = &report["cameras"][k];
         let by: Vec<&str> = camera["by"].as_array().unwrap().iter().map(|v| v.as_str().unwrap()).collect();
         assert!(by.contains(&"sound"), "{name}: {by:?}");
@@ -191,14 +195,15 @@ fn a_calibration_places_cameras_and_clocks_are_found() {
     let (take, masks) = (at("take"), at("masks"));
     for calibration in [at("calibration.toml"), bundled().join("capture.json")] {
         let args = ["import", str(&films), "-o", str(&take), "--calibration", str(&calibration)];
-        let args = [&args[..], &["--masks", str(&masks), "--no-doctor"]].concat();
+        let args = [&args[..], &SMALL, &["--masks", str(&masks), "--no-doctor"]].concat();
         let said = splat4d(&args).run().ok();
         assert!(said.contains("calibration px") && said.contains("geometry"), "{said}");
         let made = json_of(&take.join("capture.json"));
         for (k, camera) in told.iter().enumerate() {
             let found = &made["cameras"][k];
             for key in ["fx", "fy", "cx", "cy"] {
-                assert!((found[key].as_f64().unwrap() - camera[key].as_f64().unwrap()).abs() < EXACT, "{key} {found}");
+                let half = 0.5 * camera[key].as_f64().unwrap();
+                assert!((found[key].as_f64().unwrap() - half).abs() < EXACT, "{key} {found}");
             }
             for (i, j) in (0..3).flat_map(|i| (0..4).map(move |j| (i, j))) {
                 let number = |v: &Value| v["world_to_camera"][i][j].as_f64().unwrap();
@@ -263,7 +268,8 @@ fn colmap_is_called_where_it_is_asked_for_and_its_model_is_taken() {
     let dir = tempfile::tempdir().unwrap();
     let at = |name: &str| dir.path().join(name);
     let (films, take, program) = (at("films"), at("take"), at("program"));
-    filmed(&films);
+    // The model says where cameras are, and the user when: few frames are enough.
+    filmed_by(&CAMERAS, 4, &films);
     std::fs::create_dir_all(program.join("model")).unwrap();
     let (mut cameras, mut images) = (String::new(), String::new());
     for (k, (camera, (name, _))) in told().iter().zip(&CAMERAS).enumerate() {
@@ -278,8 +284,8 @@ fn colmap_is_called_where_it_is_asked_for_and_its_model_is_taken() {
     std::fs::write(program.join("model/cameras.txt"), cameras).unwrap();
     std::fs::write(program.join("model/images.txt"), images).unwrap();
     let folder = str(&program).to_owned();
-    let import =
-        |path: &str| splat4d(&["import", str(&films), "-o", str(&take), "--colmap", "--no-doctor"]).path(path).run();
+    let order = ["import", str(&films), "-o", str(&take), "--colmap", "--synchronous", "--no-doctor"];
+    let import = |path: &str| splat4d(&order).path(path).run();
     let missing = import("/nonexistent").failed();
     assert!(missing.contains("colmap cannot be started") && missing.contains("leave --colmap out"), "{missing}");
     stand_in(&program, "if [ -z \"$1\" ]; then :; fi; echo 'out of features' >&2; exit 3");
@@ -334,7 +340,7 @@ fn clocks_that_nothing_confirms_are_refused_and_can_be_told() {
         let mut all = vec!["import"];
         all.extend(three.iter().map(|p| str(p)));
         all.extend(["-o", str(&take), "--no-doctor"]);
-        splat4d(&all).args(more).run()
+        splat4d(&all).args(&SMALL).args(more).run()
     };
     let refused = import(&[]).refused();
     assert!(refused.contains("nothing tells how the clocks") && refused.contains("cam08"), "{refused}");

@@ -220,7 +220,7 @@ mod tests {
 
     #[test]
     fn another_program_is_compared_only_where_its_losses_agree() {
-        let pinned = made_up("small", 300, [40, 30]);
+        let pinned = made_up("small", 60, [20, 15]);
         let way = Way { threads: 1, simd: Simd::detect(), rounds: 1 };
         let place = tempfile::tempdir().unwrap();
         let gpu = match Gpu::open(Adapters::Any) {
@@ -240,8 +240,8 @@ mod tests {
         assert!(said.len() == 1 && said[0].contains("times ours"), "{said:?}");
         let read = |name: &str| std::fs::read(folder.join(name)).unwrap();
         let shape = |name: &str| npy::Npy::read(&read(name)).unwrap().shape;
-        assert_eq!((shape("means.npy"), shape("sh.npy")), (vec![300, 3], vec![300, 16, 3]));
-        assert_eq!(shape("truth_7.npy"), [30, 40, 3]);
+        assert_eq!((shape("means.npy"), shape("sh.npy")), (vec![60, 3], vec![60, 16, 3]));
+        assert_eq!(shape("truth_7.npy"), [15, 20, 3]);
         let scene: serde_json::Value = serde_json::from_slice(&read(SCENE)).unwrap();
         assert_eq!(scene["order"].as_array().unwrap().len(), WARM_UP + TIMED);
         assert_eq!(scene["views"].as_array().unwrap().len(), 8);

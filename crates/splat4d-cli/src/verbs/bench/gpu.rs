@@ -115,12 +115,12 @@ fn renderer(tuning: Tuning) -> Result<GpuRenderer> {
     Ok(renderer)
 }
 
-/// Draws every view of every scene and takes it back, and trains a few steps; with `sweep` for every value of the kernels' constants.
-/// Errors: there is no GPU of any kind.
+/// Draws every view of every scene and takes it back, and trains a few steps, with each of these constants of the kernels; the defaults
+/// come first. Errors: there is no GPU of any kind.
 pub(super) fn measure(
     scenes: &[Pinned],
     way: Way,
-    sweep: bool,
+    tunings: &[Tuning],
     pool: &rayon::ThreadPool,
     note: &dyn Fn(&str),
 ) -> Result<Vec<Row>> {
@@ -129,12 +129,11 @@ pub(super) fn measure(
     drop(first);
     let best = r;
     note(&format!("{name}: at best {:.2} G pairs/s and {:.1} GB/s", best.pairs * 1e-9, best.bytes * 1e-9));
-    let tunings = if sweep { Tuning::sweep() } else { vec![Tuning::default()] };
     let mut rows: Vec<Row> = Vec::new();
     for pinned in scenes {
         // Truth is drawn by the CPU, once.
         let held = Arc::new(pool.install(|| Held::of(pinned, way)));
-        for tuning in &tunings {
+        for tuning in tunings {
             let changes = tuning.changes();
             let with = changes.as_ref().map_or_else(String::new, |c| format!(" with {c}"));
             note(&format!("scene {} on {name}{with} ...", pinned.name));
@@ -342,9 +341,11 @@ mod tests {
     #[test]
     fn every_stage_has_a_time() {
         let pinned = made_up("small", 400, [40, 30]);
+        // One of the sweep's values is enough to compare with the defaults: each compiles all kernels anew.
+        let tunings = [Tuning::default(), Tuning { batch: 64, ..Tuning::default() }];
         let way = Way { threads: 1, simd: Simd::detect(), rounds: 1 };
         let pool = super::super::pool(way.threads).unwrap();
-        let rows = match measure(&[pinned], way, true, &pool, &|_| {}) {
+        let rows = match measure(&[pinned], way, &tunings, &pool, &|_| {}) {
             Ok(rows) => rows,
             Err(e) => {
                 assert!(std::env::var_os("REQUIRE_GPU").is_none(), "REQUIRE_GPU is set: {e}");
@@ -355,7 +356,7 @@ mod tests {
         let (films, others): (Vec<&Row>, Vec<&Row>) = rows.iter().partition(|r| r.stage == FILM);
         assert!(films.len() == 1 && films[0].tuning.is_none(), "one film, at the defaults");
         let stages: Vec<&str> = others.iter().map(|r| r.stage.as_str()).collect();
-        assert_eq!(stages, all.repeat(Tuning::sweep().len()));
+        assert_eq!(stages, all.repeat(tunings.len()));
         for row in &rows {
             assert!(row.ms > 0.0 && row.ms.is_finite() && row.device.is_some() && row.simd == "gpu", "{row:?}");
             assert!(row.ceiling_share.is_some_and(|share| share > 0.0), "{row:?}");
