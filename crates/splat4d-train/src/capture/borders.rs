@@ -206,7 +206,7 @@ mod tests {
         assert!(missing(&found, 20, 3) && missing(&found, 20, 29) && !missing(&found, 0, 15));
         let circle = images(8, |i, x, y| {
             let [dx, dy] = [x as f64 - 19.5, y as f64 - 14.5];
-            dx * dx + dy * dy < 14.0 * 14.0 && content(i, x, y)
+            dx * dx + dy * dy < 15.0 * 15.0 && content(i, x, y)
         });
         assert!(missing(&border(&circle, WIDTH, HEIGHT), 1, 1));
     }

@@ -58,7 +58,8 @@ pub(super) fn advice(root: &Path, named: &Path) -> Option<String> {
     if root.join(DATABASE).is_file() {
         return Some(format!("{DATABASE} holds no poses yet (`colmap mapper` finds them): {reconstruct}."));
     }
-    colmap::has_images(root).then(|| format!("It holds images, but no camera poses: {reconstruct}."))
+    let images = colmap::has_images(root) || folders().any(|folder| !rig::image_names(&folder).is_empty());
+    images.then(|| format!("It holds images, but no camera poses: {reconstruct}."))
 }
 
 /// Whether a name ends in one of these.

@@ -195,7 +195,7 @@ fn black_borders_are_neither_trained_nor_scored() {
     for c in 0..6u32 {
         let pixel = |x: u32, y: u32| {
             let black = x == 0 || x == WIDTH as u32 - 1 || (c == 0 && y == 8);
-            image::Rgb(if black { [3, 0, 12] } else { [90 + 9 * x as u8, 60 + 7 * (y + c) as u8, 50] })
+            image::Rgb(if black { [3, 0, 12] } else { [90 + 6 * x as u8, 60 + 7 * (y + c) as u8, 50] })
         };
         sample.save(&format!("images/{c}.png"), ImageBuffer::from_fn(WIDTH as u32, HEIGHT as u32, pixel));
     }
