@@ -134,7 +134,7 @@ fn is_model(path: &Path, marker: &str, file: &Path) -> bool {
         let model = path.join(workspace);
         colmap::is_model(&model) && model.parent().is_some_and(|above| above != path && colmap::has_images(above))
     };
-    colmap::is_model(file) && colmap::has_images(path) || !colmap::WORKSPACES.iter().any(|w| own_images(&w))
+    colmap::is_model(file) && colmap::has_images(path) || !colmap::WORKSPACES.iter().any(own_images)
 }
 
 /// Whether a file's name is one that a capture's metadata can have.
