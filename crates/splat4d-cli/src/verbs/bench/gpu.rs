@@ -341,7 +341,7 @@ mod tests {
     #[test]
     fn every_stage_has_a_time() {
         let pinned = made_up("small", 400, [40, 30]);
-        // One of the sweep's values is enough to compare with the defaults: each compiles all kernels anew.
+        // One of the sweep's values is enough to compare with the defaults: each compiles all kernels again.
         let tunings = [Tuning::default(), Tuning { batch: 64, ..Tuning::default() }];
         let way = Way { threads: 1, simd: Simd::detect(), rounds: 1 };
         let pool = super::super::pool(way.threads).unwrap();
