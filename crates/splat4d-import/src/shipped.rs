@@ -168,10 +168,17 @@ pub struct Contents {
     pub warnings: Vec<String>,
 }
 
-/// What such a capture holds; `None`: it is no such capture. Errors: as [`extract`], but of space.
+/// Whether all frames of a video are extracted, by the notes of that.
+fn is_extracted(root: &Path, video: &Path) -> bool {
+    let note = std::fs::read(root.join(NOTES).join(format!("{}.json", stem(video)))).ok();
+    let note: Option<serde_json::Value> = note.and_then(|bytes| serde_json::from_slice(&bytes).ok());
+    note.is_some_and(|n| n["complete"] == true)
+}
+
+/// What such a capture holds; `None`: it is no such capture, or all frames are extracted. Errors: as [`extract`], but of space.
 pub fn contents(root: &Path) -> Result<Option<Contents>> {
     let videos = videos(root);
-    if videos.is_empty() {
+    if videos.iter().all(|v| is_extracted(root, v)) {
         return Ok(None);
     }
     let rows = check_poses(&root.join(POSES), &videos)?;
@@ -248,6 +255,7 @@ mod tests {
         assert_eq!(extract(root, &mut progress, &|| false).unwrap().unwrap(), found);
         assert!(root.join("images/cam00/000002.jpg").is_file());
         assert_eq!(std::fs::metadata(&frame).unwrap().modified().unwrap(), written, "what was there is left");
+        assert_eq!(contents(root).unwrap(), None, "its frames are read");
         let note: serde_json::Value =
             serde_json::from_slice(&std::fs::read(root.join("import/cam00.json")).unwrap()).unwrap();
         assert!((note["interval"].as_f64().unwrap() - 0.1).abs() < 1e-6, "the capture's reader finds its rate there");

@@ -22,7 +22,7 @@ use std::sync::Arc;
 
 /// Images of a lens that are looked at: content that is black by chance is black in all of them hardly ever.
 const LOOKED_AT: usize = 16;
-/// Pixels that are decoded of one lens at most, where that leaves [`FEWEST`] images: half a second of one core.
+/// Pixels that are decoded of one lens at most, where that leaves [`FEWEST`] images: it bounds the time.
 const PIXELS: usize = 30_000_000;
 /// With fewer views of different places, what is black in all of them may be an object.
 const FEWEST: usize = 6;

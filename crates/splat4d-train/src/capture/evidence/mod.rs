@@ -16,7 +16,7 @@ mod tests;
 
 use super::account::first_names;
 use super::preflight::{Finding, Severity};
-use super::{Aspect, Capture, Frame, Poses};
+use super::{Aspect, Capture, DepthFile, Frame, Poses};
 use look::Look;
 pub use motion::Agreement;
 use splat4d::math::Se3;
@@ -90,15 +90,20 @@ impl Capture {
         if let Some(error) = points::unreadable_depth(self) {
             let what = format!("A depth map cannot be used, and training with depth stops there: {error}");
             findings.push(warn(what, "Without depth: --set loss.depth=0."));
-        } else if let Some((ratio, by, file)) = points::depth_unit(self) {
-            let what = format!(
-                "Depth maps and {by} do not fit: these are {ratio:.3e} times as far away as depth maps say (such as {}). A \
-                 stored number is probably {:.3e} scene units, and is read as {:.3e}.",
-                file.path.display(),
-                ratio * file.scale,
-                file.scale
-            );
-            findings.push(warn(what, "State the unit (depth_unit_scale_factor; in capture.json depth_scale)."));
+            return findings;
+        }
+        match points::depth_unit(self) {
+            points::Unit::Right => {}
+            points::Unit::Unknown => findings.push(Finding {
+                severity: Severity::Note,
+                aspect: Some(Aspect::NotChecked),
+                what: "Whether depth maps are in scene units: neither initial points nor other maps tell it.".into(),
+                remedy: String::new(),
+            }),
+            points::Unit::Wrong(ratio, by, file) => {
+                let remedy = "State the unit (depth_unit_scale_factor; in capture.json depth_scale).";
+                findings.push(warn(other_unit(ratio, by, file), remedy));
+            }
         }
         findings
     }
@@ -230,6 +235,17 @@ impl Capture {
             misread: true,
         }
     }
+}
+
+/// The finding where depth maps are in another unit than `by`.
+fn other_unit(ratio: f64, by: &str, file: &DepthFile) -> String {
+    format!(
+        "Depth maps and {by} do not fit: these are {ratio:.3e} times as far away as depth maps say (such as {}). A stored number \
+         is probably {:.3e} scene units, and is read as {:.3e}.",
+        file.path.display(),
+        ratio * file.scale,
+        file.scale
+    )
 }
 
 /// What masks and alpha say of themselves: white counts.

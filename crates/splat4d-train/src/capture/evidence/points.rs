@@ -210,7 +210,8 @@ const GRID: usize = 24;
 const AGREE: f64 = 0.03;
 const UNIT: (f64, f64) = (0.4, 1.5);
 
-/// The factor at which metric depth maps of neighbouring views agree with each other; `None`: with none, or with several.
+/// The factor at which metric depth maps of neighbouring views agree with each other; `None`: with none, or with several. Factors
+/// next to 1 are within what is right.
 fn by_views(capture: &Capture) -> Option<f64> {
     let metric = |i: &&usize| capture.frames[**i].depth.as_ref().is_some_and(|d| d.kind == DepthKind::Metric);
     let all: Vec<usize> = capture.train.iter().filter(metric).copied().collect();
@@ -262,11 +263,11 @@ fn by_views(capture: &Capture) -> Option<f64> {
         }
         if seen < IN_MAP { 0.0 } else { f64::from(agree as u32) / f64::from(seen as u32) }
     };
-    let mut best = (1.0, share(1.0));
-    let stated = best.1;
+    let stated = share(1.0);
+    let mut best = (1.0, 0.0);
     let mut power = FACTORS[0];
     while power <= FACTORS[1] * 1.001 {
-        for factor in [power, 2.0 * power, 5.0 * power].into_iter().filter(|f| (f - 1.0).abs() > 1e-6) {
+        for factor in [power, 2.0 * power, 5.0 * power].into_iter().filter(|f| f.max(1.0 / f) >= SAME_UNIT) {
             let found = share(factor);
             if found > best.1 {
                 best = (factor, found);
@@ -274,18 +275,34 @@ fn by_views(capture: &Capture) -> Option<f64> {
         }
         power *= 10.0;
     }
-    (best.0 != 1.0 && best.1 >= UNIT.0 && best.1 >= UNIT.1 * stated).then_some(best.0)
+    match () {
+        () if stated.max(best.1) < UNIT.0 => None,
+        () if best.1 >= UNIT.1 * stated => Some(best.0),
+        () if stated >= UNIT.1 * best.1 => Some(1.0),
+        () => None,
+    }
 }
 
-/// How many times as far away things are as metric depth maps say, what tells it, and a map's file. `None`: about as far, or it
-/// cannot be told.
-pub(super) fn depth_unit(capture: &Capture) -> Option<(f64, &'static str, &DepthFile)> {
-    let file = with_depth(capture).first()?.depth.as_ref()?;
-    let (ratio, by) = match by_points(capture) {
-        Some(ratio) => (ratio, "initial points"),
-        None => (by_views(capture)?, "depth maps of other views"),
-    };
-    (ratio.max(1.0 / ratio) > SAME_UNIT).then_some((ratio, by, file))
+/// What is known of the unit of metric depth maps.
+pub(super) enum Unit<'a> {
+    /// There are no such maps, or it is right.
+    Right,
+    /// How many times as far away things are as they say, what tells it, and a map's file.
+    Wrong(f64, &'static str, &'a DepthFile),
+    /// Neither points nor other maps tell it.
+    Unknown,
+}
+
+/// Compares metric depth maps with initial points, else with each other.
+pub(super) fn depth_unit(capture: &Capture) -> Unit<'_> {
+    let frames = with_depth(capture);
+    let Some(file) = frames.first().and_then(|f| f.depth.as_ref()) else { return Unit::Right };
+    let by_points = by_points(capture).map(|ratio| (ratio, "initial points"));
+    match by_points.or_else(|| Some((by_views(capture)?, "depth maps of other views"))) {
+        Some((ratio, by)) if ratio.max(1.0 / ratio) > SAME_UNIT => Unit::Wrong(ratio, by, file),
+        Some(_) => Unit::Right,
+        None => Unit::Unknown,
+    }
 }
 
 /// Why a depth map cannot be read: the first of some.
