@@ -182,14 +182,17 @@ pub fn main_from(words: impl IntoIterator<Item = OsString>) -> u8 {
     })
 }
 
-/// One verb with its options, for another program: says nothing but warnings, and returns errors.
-pub fn call(words: &[OsString]) -> anyhow::Result<()> {
+/// One verb with its options, for another program: prints nothing but warnings, and returns the objects that `--json` would
+/// print, or the error.
+pub fn call(words: &[OsString]) -> anyhow::Result<Vec<serde_json::Value>> {
     let name = OsString::from("splat4d");
     let cli = Cli::try_parse_from(std::iter::once(&name).chain(words)).map_err(|e| {
         let text = e.to_string();
         Error::input(text.trim_start_matches("error: ").trim_end().to_owned())
     })?;
-    cli.verb.run(None, &Console::new(Loudness::Quiet, false))
+    let console = Console::keeping_objects();
+    cli.verb.run(None, &console)?;
+    Ok(console.into_objects())
 }
 
 /// Parses the arguments of a program with the command's manners, does what `work` makes of them, and tells errors.

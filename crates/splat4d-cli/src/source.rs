@@ -127,7 +127,7 @@ impl Source {
     }
 
     /// A scene of our own, without a run.
-    pub(crate) fn own(scene: Scene<f32>) -> Self {
+    pub fn own(scene: Scene<f32>) -> Self {
         let warnings = Warnings::default();
         Self { scene, run: None, ply: None, playback: None, provenance: None, dialect: None, warnings }
     }

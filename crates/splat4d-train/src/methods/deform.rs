@@ -23,9 +23,9 @@ const NOISE_STEPS: f64 = 0.5;
 /// Steps over which the rates of networks and grids rise. Adam's first step is as long as the rate whatever the gradient, and
 /// at once it threw a settled cloud 25 pixels about: training views of a hand-held take fell by 4.6 dB in one step. With
 /// it 0.2 dB more are held out there (docs/suite.md). Source of linear warm-up: Goyal et al. 2017, §2.2.
-const WARM_UP: usize = 50;
+pub(super) const WARM_UP: usize = 50;
 /// Short runs have no time for it: at most this part of the iterations.
-const WARM_UP_SHARE: usize = 20;
+pub(super) const WARM_UP_SHARE: usize = 20;
 /// The grid over space: a sixteenth of the published entries, since Gaussians are thousands and not millions of samples.
 const SPACE: HashShape = HashShape { levels: 8, features: 2, log2_size: 15, base: 8, finest: 256 };
 /// The grids over two axes and time.
@@ -162,11 +162,16 @@ fn spec(plan: &Plan) -> DeformSpec {
 fn stage(plan: &Plan, from: usize, to: usize) -> Stage {
     let mut stage = still::stage("deform-mlp", plan);
     still::learn_life(&mut stage, plan, DeformProgram.life(plan));
+    canonical(&mut stage);
+    stage.part(from, to)
+}
+
+/// Lets positions start as slowly as those of a cloud must that is seen at every moment.
+pub(super) fn canonical(stage: &mut Stage) {
     for group in stage.groups.iter_mut().filter(|g| g.column == "means") {
         group.rate.start /= CANONICAL_SLOWDOWN;
         group.rate.end = group.rate.end.min(group.rate.start);
     }
-    stage.part(from, to)
 }
 
 /// Lets the networks of every deformable layer learn, or not.

@@ -8,6 +8,7 @@ pub(crate) mod deform;
 pub(crate) mod filtered;
 pub(crate) mod hexplane;
 pub(crate) mod native4d;
+pub(crate) mod own;
 pub(crate) mod spacetime;
 pub(crate) mod ssm;
 pub mod still;
@@ -20,6 +21,7 @@ pub(crate) use deform::DeformSettings;
 pub(crate) use filtered::FilterSettings;
 pub(crate) use hexplane::HexplaneSettings;
 pub(crate) use native4d::Native4dSettings;
+pub use own::OwnMotion;
 pub(crate) use spacetime::SpacetimeSettings;
 pub(crate) use ssm::SsmSettings;
 pub(crate) use still::{AppearanceSettings, LifeSettings, RateSettings};
@@ -352,10 +354,13 @@ pub(crate) const PROGRAMS: [(&str, Make); 8] = [
     ("ssm", || Box::new(ssm::SsmProgram)),
 ];
 
-/// The program of a built-in motion model.
+/// The program of a built-in motion model, or of one that was registered ([`OwnMotion::register`]).
 pub fn program(motion: &str) -> Result<Box<dyn Program>> {
     if let Some((_, make)) = PROGRAMS.into_iter().find(|(name, _)| *name == motion) {
         return Ok(make());
+    }
+    if let Some(own) = own::program(motion) {
+        return Ok(own);
     }
     if BUILT_IN.contains(&motion) {
         return Err(Error::input(format!("`{motion}` cannot be chosen: it wraps another motion model"))
