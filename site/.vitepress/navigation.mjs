@@ -16,6 +16,7 @@ const TUTORIALS = [
   ['docs/own-videos', 'Your own videos'],
   ['docs/own-page', 'A player on your page'],
   ['docs/own-motion-model', 'Your own motion model'],
+  ['docs/own-motion-python', 'Your own motion model in Python'],
   ['docs/own-loss', 'Your own loss'],
   ['docs/from-scratch', '4D Gaussians from scratch'],
 ];

@@ -21,9 +21,10 @@ use splat4d_train::capture::{Capture, CaptureKind, CaptureOptions, ImageStore, T
 use splat4d_train::eval::Align;
 use splat4d_train::eval::flow::flow_error;
 use splat4d_train::eval::points::point_errors;
-use splat4d_train::eval::run::{EvalOptions, Measured, Scores, evaluate};
+use splat4d_train::eval::run::{EvalOptions, Measured, Scores, assess, evaluate};
 use splat4d_train::eval::tracks::track_error;
 use splat4d_train::eval::trajectory::trajectory_error;
+use splat4d_train::event::Event;
 use splat4d_train::path_text::in_command;
 use splat4d_train::recipe::{MotionName, Recipe};
 use splat4d_train::run::chunks::Chunked;
@@ -271,10 +272,7 @@ pub(crate) fn scores_on(
             .into());
     }
     let own = capture.background;
-    let all: Vec<(&str, Option<[f32; 3]>)> = match backgrounds {
-        [] => vec![("", own)],
-        chosen => chosen.iter().map(|(name, color)| (*name, Some(*color))).collect(),
-    };
+    let all = on_backgrounds(own, backgrounds);
     let measuring = Measuring { opened: &opened, recipe: &recipe, measure };
     for (name, background) in all {
         let place = if background == own { split.to_owned() } else { format!("{split}-{name}") };
@@ -285,17 +283,85 @@ pub(crate) fn scores_on(
         let capture = Arc::new(Capture { background, ..capture.clone() });
         let place = (!judged).then_some(place);
         let scores = measuring.evaluate(&scene, &capture, measured, place, console)?;
-        let on = if name.is_empty() { String::new() } else { format!(" on {name}") };
-        let views = match measured {
-            Measured::Test => "held-out views",
-            Measured::Validation => "validation views",
-            Measured::Train => "training views",
+        say_split(&scores, measured, name, console);
+    }
+    Ok(())
+}
+
+/// Backgrounds with their names; where none are asked for, the capture's own.
+fn on_backgrounds<'a>(own: Option<[f32; 3]>, asked: &[(&'a str, [f32; 3])]) -> Vec<(&'a str, Option<[f32; 3]>)> {
+    match asked {
+        [] => vec![("", own)],
+        chosen => chosen.iter().map(|(name, color)| (*name, Some(*color))).collect(),
+    }
+}
+
+fn say_split(scores: &Scores, measured: Measured, background: &str, console: &Console) {
+    let on = if background.is_empty() { String::new() } else { format!(" on {background}") };
+    let views = match measured {
+        Measured::Test => "held-out views",
+        Measured::Validation => "validation views",
+        Measured::Train => "training views",
+    };
+    console.say(&format!("{views}{on}: {}", in_words(|key| scores.held(key))));
+    let entry = &scores.report.results()[scores.report.method()];
+    console.emit(&json!({
+        "type": "results", "iteration": scores.report.iteration, "conditions": scores.report.conditions, "results": entry,
+    }));
+}
+
+/// Scores a scene that is no run's on views of a capture, and writes scores and images into `out`, if there is such a folder.
+///
+/// Errors: the capture has no such views; images without alpha, which are composited on nothing; those of measuring.
+#[allow(clippy::too_many_arguments)]
+pub(crate) fn foreign_scores(
+    mut scene: Scene<f32>,
+    capture: &Capture,
+    recipe: &Recipe,
+    out: Option<&Path>,
+    measured: Measured,
+    backgrounds: &[(&str, [f32; 3])],
+    measure: &Measure,
+    console: &Console,
+) -> anyhow::Result<()> {
+    let mut capture = capture.clone();
+    capture.coarse().into_iter().for_each(|w| console.warn(w));
+    if capture.offset != scene.offset {
+        capture.relocate(scene.offset);
+    }
+    if measured.frames(&capture).is_empty() {
+        return Err(Error::input(format!("the capture has no views of the split `{}`", measured.name()))
+            .remedy("Choose them with --hold-out, for instance --hold-out every=8, or measure --split train.")
+            .into());
+    }
+    if !backgrounds.is_empty() && capture.background.is_none() {
+        return Err(Error::input("the capture's images have no transparent pixels, and so no background to choose")
+            .remedy("Leave --background out.")
+            .into());
+    }
+    for (name, background) in on_backgrounds(capture.background, backgrounds) {
+        scene.background = background.unwrap_or(scene.background);
+        let capture = Arc::new(Capture { background, ..capture.clone() });
+        let memory = usize::try_from(recipe.run.image_memory).unwrap_or(usize::MAX);
+        let store = Arc::new(ImageStore::new(capture.clone(), memory));
+        let options = EvalOptions {
+            folder: out.map(Path::to_owned).unwrap_or_default(),
+            antialias: recipe.appearance.antialias,
+            lpips_weights: measure.lpips_weights.clone(),
+            pictures: out.is_some(),
+            train_views: 0,
+            measured,
+            place: (!name.is_empty()).then(|| format!("{}-{name}", measured.name())),
+            device: measure.device,
+            ..EvalOptions::default()
         };
-        console.say(&format!("{views}{on}: {}", in_words(|key| scores.held(key))));
-        let entry = &scores.report.results()[scores.report.method()];
-        console.emit(&json!({
-            "type": "results", "iteration": scores.report.iteration, "conditions": scores.report.conditions, "results": entry,
-        }));
+        let mut listen = |event: &Event| console.event(event);
+        let scores = match out {
+            Some(_) => evaluate(&scene, &capture, &store, 0, &options, &mut listen)?,
+            None => assess(&scene, &capture, &store, 0, &options, &mut listen)?,
+        };
+        console.clear();
+        say_split(&scores, measured, name, console);
     }
     Ok(())
 }

@@ -17,7 +17,7 @@
 //! | `baking.rs`, `baking/` | the playback file at the end of a run |
 //! | `report/`, `report/compress/` | `report.html`, drawn without a library |
 //! | `film.rs` | the playback file of a long capture, which grows during training |
-//! | `labelling.rs`, `chunked.rs`, `compressing.rs`, `predicting.rs`, `predicting/`, `editing.rs`, `editor.rs` | the work of `label`, `train --chunk` and `join`, `compress`, `predict`, `edit`, `view --edit` |
+//! | `labelling.rs`, `chunked.rs`, `comparing.rs`, `compressing.rs`, `predicting.rs`, `predicting/`, `editing.rs`, `editor.rs` | the work of `label`, `train --chunk` and `join`, `compare`, `compress`, `predict`, `edit`, `view --edit` |
 //! | `verbs/`, `verbs/info/` | one file per command |
 //! | `verbs/bench/` | pinned scenes, stages, training steps, growth, GPU stages, other programs (`studies/beside/with_gsplat.py`); each time with its lower bound |
 //! | `bin/` | `s4d`, the command's second name: a launcher |
@@ -28,6 +28,7 @@ mod asked;
 mod baking;
 mod camera_file;
 mod chunked;
+mod comparing;
 mod compressing;
 pub mod console;
 mod deadline;
@@ -130,6 +131,7 @@ enum Verb {
     Train(Box<verbs::train::Args>),
     Join(verbs::join::Args),
     Eval(verbs::eval::Args),
+    Compare(verbs::compare::Args),
     Predict(verbs::predict::Args),
     Render(verbs::render::Args),
     Localise(verbs::localise::Args),
@@ -152,6 +154,7 @@ impl Verb {
             Verb::Train(args) => verbs::train::run(args, console),
             Verb::Join(args) => verbs::join::run(args, console),
             Verb::Eval(args) => verbs::eval::run(args, console),
+            Verb::Compare(args) => verbs::compare::run(args, console),
             Verb::Predict(args) => verbs::predict::run(args, console),
             Verb::Render(args) => verbs::render::run(args, console),
             Verb::Localise(args) => verbs::localise::run(args, console),

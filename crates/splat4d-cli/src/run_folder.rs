@@ -459,7 +459,7 @@ pub(crate) fn beside(results: &Value) -> Vec<Beside<'_>> {
 }
 
 /// The entry `ours_N` with the largest N.
-fn newest(results: &Value) -> Option<(usize, &Value)> {
+pub(crate) fn newest(results: &Value) -> Option<(usize, &Value)> {
     results.as_object()?.iter().filter_map(|(k, v)| Some((step_of(k)?, v))).max_by_key(|e| e.0)
 }
 
@@ -467,7 +467,7 @@ fn step_of(name: &str) -> Option<usize> {
     name.strip_prefix("ours_")?.parse().ok()
 }
 
-fn view_scores(entry: &Value) -> Vec<ViewScore> {
+pub(crate) fn view_scores(entry: &Value) -> Vec<ViewScore> {
     let psnr = entry.get("PSNR").and_then(Value::as_object);
     let mut views: Vec<ViewScore> = psnr
         .into_iter()

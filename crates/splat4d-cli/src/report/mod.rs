@@ -3,6 +3,7 @@
 //! folder's files; missing files are missing in the page.
 
 pub mod chart;
+pub(crate) mod compare;
 pub(crate) mod compress;
 pub(crate) mod doctor;
 mod pictures;
@@ -49,7 +50,12 @@ fn page(run: &Run) -> String {
     conditions(&mut body, run);
     costs(&mut body, run);
     again(&mut body, run);
-    let title = escape(&run.name());
+    document(&run.name(), &body)
+}
+
+/// A whole page of a body.
+pub(crate) fn document(title: &str, body: &str) -> String {
+    let title = escape(title);
     format!(
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" \
          content=\"width=device-width, initial-scale=1\"><title>{title} · splat4d</title>\n<style>\n{STYLE}</style></head>\
