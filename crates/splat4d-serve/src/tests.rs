@@ -254,7 +254,7 @@ fn paths_lead_nowhere_else() {
     ] {
         assert_eq!(get(&server, target).status, 404, "{target}");
     }
-    assert_eq!(ask(&server, "GET", "http://localhost/", &[]).status, 400, "no proxy");
+    assert_eq!(ask(&server, "GET", "http://localhost/", &[]).status, 400, "not a proxy");
 }
 
 /// Requests as broken clients and curious strangers send them.

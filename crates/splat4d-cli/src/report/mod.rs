@@ -85,7 +85,7 @@ fn cards(out: &mut String, run: &Run) {
     for (class, key, digits, unit, name) in [
         ("main", "PSNR", 2, "dB", "PSNR, held-out views"),
         ("", "PSNR-aligned", 2, "dB", "PSNR, held-out cameras aligned"),
-        ("", "PSNR-cc", 2, "dB", "PSNR, each camera's colours corrected"),
+        ("", "PSNR-cc", 2, "dB", "PSNR, colours corrected per camera"),
         ("main", "PSNR-dynamic", 2, "dB", "PSNR of dynamic regions"),
         ("", "PSNR-foreground", 2, "dB", "PSNR of the foreground"),
         ("", "SSIM", 4, "", "SSIM"),
@@ -100,7 +100,7 @@ fn cards(out: &mut String, run: &Run) {
         }
     }
     if let (Some(ours), Some(still)) = (run.score("PSNR-dynamic"), run.baseline("PSNR-dynamic")) {
-        card("main", format!("{:+.2}", ours - still), "dB", "dynamic regions, over a static scene");
+        card("main", format!("{:+.2}", ours - still), "dB", "dynamic regions, against a static scene");
     }
     if let Some(n) = run.number("gaussians").or(run.metrics.last().map(|m| m.gaussians)) {
         card("", grouped(n as usize), "", "Gaussians");
@@ -108,7 +108,7 @@ fn cards(out: &mut String, run: &Run) {
     if let Some(bytes) = run.number("peak_memory").filter(|b| *b > 0.0) {
         let text = human_bytes(bytes as u64);
         let (value, unit) = text.split_once(' ').unwrap_or((&text, ""));
-        card("", value.into(), unit, "memory at most");
+        card("", value.into(), unit, "peak memory");
     }
     if let Some(seconds) = run.number("seconds") {
         card("", human_seconds(seconds), "min", "training time");
@@ -121,7 +121,7 @@ fn cards(out: &mut String, run: &Run) {
     }
     out.push_str("</div>\n");
     if run.results.is_some() && !["LPIPS", "LPIPS-vgg", "LPIPS-alex"].iter().any(|k| run.score(k).is_some()) {
-        out.push_str("<p class=\"note\">LPIPS was not computed: name its weights with --lpips-weights.</p>\n");
+        out.push_str("<p class=\"note\">LPIPS was not computed: give its weights with --lpips-weights.</p>\n");
     }
 }
 
@@ -130,7 +130,7 @@ fn findings(out: &mut String, run: &Run) {
     if findings.is_empty() {
         return;
     }
-    out.push_str("<h2>Worth knowing</h2>\n");
+    out.push_str("<h2>Findings</h2>\n");
     for finding in findings {
         let _ = writeln!(out, "<div class=\"warn\">{}</div>", escape(&finding));
     }
@@ -138,7 +138,7 @@ fn findings(out: &mut String, run: &Run) {
 
 fn film(out: &mut String, run: &Run) {
     if let Some(film) = pictures::film(&run.path) {
-        let _ = writeln!(out, "<h2>Through space and time</h2>\n{film}");
+        let _ = writeln!(out, "<h2>Orbit film</h2>\n{film}");
     }
 }
 
@@ -176,8 +176,8 @@ fn views(out: &mut String, run: &Run) {
     if !shown.is_empty() {
         let _ = write!(
             out,
-            "<h2>Views that training never saw</h2>\n<div class=\"views\">{shown}</div>\n<p class=\"note\">Error: the \
-             mean difference of the channels, from none (dark) to a quarter of full scale and more (bright).</p>\n"
+            "<h2>Held-out views</h2>\n<div class=\"views\">{shown}</div>\n<p class=\"note\">Error: mean difference \
+             of the channels, from 0 (dark) to a quarter of full scale or more (bright).</p>\n"
         );
     }
 }
@@ -192,7 +192,7 @@ fn curves(out: &mut String, run: &Run) {
         ("Loss", lines(&series("", |m| m.loss), "step", "loss")),
         ("Gaussians", lines(&series("", |m| m.gaussians), "step", "Gaussians")),
     ];
-    panels(out, "How it learned", charts);
+    panels(out, "Training curves", charts);
 }
 
 fn scores(out: &mut String, run: &Run) {
@@ -221,7 +221,7 @@ fn scores(out: &mut String, run: &Run) {
         rows.truncate(CAMERA_BARS);
     }
     let lowest = rows.iter().map(|r| r.1).fold(f64::INFINITY, f64::min);
-    let title = if all > CAMERA_BARS { "PSNR by camera, the weakest" } else { "PSNR by camera" };
+    let title = if all > CAMERA_BARS { "PSNR by camera, lowest first" } else { "PSNR by camera" };
     let by_camera = bars(&rows, (lowest - 5.0).max(0.0), title);
 
     let mut times: Vec<f64> = run.views.iter().filter_map(|v| v.time).collect();
@@ -242,11 +242,11 @@ fn scores(out: &mut String, run: &Run) {
         series.retain(|s| s.points.len() > 1 || s.name == "all");
     }
     let by_time = if times.len() > 1 { lines(&series, "seconds", "dB") } else { None };
-    panels(out, "Where and when it is good", [(title, by_camera), ("PSNR by time, dB", by_time)]);
+    panels(out, "Quality by camera and time", [(title, by_camera), ("PSNR by time, dB", by_time)]);
     if corrected {
         out.push_str(
-            "<p class=\"note\">In brackets: after the one affine colour matrix that suits all held-out views of the \
-             camera best. The rest of the error is no matter of white balance.</p>\n",
+            "<p class=\"note\">In brackets: after the best affine colour matrix for all held-out views of the \
+             camera. The remaining error is not caused by white balance.</p>\n",
         );
     }
 }
@@ -266,11 +266,11 @@ fn lives(out: &mut String, run: &Run) {
     let rows: Vec<(String, f64, String)> = counts.iter().enumerate().map(row).collect();
     // A scene in which all live for ever has nothing to tell.
     if counts.iter().filter(|n| **n > 0.0).count() > 1 {
-        let chart = bars(&rows, 0.0, "Gaussians by the share of the clip in which they can be seen");
+        let chart = bars(&rows, 0.0, "Gaussians by the share of the clip in which they are visible");
         panels(
             out,
-            "How long Gaussians live",
-            [("Share of all, by the part of the clip in which one can be seen", chart)],
+            "Lifespan of Gaussians",
+            [("Share of all Gaussians, by the part of the clip in which they are visible", chart)],
         );
     }
 }
@@ -301,7 +301,7 @@ fn conditions(out: &mut String, run: &Run) {
     if !rows.is_empty() {
         let head = ["views", "background", "step", "PSNR", "corrected", "SSIM", "instructions", "device"];
         let head = head.map(|h| format!("<th>{h}</th>")).concat();
-        let _ = write!(out, "<h2>What was measured</h2>\n<table><tr>{head}</tr>{rows}</table>\n");
+        let _ = write!(out, "<h2>Measurements</h2>\n<table><tr>{head}</tr>{rows}</table>\n");
     }
 }
 
@@ -331,29 +331,25 @@ fn costs(out: &mut String, run: &Run) {
         let _ = write!(table, "<tr><th>{}</th><td>{}</td></tr>", escape(name), escape(&value));
     };
     if total > 0.0 {
-        row("A step takes", format!("{} ms on average", short(total)));
+        row("Time per step", format!("{} ms on average", short(total)));
     }
     for (key, name) in [("evaluation_seconds", "Evaluation"), ("orbit_seconds", "Orbit film")] {
         if let Some(seconds) = run.number(key) {
             row(name, format!("{seconds:.1} s"));
         }
     }
-    for (key, name) in [("memory_estimate", "Memory, estimated before"), ("peak_memory", "Memory, at most")] {
+    for (key, name) in [("memory_estimate", "Memory, estimated"), ("peak_memory", "Peak memory")] {
         if let Some(bytes) = run.number(key).filter(|b| *b > 0.0) {
             row(name, human_bytes(bytes as u64));
         }
     }
     if let Some(seams) = run.info.get("seams").filter(|s| s.is_object()) {
         let flicker = |key: &str| seams.get(key).and_then(Value::as_f64).unwrap_or(f64::NAN);
-        let words = format!("{}/255, in their midst {}/255", short(flicker("across")), short(flicker("inside")));
-        row("Flicker where chunks meet", words);
+        let words = format!("{}/255, within chunks {}/255", short(flicker("across")), short(flicker("inside")));
+        row("Flicker at chunk boundaries", words);
     }
     let table = (!table.is_empty()).then(|| format!("<table>{table}</table>"));
-    panels(
-        out,
-        "What it cost",
-        [("A training step by stage", bars(&rows, 0.0, "time by stage")), ("Time and memory", table)],
-    );
+    panels(out, "Totals", [("Training step by stage", bars(&rows, 0.0, "time by stage")), ("Totals", table)]);
 }
 
 fn again(out: &mut String, run: &Run) {
@@ -388,8 +384,8 @@ fn again(out: &mut String, run: &Run) {
     if !lines.is_empty() {
         let _ = write!(
             out,
-            "<h2>Do it again</h2>\n<pre>{}</pre>\n<p class=\"note\">The same recipe gives the same bits with any number of \
-             threads on processors with the same instructions.</p>\n",
+            "<h2>Reproduce</h2>\n<pre>{}</pre>\n<p class=\"note\">The same recipe gives the same bits with any \
+             number of threads on processors with the same SIMD level.</p>\n",
             escape(&lines)
         );
     }

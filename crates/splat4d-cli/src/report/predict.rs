@@ -74,7 +74,8 @@ pub(crate) fn write(folder: &Path, run: &str, told: &Told, films: &[(String, Pat
 fn page(run: &str, told: &Told, films: &[(String, PathBuf)]) -> String {
     let mut body = String::new();
     let words = format!(
-        "{} frames observed, {} predicted, {} of them with pictures · {} nodes on {} moving Gaussians · scene of {}",
+        "{} frames observed, {} predicted, {} of them with images · {} nodes on {} moving Gaussians · the exported \
+         scene uses {}",
         told.observed_frames,
         told.horizon,
         told.pictured,
@@ -85,7 +86,7 @@ fn page(run: &str, told: &Told, films: &[(String, PathBuf)]) -> String {
     let _ = writeln!(body, "<header><h1>{}, predicted</h1><p>{}</p></header>", escape(run), escape(&words));
     if told.pictured < told.horizon {
         let beyond = told.horizon - told.pictured;
-        let _ = writeln!(body, "<p class=\"note\">{beyond} predicted frames have no picture to compare with.</p>");
+        let _ = writeln!(body, "<p class=\"note\">{beyond} predicted frames have no image to compare with.</p>");
     }
     let all: Vec<&ModelScores> = told.models.iter().chain(&told.assimilated).chain(&told.oracle).collect();
     table(&mut body, &all);
@@ -101,27 +102,27 @@ fn page(run: &str, told: &Told, films: &[(String, PathBuf)]) -> String {
     let errors = |e: &Option<Vec<f64>>| e.iter().flatten().map(|x| Some(*x)).collect::<Vec<_>>();
     panels(
         &mut body,
-        "By horizon",
+        "By forecast horizon",
         [
             ("PSNR of dynamic regions, dB", curve(&|m| m.psnr_dynamic_by_horizon.clone(), "dB")),
             ("PSNR, dB", curve(&|m| m.psnr_by_horizon.clone(), "dB")),
-            ("Distance of known points from the truth, scene units", curve(&|m| errors(&m.track_error), "units")),
-            ("Distance of nodes from the oracle's, scene units", curve(&|m| errors(&m.node_error), "units")),
+            ("Error of tracked points, scene units", curve(&|m| errors(&m.track_error), "units")),
+            ("Distance of nodes to the oracle's, scene units", curve(&|m| errors(&m.node_error), "units")),
         ],
     );
     if !films.is_empty() {
-        body.push_str("<h2>Truth, left, and prediction</h2>\n");
+        body.push_str("<h2>Truth (left) and prediction</h2>\n");
         for (camera, path) in films {
-            if let Some(film) = pictures::film_file(path, "Truth beside prediction") {
+            if let Some(film) = pictures::film_file(path, "Truth (left) and prediction") {
                 let _ = writeln!(body, "<p class=\"note\">camera {}</p>\n{film}", escape(camera));
             }
         }
     }
     body.push_str(
-        "<p class=\"note\">Where things move: pixels that differ from the last observed picture of the camera. Skill: 1 minus the \
-         mean squared error there over the baseline's; 0 is no better, below 0 is worse. Wins: share of the views nearer to \
-         the truth than the baseline's. Back-test: node error of forecasts from three moments of the observed part, \
-         by which the scene's model was chosen; nothing later had a say in it.</p>\n",
+        "<p class=\"note\">Dynamic regions: pixels that differ from the last observed image of the camera. Skill: 1 \
+         minus the ratio of the mean squared error there to the baseline's; 0 means equal, below 0 means worse. \
+         Wins: share of views nearer to the truth than the baseline's. Back-test: node error of forecasts from three \
+         times of the observed part. It selects the model of the exported scene; later frames are not used.</p>\n",
     );
     format!(
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" \
@@ -141,10 +142,10 @@ fn table(out: &mut String, models: &[&ModelScores]) {
         "wins over freeze",
         "over velocity",
         "back-test",
-        "last known points off by",
-        "spread: error / σ",
-        "fitted in",
-        "left the scene",
+        "error of points, last frame",
+        "error / predicted σ",
+        "fitting time",
+        "diverged",
     ];
     let head = heads.map(|h| format!("<th>{h}</th>")).concat();
     let number = |x: Option<f64>, digits: usize| x.map_or_else(String::new, |x| format!("{x:.digits$}"));

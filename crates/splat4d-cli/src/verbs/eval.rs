@@ -156,7 +156,7 @@ fn baseline(out: &OutputFolder, run: &Run, measure: &finish::Measure, console: &
         console.clear();
         if outcome.interrupted {
             return Err(splat4d::Error::new(ErrorKind::Interrupted, "the still scene is unfinished")
-                .remedy("Run `splat4d eval --baseline` again; it trains anew.")
+                .remedy("Run `splat4d eval --baseline` again; it trains again.")
                 .into());
         }
     }

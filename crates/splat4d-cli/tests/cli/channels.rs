@@ -142,7 +142,7 @@ fn masks_teach_a_run_its_labels_and_points_are_followed() {
     std::fs::write(&points, format!("camera,x,y,time\n{name},{width},1,0\n")).unwrap();
     let message = ask().refused();
     assert!(
-        message.contains("points.csv") && message.contains("line 2") && message.contains("not in a picture"),
+        message.contains("points.csv") && message.contains("line 2") && message.contains("outside the image"),
         "{message}"
     );
 }

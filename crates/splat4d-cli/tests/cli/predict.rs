@@ -79,7 +79,7 @@ fn what_cannot_be_predicted_is_refused_with_a_remedy() {
     assert!(actions("push.x,push.z\n1,2\n").contains("push.x"));
     assert!(actions("grip\n1,2\n").contains("line 2"));
     assert!(predict(&run, &["--model", "oracle"]).refused().contains("koopman"));
-    assert!(predict(&run, &["--oracle", str(&run)]).refused().contains("saw more of it"));
+    assert!(predict(&run, &["--oracle", str(&run)]).refused().contains("trained on more of it"));
     for flags in [["--horizon", "0"], ["--nodes", "999"], ["--seeds", "0"]] {
         predict(&run, &flags).refused();
     }

@@ -197,7 +197,7 @@ pub(super) fn between(
     if pairs.is_empty() {
         report
             .left
-            .push("No two pictures have enough in common: poses, exposure and sharpness were not compared.".into());
+            .push("No two images have enough in common: poses, exposure and sharpness were not compared.".into());
         return;
     }
     let told = |p: &Pair| PairReport {
@@ -234,7 +234,7 @@ pub(super) fn between(
             && let Some(g) = grade(off, EPIPOLAR).min(grade(own, OWN_PIXELS))
         {
             let what = format!(
-                "Camera {}: what it shows lies {off:.1} px (of 1920) beside where its pose and lens say.",
+                "Camera {}: its features are {off:.1} px (at 1920 px) from where its pose and lens project them.",
                 name(camera)
             );
             let words = (
@@ -249,7 +249,7 @@ pub(super) fn between(
                 let what = format!("Camera {} is {:.2} stops {way} than the others.", name(camera), green.abs());
                 let words = (
                     "Brightness that changes with the view, and fog that explains it.",
-                    "Lock exposure, correct its pictures, or keep exposure learnt.",
+                    "Lock exposure, correct its images, or keep exposure learnt.",
                 );
                 told.add((g, "exposure"), Some(name(camera)), (green, "stops"), what, words);
             }
@@ -264,7 +264,7 @@ pub(super) fn between(
                 );
                 let words = (
                     "Colours that change with the view.",
-                    "Lock white balance, correct its pictures, or keep exposure learnt.",
+                    "Lock white balance, correct its images, or keep exposure learnt.",
                 );
                 told.add((g, "white-balance"), Some(name(camera)), (tint, "stops"), what, words);
             }

@@ -142,7 +142,7 @@ fn take(capture: &Capture, seen: &[Seen], report: &mut Report) {
         (0..seen.len()).filter(|&c| capture.cameras[c].fixed && !seen[c].stands.is_empty()).collect();
     if fixed.len() < seen.len() {
         report.left.push(
-            "Moving cameras: whether a camera moved, its flicker, frames and clock are told of fixed ones only.".into(),
+            "Moving cameras: movement, flicker, frames and time offset are checked for fixed cameras only.".into(),
         );
         return;
     }
@@ -155,7 +155,7 @@ fn take(capture: &Capture, seen: &[Seen], report: &mut Report) {
             None,
             (fixed.len() as f64, "cameras"),
             what,
-            ("Good pictures only near the cameras.", "Six and more, all round the scene."),
+            ("Good quality only near the cameras.", "Six and more, all round the scene."),
         );
     }
     if fixed.len() < 2 {
@@ -201,7 +201,7 @@ pub(super) fn volume_of(seen: &[&Seen], target: [f64; 3], report: &mut Report) {
         return;
     };
     if let Some(g) = grade(1.0 / share.max(f64::MIN_POSITIVE), VOLUME.map(|v| 1.0 / v)) {
-        let what = format!("Of the space in which something moves three cameras see {:.0} %.", 100.0 * share);
+        let what = format!("Three cameras see {:.0} % of the space in which something moves.", 100.0 * share);
         let words =
             ("Moving things that dissolve between the views.", "Turn the cameras to the action, or film with more.");
         Told { report }.add((g, "volume"), None, (100.0 * share, "%"), what, words);

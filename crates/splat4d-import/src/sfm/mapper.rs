@@ -498,7 +498,8 @@ impl Map<'_> {
         let known = self.known(sight);
         if known.len() < SEES {
             self.reasons[sight] = format!(
-                "it shares {} places with the others, {SEES} are needed: the overlap is small, or its pictures look different",
+                "it shares {} points with the others, {SEES} are needed: the overlap is small, or its images look \
+                 different",
                 known.len()
             );
             return false;

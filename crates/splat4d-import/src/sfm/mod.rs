@@ -146,7 +146,7 @@ fn solve_sights(
         return Ok(solution(who, sights, mapped, links.len(), 1.0));
     }
     let alone = || {
-        Error::input("no two of these pictures show the same things")
+        Error::input("no two of these images show the same scene")
             .remedy("Film one scene from neighbouring places (at most 30 degrees apart), in focus and in light.")
     };
     if links.is_empty() {

@@ -109,7 +109,7 @@ impl sfm::pictures::Pictures for Stored<'_> {
     fn load(&self, camera: usize, frame: usize) -> Result<Planes<f32>> {
         let picture = self.rgb(camera, frame)?;
         if [picture.width, picture.height] != self.pictures[camera].size {
-            return Err(Error::input("a stored picture is of another size than the rest")
+            return Err(Error::input("a stored image is of another size than the rest")
                 .at(self.folder.join(self.pictures[camera].file(frame)).display())
                 .remedy("Remove the folder \"images\" and import again."));
         }

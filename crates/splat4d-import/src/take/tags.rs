@@ -90,7 +90,7 @@ pub(super) fn measured(
     let sightings = seen.len();
     let placed = placed(&seen);
     of(board, &placed, solved.up).map_err(|e| match sightings {
-        0 => Error::input(format!("no tag of {} is seen in {} pictures that were looked at", board.family.name, looks.len()))
+        0 => Error::input(format!("no tag of {} was found in {} images", board.family.name, looks.len()))
             .remedy(
                 "Is it this family, is each of its bits at least two pixels wide, and is there white around every tag? Without \
                  --board the unit is a guess.",

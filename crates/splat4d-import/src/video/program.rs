@@ -10,8 +10,8 @@ use std::sync::mpsc::{Receiver, channel};
 use std::thread::JoinHandle;
 
 /// How to install what is missing.
-const INSTALL: &str = "Install it: apt install ffmpeg (Debian, Ubuntu), brew install ffmpeg (macOS) or winget install \
-                       ffmpeg (Windows). Or extract the frames elsewhere and give folders of pictures.";
+const INSTALL: &str = "Install it: apt install ffmpeg (Debian, Ubuntu), brew install ffmpeg (macOS) or winget \
+                       install ffmpeg (Windows). Or extract the frames elsewhere and give folders of images.";
 /// The first version that knows `-fps_mode`; the older name is gone from newer ones.
 const FPS_MODE_SINCE: (u32, u32) = (5, 1);
 /// The first version whose `showinfo` can leave out checksums, and the oldest that is used.

@@ -243,7 +243,7 @@ fn what_is_no_video_is_refused_with_a_reason() {
     for (name, word) in [
         ("empty.mp4", "empty"),
         ("noise.mp4", "damaged"),
-        ("sound.wav", "no pictures"),
+        ("sound.wav", "no images"),
         ("headless.mp4", "moov"),
         ("absent.mp4", "cannot be read"),
     ] {

@@ -28,7 +28,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
     if take.frames.is_empty() {
         return Err(located(
             Error::input("the capture has no frames")
-                .remedy("Check that the file lists pictures and that the pictures lie where it says."),
+                .remedy("Check that the file lists images and that the images lie where it says."),
         ));
     }
     options::check_rate("frame rate", take.fps).map_err(located)?;
@@ -190,7 +190,7 @@ fn check_frame(frame: &mut RawFrame, camera: &str, options: &CaptureOptions) -> 
         ("depth", frame.depth.as_ref().map(|d| &d.path)),
         ("flow", frame.flow.as_ref()),
         ("mask of labels", frame.labels.as_ref()),
-        ("picture of features", frame.features.as_ref()),
+        ("image of features", frame.features.as_ref()),
     ];
     for (what, file) in files.into_iter().filter_map(|(what, file)| Some((what, file?))) {
         if !file.is_file() {
@@ -297,7 +297,7 @@ fn check_duplicates(take: &mut Take, cameras: &[Rig]) -> Result<()> {
                 continue;
             }
             let what = format!(
-                "camera {} has two pictures at {} s: {} and {}",
+                "camera {} has two images at {} s: {} and {}",
                 cameras[frame.camera].name,
                 frame.time,
                 other.image.display(),
@@ -467,7 +467,7 @@ fn fit_pictures(take: &mut Take, options: &CaptureOptions) -> Result<(bool, Vec<
     }
     if let Some((image, size, stated)) = resized.first() {
         let what = format!(
-            "{} pictures are of another size than their intrinsics are for, which are scaled to them: {} is {}x{}, not \
+            "{} images are of another size than their intrinsics are for, which are scaled to them: {} is {}x{}, not \
              {}x{}.",
             resized.len(),
             image.display(),
@@ -545,9 +545,9 @@ fn check_masks(take: &Take, has_alpha: bool) -> Result<()> {
         }
     }
     let place = first.mask.as_ref().unwrap_or(&first.image);
-    Err(Error::input("the masks exclude everything: no picture has a foreground pixel")
+    Err(Error::input("the masks exclude everything: no image has a foreground pixel")
         .at(place.display())
-        .remedy("Masks are white where the picture counts: invert them, or leave them out of the capture."))
+        .remedy("Masks are white where the image counts: invert them, or leave them out of the capture."))
 }
 
 /// Masks whose shape is compared with that of their image's before training loads all.

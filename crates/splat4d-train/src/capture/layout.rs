@@ -162,7 +162,7 @@ fn remark(take: &mut Take, path: &Path, marker: &str, others: &[&str]) {
     let list = |names: &[&str]| names.join(", ");
     let choose = |other: &str| format!("To read another, give its path: {}.", path.join(other).display());
     if let Some(other) = same.first() {
-        let what = format!("{marker} is read and {other} is not: the former says which pictures are held out.");
+        let what = format!("{marker} is read and {other} is not: the former says which images are held out.");
         take.notes.push(format!("{what} {}", choose(other)));
     }
     if let Some(other) = foreign.first() {

@@ -185,7 +185,7 @@ pub(super) fn camera_of(row: &[f64], (width, height): (usize, usize), poses: Pos
     // Sides of reduced copies are rounded.
     let rounding = 1.0 / width.min(height).max(1) as f64;
     if aspect.is_nan() || (aspect - 1.0).abs() > MAX_ASPECT_CHANGE.max(rounding) {
-        let what = format!("the pose is for pictures of {stated_width}x{stated_height}, not {width}x{height}");
+        let what = format!("the pose is for images of {stated_width}x{stated_height}, not {width}x{height}");
         return Err(Error::input(what).remedy("Extract the frames without cropping."));
     }
     // Frames are often extracted at half the size that the calibration states.

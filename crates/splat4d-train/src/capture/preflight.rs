@@ -114,7 +114,7 @@ impl Capture {
         if self.points.is_none() {
             findings.push(finding(
                 Severity::Note,
-                "The capture has no initial points: training looks for some in its pictures.".into(),
+                "The capture has no initial points: training finds points in its images.".into(),
                 "A sparse cloud (COLMAP, or any coloured .ply) gives a better start.",
             ));
         }
@@ -163,7 +163,7 @@ impl Capture {
             findings.push(finding(
                 Severity::Warning,
                 format!("The cameras cover only {widest:.0}° around the scene: depth is poorly determined."),
-                "Spread the cameras, or expect good pictures only between them.",
+                "Spread the cameras, or expect good quality only between them.",
             ));
         }
         if let Some((angle, i, j)) = closest.filter(|c| c.0 < CLOSE_DEGREES) {

@@ -67,14 +67,14 @@ pub(super) fn order(
     let count = names.len();
     if sequence == Sequence::Auto && moment && !one_each && count > 1 {
         notes.push(format!(
-            "The capture states no times, and its names do not number the frames of a film: its {count} pictures are \
-             one moment. If they are frames of a film, say --set capture.sequence=video."
+            "The capture has no times, and its names do not number the frames of a video: its {count} images are \
+             given the same time. If they are frames of a video, use --set capture.sequence=video."
         ));
     }
     if sequence == Sequence::Auto && !moment && !rig && count > 1 && !still(&groups[0], poses) {
         warnings.push(format!(
-            "The capture states no times: its {count} pictures are numbered like frames ({}) and taken for a film of \
-             one moving camera at {fps} frames per second. If they are photos of one moment, say --set \
+            "The capture has no times: its {count} images are numbered like frames ({}) and read as a video of one \
+             moving camera at {fps} frames per second. If they are photos of one time, use --set \
              capture.sequence=photos.",
             names[0]
         ));

@@ -101,7 +101,7 @@ pub fn support(
 ) -> Result<Judged> {
     scene.without_head("the search for floaters")?;
     if held.is_empty() {
-        return Err(Error::input("no view was held out: nobody can say what floats")
+        return Err(Error::input("no view was held out, which is needed to find floaters")
             .remedy("Train with held-out views, or delete by a selection"));
     }
     let mut judge = Judge::new(scene, antialias);

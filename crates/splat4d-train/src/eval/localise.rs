@@ -109,9 +109,9 @@ pub fn localise(
     question: Question,
     told: &mut dyn FnMut(usize, usize),
 ) -> Result<Located> {
-    assert!(!starts.is_empty(), "a picture is looked for from somewhere");
+    assert!(!starts.is_empty(), "localisation has a start camera");
     let fits = |c: &Camera| (c.width, c.height) == (picture.width, picture.height);
-    assert!(starts.iter().all(fits), "starts have the picture's size");
+    assert!(starts.iter().all(fits), "starts have the image's size");
     let backend = device::cpu(RenderConfig { antialias: question.antialias, ..RenderConfig::default() });
     let (instant, image) = (Evaluation::default(), Image::default());
     let mut search = Search { scene, backend, instant, image, lens: question.lens };

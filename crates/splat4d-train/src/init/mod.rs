@@ -202,7 +202,7 @@ pub fn seeds(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>, moving: bo
                 .remedy("Add a points file to the capture, or use --set init=random"));
         }
         Source::Pictures if !have_points => {
-            return Err(Error::input("no points were found in the pictures")
+            return Err(Error::input("no points were found in the images")
                 .remedy("Check the poses with `splat4d info CAPTURE`, or use --set init=random"));
         }
         Source::Hull if !frames.has_masks() => {

@@ -207,14 +207,14 @@ mod tests {
             let choice = made.choose(fixed);
             assert!(choice.motion == motion && choice.why.contains(word), "{choice:?}");
         };
-        is(Made::new(6, 1, 4, true), true, "still", "one moment");
+        is(Made::new(6, 1, 4, true), true, "still", "the same time");
         is(Made::new(6, 10, 0, true), true, "still", "0.000 %");
         is(Made::new(6, 10, 4, true), true, "spacetime", "6 cameras");
         // Shutters that do not open at once: by little, and by up to a frame.
         is(Made { late: 0.002, ..Made::new(6, 10, 4, true) }, true, "spacetime", "6 cameras");
         is(Made { late: 0.005, ..Made::new(6, 10, 4, true) }, true, "spacetime", "4 cameras");
         // What is to go on needs Gaussians that last, where cameras can follow them.
-        is(Made { observe: 0.8, ..Made::new(6, 10, 4, true) }, true, "tracked", "to be predicted");
+        is(Made { observe: 0.8, ..Made::new(6, 10, 4, true) }, true, "tracked", "prediction");
         is(Made { observe: 0.8, ..Made::new(2, 10, 4, true) }, true, "control", "2.0 cameras");
         is(Made { observe: 0.8, ..Made::new(1, 50, 4, true) }, false, "control", "one camera");
         is(Made::new(1, 50, 4, true), false, "control", "one camera");

@@ -119,8 +119,10 @@ impl Program for ControlProgram {
 
     fn check(&self, plan: &Plan) -> Result<()> {
         if plan.times < 2 {
-            return Err(Error::input("control nodes learn from motion, and the capture has one moment only")
-                .remedy("Use --motion still"));
+            return Err(Error::input(
+                "control nodes learn from motion, but all images of the capture have the same time",
+            )
+            .remedy("Use --motion still"));
         }
         Ok(())
     }
@@ -132,7 +134,7 @@ impl Program for ControlProgram {
     fn suits(&self, seen: &Seen) -> Option<String> {
         let one = seen.masks && !seen.is_long();
         one.then(|| {
-            format!("{} a moment, and masks show one object: few nodes move all of it", seen.cameras_in_words())
+            format!("{} each time, and masks show one object: few nodes move all of it", seen.cameras_in_words())
         })
     }
 

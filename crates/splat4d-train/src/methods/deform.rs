@@ -98,9 +98,9 @@ impl Program for DeformProgram {
     }
 
     fn suits(&self, seen: &Seen) -> Option<String> {
-        let length = if seen.is_long() { format!(" of {}", seen.times) } else { String::new() };
+        let times = if seen.is_long() { format!("each of {} times", seen.times) } else { "each time".to_owned() };
         Some(format!(
-            "{} a moment{length}: one cloud that a network moves shares what every moment shows",
+            "{} {times}: one set of Gaussians, deformed by a network, uses all times together",
             seen.cameras_in_words()
         ))
     }
@@ -130,7 +130,7 @@ impl Program for DeformProgram {
 
 fn check(plan: &Plan) -> Result<()> {
     if plan.times < 2 {
-        return Err(Error::input("every picture of the capture is of one moment: there is nothing to deform")
+        return Err(Error::input("all images of the capture have the same time: there is nothing to deform")
             .remedy("Train it with --motion still"));
     }
     Deform::new(spec(plan), &mut Params::<f32>::new(0, 1, &[])).map(drop).map_err(|e| {
@@ -197,7 +197,7 @@ fn networks(stage: &mut Stage, plan: &Plan) {
     let rate = Rate { start: r.deform.lr_init, end: r.deform.lr_final };
     let warm_up = WARM_UP.min(r.run.iterations / WARM_UP_SHARE);
     let made = Deform::new(spec(plan), &mut Params::<f32>::new(0, 1, &[]));
-    let model = made.expect("a recipe's network is one that can be made: its knobs were checked");
+    let model = made.expect("a recipe's network can be built: its settings were checked");
     stage.groups.extend(model.network_columns().iter().map(|c| Group { warm_up, ..Group::new(c, rate) }));
     let fast = Rate { start: GRID_SPEEDUP * rate.start, end: GRID_SPEEDUP * rate.end };
     let levels = model.grid_columns();

@@ -96,14 +96,14 @@ impl Program for SpacetimeProgram {
         if seen.depth && !seen.masks && !seen.predicted {
             let cameras = seen.cameras_in_words();
             return Some(format!(
-                "{cameras} a moment, and depth maps say where things are then: Gaussians begin there"
+                "{cameras} each time, and depth maps give positions at that time, from which Gaussians start"
             ));
         }
         let moving =
             seen.changing.map_or_else(String::new, |share| format!(", {:.1} % of the pixels move", 100.0 * share));
         (seen.cameras >= MANY_CAMERAS).then(|| {
             let cameras = seen.cameras;
-            format!("{cameras:.0} cameras see every moment{moving}: explicit motion with lives needs no network")
+            format!("{cameras:.0} cameras see every time{moving}: enough for explicit motion with lifespans")
         })
     }
 

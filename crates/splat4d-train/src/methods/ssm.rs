@@ -90,8 +90,10 @@ impl Program for SsmProgram {
 
     fn check(&self, plan: &Plan) -> Result<()> {
         if plan.times < 2 {
-            return Err(Error::input("a scan over time learns from motion, and the capture has one moment only")
-                .remedy("Use --motion still"));
+            return Err(Error::input(
+                "a state-space model learns from motion, but all images of the capture have the same time",
+            )
+            .remedy("Use --motion still"));
         }
         Ok(())
     }

@@ -121,7 +121,7 @@ impl Program for StillProgram {
 
     fn suits(&self, seen: &Seen) -> Option<String> {
         if seen.times <= 1 {
-            return Some("all pictures are of one moment".into());
+            return Some("all images have the same time".into());
         }
         if let Some(agreement) = seen.agreement.filter(Agreement::is_static) {
             return Some(format!(
@@ -131,7 +131,7 @@ impl Program for StillProgram {
             ));
         }
         let percent = 100.0 * seen.changing.filter(|share| *share < MOVING)?;
-        Some(format!("cameras stand still and only {percent:.3} % of their pixels ever change"))
+        Some(format!("cameras are fixed and only {percent:.3} % of their pixels change"))
     }
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {

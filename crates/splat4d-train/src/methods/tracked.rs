@@ -93,9 +93,9 @@ impl Program for TrackedProgram {
             let learns = |name: &&str| program(name).is_ok_and(|p| p.capabilities(plan).fixed_cameras < least);
             let others: Vec<&str> = MODELS.iter().copied().filter(learns).collect();
             return Err(Error::input(format!(
-                "`tracked` needs at least {least} fixed cameras that take their pictures together: it follows \
-                 every Gaussian from one moment to the next, and what fewer cameras see of one moment does not say where \
-                 things are. At {:.3} s this capture has {} training pictures of fixed cameras",
+                "`tracked` needs at least {least} fixed, synchronised cameras: it tracks every Gaussian from frame \
+                 to frame, and fewer cameras do not determine positions in a frame. At {:.3} s this capture has {} \
+                 training images of fixed cameras",
                 fewest.0, fewest.1
             ))
             .remedy(format!("Use another --motion: {}", others.join(", "))));
@@ -110,7 +110,7 @@ impl Program for TrackedProgram {
     fn suits(&self, seen: &Seen) -> Option<String> {
         (seen.predicted && seen.fewest >= LEAST_CAMERAS && !seen.is_long()).then(|| {
             let cameras = seen.cameras_in_words();
-            format!("{cameras} each moment, and what is to be predicted needs Gaussians that last and can be followed")
+            format!("{cameras} each time, and prediction needs persistent Gaussians that can be tracked")
         })
     }
 

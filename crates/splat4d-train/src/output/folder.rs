@@ -100,7 +100,7 @@ impl OutputFolder {
         }
         let before = path.exists();
         std::fs::create_dir_all(path).map_err(|e| {
-            let error = Error::environment("the folder cannot be made", e).at(path.display());
+            let error = Error::environment("the folder cannot be created", e).at(path.display());
             error.remedy("Choose another place with -o: one where you may write, below a folder and not below a file")
         })?;
         let owner = Owner::of(path, request.command).inspect_err(|_| {

@@ -105,7 +105,7 @@ pub fn write_atomically_with(path: &Path, write: &mut dyn FnMut(&mut dyn Write) 
         return write(&mut file).map_err(|e| e.at(path.display()));
     }
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    std::fs::create_dir_all(folder).map_err(|e| place(e, "the folder cannot be made"))?;
+    std::fs::create_dir_all(folder).map_err(|e| place(e, "the folder cannot be created"))?;
     if path.is_dir() {
         return Err(failed(std::io::ErrorKind::IsADirectory.into()));
     }

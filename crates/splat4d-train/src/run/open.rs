@@ -101,9 +101,9 @@ pub(super) fn check_flow(capture: &Capture, recipe: &Recipe) -> Result<()> {
     if recipe.loss.flow == 0.0 || own || capture.train.iter().any(|&i| capture.frames[i].flow.is_some()) {
         return Ok(());
     }
-    Err(Error::input("lambda_flow compares flow, and the capture's training pictures have none").remedy(
-        "Give cameras a `flow` in capture.json (docs/capture-format.md), follow the pictures with --set \
-             capture.flow=own, or leave lambda_flow at 0",
+    Err(Error::input("lambda_flow compares flow, and the capture's training images have none").remedy(
+        "Give cameras a `flow` in capture.json (docs/capture-format.md), compute it from the images with --set \
+         capture.flow=own, or leave lambda_flow at 0",
     ))
 }
 

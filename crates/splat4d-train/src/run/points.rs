@@ -139,7 +139,7 @@ mod tests {
         let train = || {
             let mut looked = false;
             let mut listen = |e: &Event| {
-                looked |= matches!(e, Event::Phase { name, .. } if name == "points from pictures");
+                looked |= matches!(e, Event::Phase { name, .. } if name == "points from images");
             };
             let options = TrainOptions::default();
             train(place.open(&recipe), recipe.clone(), &run, &options, &AtomicBool::new(false), &mut listen).unwrap();

@@ -59,7 +59,7 @@ impl Emphasis {
             }
         };
         self.moves.reset(1, color.height, color.width);
-        assert_eq!(still[0].len(), color.pixels(), "pictures of one camera have one size");
+        assert_eq!(still[0].len(), color.pixels(), "images of one camera have one size");
         // Rows in parallel: in series this was a twentieth of a step on two cores, and a quarter beside a graphics card.
         let simd = Simd::detect();
         self.moves.data.par_chunks_mut(color.width).with_min_len(ROWS).enumerate().for_each(|(y, row)| {

@@ -142,7 +142,7 @@ pub(super) fn run(step: &Step, scene: &mut Scene<f32>, context: &dyn Context) ->
         }
         Step::Floaters { strength } => {
             if !(0.0..=1.0).contains(strength) {
-                return Err(Error::input(format!("a strength of {strength}")).remedy("Give 0 to 1"));
+                return Err(Error::input(format!("invalid strength {strength}")).remedy("Give 0 to 1"));
             }
             let selected = context.floaters(scene, *strength)?;
             keep(scene, &selected, false);

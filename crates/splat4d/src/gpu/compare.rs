@@ -92,7 +92,7 @@ impl GpuRenderer {
         let start = Instant::now();
         let (n, size) = (shot.splats.len(), [shot.camera.width, shot.camera.height]);
         let shape = [target.truth.channels, target.truth.width, target.truth.height];
-        assert_eq!(shape, [CHANNELS, size[0], size[1]], "a picture and its truth have one shape");
+        assert_eq!(shape, [CHANNELS, size[0], size[1]], "an image and its truth have one shape");
         if !self.can_compare(n, size) {
             return Ok(None);
         }

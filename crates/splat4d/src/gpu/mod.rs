@@ -184,7 +184,7 @@ impl GpuRenderer {
         if across > MOST_GROUPS || band_rows == 0 {
             return Err(Error::new(
                 ErrorKind::Unsupported,
-                format!("a picture {w} pixels wide is too large for the GPU"),
+                format!("an image {w} pixels wide is too large for the GPU"),
             )
             .remedy("Render on the CPU."));
         }
@@ -358,7 +358,7 @@ impl GpuRenderer {
         staging.map_async(wgpu::MapMode::Read, .., |_| ());
         gpu.wait()?;
         let lost = |e: wgpu::MapRangeError| {
-            Error::new(ErrorKind::Unsupported, format!("the picture cannot be read from the GPU ({e})"))
+            Error::new(ErrorKind::Unsupported, format!("the image cannot be read from the GPU ({e})"))
                 .at(gpu.name())
                 .remedy("Render on the CPU.")
         };

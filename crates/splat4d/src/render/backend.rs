@@ -164,7 +164,7 @@ pub(crate) fn refusal(who: &str, what: &str) -> Error {
 
 impl<F: Real> Backend<F> for Renderer<F> {
     fn can(&self, wanted: &Wanted) -> Result<()> {
-        if wanted.compare { Err(refusal("the renderer of the CPU", "compare pictures")) } else { Ok(()) }
+        if wanted.compare { Err(refusal("the renderer of the CPU", "compare images")) } else { Ok(()) }
     }
 
     fn render(&mut self, shot: &Shot<'_, F>, out: &mut Image<F>) -> Result<()> {

@@ -358,7 +358,7 @@ impl<F: Real> Renderer<F> {
         let plane = |planes: Option<&'_ Planes<F>>, channels: usize| {
             if let Some(p) = planes {
                 let shape = [p.channels, p.height, p.width];
-                assert_eq!(shape, [channels, size[1], size[0]], "a picture's gradient has the picture's shape");
+                assert_eq!(shape, [channels, size[1], size[0]], "an image's gradient has the image's shape");
             }
         };
         plane(Some(grads.color), 3);

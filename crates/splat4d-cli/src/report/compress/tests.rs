@@ -94,7 +94,7 @@ fn what_is_missing_or_strange_costs_no_page() {
     let html = page(folder.path());
     assert!(html.contains("<table>") && !html.contains("NaN") && !html.contains("Stages"), "{html}");
     std::fs::write(folder.path().join(FILE), "{\"after\": 3}").unwrap();
-    assert!(page(folder.path()).contains("not as this version"));
+    assert!(page(folder.path()).contains("written by another version"));
     std::fs::write(folder.path().join(FILE), "{\"after\":").unwrap();
     assert!(Run::open(folder.path()).unwrap_err().to_string().contains(FILE));
 }

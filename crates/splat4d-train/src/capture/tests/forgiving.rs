@@ -103,7 +103,7 @@ fn resized_pictures_scale_their_intrinsics_and_cropped_ones_are_refused() {
     let capture = open(&sample);
     let view = &capture.frames[3].view;
     assert_eq!((view.width, view.height, view.intrinsics.fx, view.intrinsics.cy), (WIDTH, HEIGHT, FOCAL, 8.0));
-    assert!(says(&capture.warnings, &["9 pictures", "cam00.png is 24x16, not 48x32"]), "{:?}", capture.warnings);
+    assert!(says(&capture.warnings, &["9 images", "cam00.png is 24x16, not 48x32"]), "{:?}", capture.warnings);
     sample.edit("transforms.json", |v| v["h"] = json!(2 * HEIGHT + 6));
     assert_says(&refuse(&sample), &["cam00", "24x16", "48x38"]);
     // Any picture is looked at, not only the first.
@@ -176,7 +176,7 @@ fn photos_without_times_are_one_moment() {
         assert_eq!((capture.timing, capture.times()), (Timing::Moment, vec![0.0]));
         assert!(capture.cameras.len() == 20 && capture.fixed_cameras());
         assert_eq!((capture.cameras[7].name.as_str(), capture.held.as_slice()), ("cam07", &[0, 8, 16][..]));
-        assert!(says(&capture.notes, &["20 pictures are one moment", "capture.sequence=video"]), "{:?}", capture.notes);
+        assert!(says(&capture.notes, &["20 images are given the same time", "capture.sequence=video"]), "{:?}", capture.notes);
         assert!(capture.warnings.is_empty());
     }
     let held = CaptureOptions { hold_out: Some("camera=cam00".parse().unwrap()), ..CaptureOptions::default() };
@@ -192,7 +192,7 @@ fn numbered_frames_without_times_are_a_film() {
     for path in [sample.root().to_owned(), sample.path("sparse")] {
         let capture = Capture::open(&path, &CaptureOptions::default()).unwrap();
         assert_eq!((capture.timing, capture.times().len(), capture.cameras.len()), (Timing::Numbers, 20, 1));
-        let parts = ["20 pictures", "frame_0001.png", "film of one moving camera", "capture.sequence=photos"];
+        let parts = ["20 images", "frame_0001.png", "video of one moving camera", "capture.sequence=photos"];
         assert!(says(&capture.warnings, &parts), "{:?}", capture.warnings);
     }
     let photos = open_as(&sample, Sequence::Photos);

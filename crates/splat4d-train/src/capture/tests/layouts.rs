@@ -109,7 +109,7 @@ fn eight_bits_of_any_picture() {
     let read = Rgb8::read(&sample.path("images/cam01/0006.png")).unwrap();
     assert_eq!((read.width, read.height, read.data.len()), (WIDTH, HEIGHT, WIDTH * HEIGHT * 3));
     assert_eq!(read.data[2], 47, "the blue of camera 1, frame 1");
-    assert!(Rgb8::decode(b"no picture", &sample.path("x.png")).unwrap_err().to_string().contains("x.png"));
+    assert!(Rgb8::decode(b"no image", &sample.path("x.png")).unwrap_err().to_string().contains("x.png"));
 }
 
 #[test]

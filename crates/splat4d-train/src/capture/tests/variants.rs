@@ -510,7 +510,7 @@ fn standard_folders_of_colmap_are_read() {
         let view = &capture.frames[3].view;
         assert_eq!((view.width, view.height, view.intrinsics.fx), (WIDTH / 2, HEIGHT / 2, FOCAL / 2.0));
         assert!(capture.warnings.is_empty() && capture.frames[3].image.starts_with(sample.path("images_2")));
-        assert_said(&capture, Aspect::Assumed, Severity::Note, &["9 pictures", "12x8, not 24x16"]);
+        assert_said(&capture, Aspect::Assumed, Severity::Note, &["9 images", "12x8, not 24x16"]);
     }
     assert_eq!(open(&colmap_at("sparse/0", &["images_2"])).frames[0].view.width, WIDTH / 2);
 }

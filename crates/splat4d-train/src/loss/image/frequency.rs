@@ -58,7 +58,7 @@ impl<F: Real> Frequency<F> {
         weight: f64,
         d: &mut Planes<F>,
     ) -> f64 {
-        assert!(image.data.len() == truth.data.len() && d.data.len() == image.data.len(), "pictures of one shape");
+        assert!(image.data.len() == truth.data.len() && d.data.len() == image.data.len(), "images of one shape");
         let (w, h) = (image.width, image.height);
         if w == 0 || h == 0 {
             return 0.0;

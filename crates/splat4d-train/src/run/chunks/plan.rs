@@ -80,7 +80,7 @@ impl ChunkPlan {
         let (half, chunks) = (self.overlap / 2, self.cuts.len() + 1);
         let reach = (MOVED * ((self.take[1] - self.take[0]) / chunks) as f64) as usize;
         for k in 0..self.cuts.len() {
-            listen(&Event::Phase { name: "looking for quiet moments".into(), done: k, total: self.cuts.len() });
+            listen(&Event::Phase { name: "searching for chunk boundaries".into(), done: k, total: self.cuts.len() });
             let cut = self.cuts[k];
             let first = cut - reach - half;
             let mut change = vec![0.0; 2 * (reach + half)];

@@ -62,5 +62,5 @@ fn a_take_is_cut_where_it_was_told() {
     assert_eq!(last(&open("0.0001").unwrap(), &open("0.0001").unwrap().train), 0.0);
     let photos = recipe(&["capture.observe=0.5", "max_frames=1"]);
     let message = open_capture(place.capture.path(), &photos).unwrap_err().to_string();
-    assert!(message.contains("one moment"), "{message}");
+    assert!(message.contains("the same time"), "{message}");
 }

@@ -135,7 +135,7 @@ fn a_loss_of_more_terms_is_said_once_and_computed_by_the_cpu() {
     let Some(mut trainer) = on_gpu(&bed, &recipe) else { return };
     let mut cpu = bed.start(&recipe);
     let (mse, notices) = finish(&mut trainer, "total variation");
-    assert!(notices.len() == 1 && notices[0].contains("the CPU compares pictures"), "{notices:?}");
+    assert!(notices.len() == 1 && notices[0].contains("the CPU compares images"), "{notices:?}");
     let expected = finish(&mut cpu, "total variation").0;
     assert!((mse[0] / expected[0] - 1.0).abs() < FIRST.1, "{mse:?} {expected:?}");
 }
