@@ -4,6 +4,9 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
+#[path = "tidy/words.rs"]
+mod words;
+
 /// The allowed order of a crate's top modules: a module may import those before it. Names that do not exist yet
 /// hold a place for what the design foresees.
 const ORDER: [(&str, &[&str]); 8] = [
@@ -197,31 +200,6 @@ const ROOT_DOCS: [&str; 6] =
 /// Longest pages, in lines: a longer one covers two subjects.
 const PAGE_LINES: usize = 250;
 const README_LINES: usize = 150;
-
-/// Phrases that documents do not use, because readers have to translate them into the field's terms; outside of code. A phrase
-/// begins a word: `picture` also finds `pictures`. CONTRIBUTING.md, "Language", says what to write.
-const FORBIDDEN: [&str; 20] = [
-    "anew",
-    "are no numbers",
-    "are told",
-    "at last",
-    "beside",
-    "everybody",
-    "goes back",
-    "is no number",
-    "is told",
-    "is worth",
-    "knob",
-    "made up",
-    "made-up",
-    "nobody",
-    "of before",
-    "picture",
-    "tells",
-    "the way back",
-    "upkeep",
-    "whoever",
-];
 
 /// Folders of the repository that a path in a document begins with.
 const ROOTS: [&str; 6] = ["crates/", "docs/", "examples/", "studies/", "xtask/", ".ci/"];
@@ -462,82 +440,6 @@ fn libraries_do_not_print_and_splat4d_opens_no_file() {
 /// Every document that is checked, in order.
 fn documents() -> Vec<String> {
     ROOT_DOCS.map(str::to_owned).into_iter().chain(files("docs", "md")).collect()
-}
-
-/// A document's prose: fenced blocks, code spans and the targets of links are blank; lines stay where they are.
-fn prose(text: &str) -> String {
-    let mut out = String::new();
-    let mut fenced = false;
-    for line in text.lines() {
-        let fence = line.trim_start().starts_with("```");
-        fenced ^= fence;
-        if !fenced && !fence {
-            // Odd parts are code spans; a span ends on its line.
-            let spoken: Vec<&str> = line.split('`').step_by(2).collect();
-            let spoken = spoken.join(" ");
-            let mut parts = spoken.split("](");
-            out += parts.next().unwrap_or("");
-            for part in parts {
-                out += part.split_once(')').map_or("", |(_, rest)| rest);
-            }
-        }
-        out.push('\n');
-    }
-    out
-}
-
-/// Where prose has one of the phrases: line and phrase.
-fn forbidden(text: &str) -> Vec<(usize, &'static str)> {
-    let mut found = Vec::new();
-    for (at, line) in prose(text).lines().enumerate() {
-        let line = line.to_lowercase();
-        for phrase in FORBIDDEN {
-            let begins =
-                |(at, _): (usize, &str)| !line[..at].ends_with(|c: char| c.is_alphanumeric() || c == '-' || c == '_');
-            if line.match_indices(phrase).any(begins) {
-                found.push((at + 1, phrase));
-            }
-        }
-    }
-    found
-}
-
-#[test]
-fn documents_use_the_terms_of_the_field() {
-    let sample = "A picture.\n`picture`, [a](knob.md)\n```\nknob\n```\nTells, retells.\n";
-    assert_eq!(forbidden(sample), [(1, "picture"), (6, "tells")], "phrases are found in prose and only there");
-    let mut troubles = Vec::new();
-    for doc in documents() {
-        let found = forbidden(&read(&doc));
-        troubles.extend(found.into_iter().map(|(line, phrase)| format!("{doc}:{line}: \"{phrase}\"")));
-    }
-    for path in sources() {
-        let text = read(&path);
-        let found = forbidden(&spoken(&path, &text));
-        troubles.extend(found.into_iter().map(|(line, phrase)| format!("{path}:{line}: \"{phrase}\"")));
-    }
-    report(troubles, "Use the term of the field: CONTRIBUTING.md, \"Language\".");
-}
-
-/// What outsiders read of a source file, at its lines: documentation of crates and modules, and the command's help.
-fn spoken(path: &str, text: &str) -> String {
-    let module = ["/lib.rs", "/mod.rs", "/main.rs"].iter().any(|name| path.ends_with(name));
-    let command = path.starts_with("crates/splat4d-cli/src/");
-    let lines: Vec<&str> = text.lines().collect();
-    let mut help = false;
-    let mut out = String::new();
-    for (at, line) in lines.iter().enumerate() {
-        help |= command && line.starts_with("const EXAMPLES");
-        // A comment of an argument stands above its attribute.
-        let below = lines[at..].iter().find(|l| !l.trim().starts_with("///"));
-        let argument = command && below.is_some_and(|l| ["#[arg", "#[command"].iter().any(|a| l.trim().starts_with(a)));
-        if module && line.starts_with("//!") || argument && line.trim().starts_with("///") || help {
-            out += line;
-        }
-        help &= !line.ends_with("\";");
-        out.push('\n');
-    }
-    out
 }
 
 /// What a heading is linked by, as GitHub and the site (`site/.vitepress/markdown.mjs`) have it.

@@ -176,7 +176,11 @@ fn photos_without_times_are_one_moment() {
         assert_eq!((capture.timing, capture.times()), (Timing::Moment, vec![0.0]));
         assert!(capture.cameras.len() == 20 && capture.fixed_cameras());
         assert_eq!((capture.cameras[7].name.as_str(), capture.held.as_slice()), ("cam07", &[0, 8, 16][..]));
-        assert!(says(&capture.notes, &["20 images are given the same time", "capture.sequence=video"]), "{:?}", capture.notes);
+        assert!(
+            says(&capture.notes, &["20 images are given the same time", "capture.sequence=video"]),
+            "{:?}",
+            capture.notes
+        );
         assert!(capture.warnings.is_empty());
     }
     let held = CaptureOptions { hold_out: Some("camera=cam00".parse().unwrap()), ..CaptureOptions::default() };
