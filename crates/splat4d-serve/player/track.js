@@ -95,7 +95,7 @@ export class Track {
       const odd = Object.keys(key).find(k => !KEYS.includes(k));
       if (odd) wrong(`unknown key "${odd}"`);
       if (!plain(key.time)) wrong('"time" is missing or not a number');
-      if (i && key.time <= track.keys[i - 1].time) wrong('its time is not after the previous key's');
+      if (i && key.time <= track.keys[i - 1].time) wrong('its time is not after that of the previous key');
       track.keys.push({ time: key.time, sceneTime: key.scene_time ?? null, camera: readPose(key, likeness, wrong) });
     });
     return track;

@@ -176,7 +176,7 @@ test('words, colours, moves by handles, keys on the time line; wrong words are s
   await panel.getByLabel('Exposure, stops').fill('-2');
   await e.idle();
   assert.equal((await e.steps())[0].exposure, -2);
-  await e.act('Set edit 1: Colour');
+  await e.act('Change edit 1: Colour');
   await area.fill('all');
   await area.blur();
   await page.waitForFunction(() => document.querySelector('splat-4d').face.editing.acts.children[0].disabled === false);

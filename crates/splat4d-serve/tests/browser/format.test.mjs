@@ -289,13 +289,13 @@ test('hostile and foreign files are refused in words', async () => {
       { kind: 'PALT', data: Buffer.alloc(12 + 9), count: 1, level: 1 },
     ],
     ['checksum', PAGE({ patch: patch(24, 1) })],
-    ['no mask of 3', PAGE(), MASK({ data: changed(0, 3) })],
-    ['no mask of 0', PAGE(), MASK({ data: changed(0, 0) })],
+    ['not a mask of 3', PAGE(), MASK({ data: changed(0, 3) })],
+    ['not a mask of 0', PAGE(), MASK({ data: changed(0, 0) })],
     ['not finite', PAGE(), MASK({ data: changed(14, 255, 255) })],
     ['do not rise', PAGE(), MASK({ data: changed(8, ...two.subarray(16, 24)), from: 3 })],
     ['differ from the index', PAGE(), MASK({ from: 1 })],
     ['differ from the index', PAGE(), MASK({ to: 4 })],
-    ['inflates to 26', PAGE(), MASK({ codec: 1, patch: patch(20, 35) })],
+    ['decompresses to 26', PAGE(), MASK({ codec: 1, patch: patch(20, 35) })],
     ['checksum', PAGE(), MASK({ patch: patch(24, 1) })],
   ];
   for (const [say, ...sections] of lazy) {
@@ -318,7 +318,7 @@ test('inflating stops at the stated size', async () => {
   const big = layout(base, [{ ...page, data: Buffer.alloc(200_000), patch: state() }]);
   await assert.rejects((await SceneFile.open(big)).page(0), /decompresses to more/);
   const small = layout(base, [{ ...page, data: Buffer.alloc(100), patch: state() }]);
-  await assert.rejects((await SceneFile.open(small)).page(0), /inflates to 100/);
+  await assert.rejects((await SceneFile.open(small)).page(0), /decompresses to 100/);
   const random = layout(base, [{ ...page, data: Buffer.alloc(128) }]);
   const raw = deflateRawSync(Buffer.alloc(128), { level: 9 }).length;
   const { crc32 } = await import('node:zlib');
