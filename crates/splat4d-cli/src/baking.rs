@@ -391,7 +391,7 @@ fn say(report: &bake::Report, likeness: Option<&bake::Likeness>, bytes: u64, sec
     console.say(&words);
     let e = &report.errors;
     if e.worst > 0.0 {
-        let tolerance = report.tolerance.map(|t| format!(" (tolerance {t} px)")).unwrap_or_default();
+        let tolerance = report.tolerance.map(|t| format!(" (tolerance {t:.3} px)")).unwrap_or_default();
         console.say(&format!(
             "error per Gaussian: median {:.3} px, 99 of 100 below {:.3} px, worst {:.3} px{tolerance}",
             e.median, e.p99, e.worst

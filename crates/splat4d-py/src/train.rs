@@ -22,7 +22,7 @@ use std::sync::Arc;
 ///
 /// `settings` are those of docs/recipe.md: `iterations=300`, `downscale=2`, `motion="spacetime"`; a setting of a table
 /// has two underscores, `densify__max_cap=20000`. Without `motion`, the capture decides. `progress` is called with
-/// every event, a dict as in docs/events.md. `loss(picture, truth, view)` gets arrays [h, w, 3] (half of the size in
+/// every event, a dict as in docs/events.md. `loss(image, truth, view)` gets arrays [h, w, 3] (half of the size in
 /// the first 40 % of the steps) and returns (value, gradient), which are added to the recipe's losses. Ctrl-C, or an
 /// exception in either function, stops with a checkpoint; `resume` continues from there.
 #[pyfunction]

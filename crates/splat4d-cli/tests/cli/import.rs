@@ -349,7 +349,7 @@ fn clocks_that_nothing_confirms_are_refused_and_can_be_told() {
     );
     assert!(refused.contains("--synchronous") && refused.contains("keep_offset"), "{refused}");
     assert!(!take.join("capture.json").exists());
-    assert!(take.join("import/report.json").is_file() && take.join("images/cam08").is_dir(), "what was found is kept");
+    assert!(take.join("import/report.json").is_file() && take.join("images/cam08").is_dir(), "results so far are kept");
     // The times of the files, on the user's word.
     import(&["--synchronous"]).ok();
     let report = json_of(&take.join("import/report.json"));
@@ -397,7 +397,7 @@ fn what_cannot_be_imported_is_explained() {
     let films = at("films");
     filmed(&films);
     let one = films.join("cam06");
-    assert!(refused(&one, &["--rig", "fixed"]).contains("nothing from two sides"));
+    assert!(refused(&one, &["--rig", "fixed"]).contains("one fixed camera"));
     assert!(refused(&films, &["--from", "3", "--to", "2"]).contains("come after"));
     assert!(refused(&films, &["--apart", "cam06"]).contains("left,right=2.4"));
     assert!(refused(&films, &["--apart", "cam06,cam99=2"]).contains("cam99"));
@@ -430,7 +430,7 @@ fn what_cannot_be_imported_is_explained() {
     let (before, own) = text.split_once("name = \"cam19\"").unwrap();
     let own = own.replacen("use = true", "use = false", 1);
     std::fs::write(&path, format!("{before}name = \"cam19\"{own}")).unwrap();
-    assert!(refused(&far, &["--rig", "fixed"]).contains("nothing from two sides"));
+    assert!(refused(&far, &["--rig", "fixed"]).contains("one fixed camera"));
     // A capture that is somebody's own stays.
     let own = at("own");
     std::fs::create_dir(&own).unwrap();

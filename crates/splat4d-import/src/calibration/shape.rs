@@ -85,8 +85,8 @@ pub fn fitted(
             scale = std::array::from_fn(|k| (stored[k] as f64 - expected[k]) / [w, h][k]);
             shift = std::array::from_fn(|k| if found[k] > 0.0 { expected[k] * bars[k] / found[k] } else { 0.0 });
             note = Some(format!(
-                "images were made smaller and have black bars ({:.0} px at the sides, {:.0} above and below), by \
-                 which the calibration was corrected; cut them off, for training learns them",
+                "images are smaller and have black bars ({:.0} px at the sides, {:.0} above and below); the \
+                 calibration was corrected accordingly",
                 found[0], found[1]
             ));
         } else if blocks(size) == blocks(video) {

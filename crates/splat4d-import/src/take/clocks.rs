@@ -149,9 +149,9 @@ pub(super) fn check(names: &[&str], solved: &Solved, told: &[Option<f64>], motio
         why.join("; ")
     ))
     .remedy(
-        "If one trigger drives all cameras, say so with --synchronous. Else tell offsets in import.toml (offset, keep_offset = \
-         true) and run the same command again: what was found is kept. Next time let sound run and clap, or film so that two \
-         cameras at most 30 degrees apart see the same thing move for a second.",
+        "If one trigger drives all cameras, use --synchronous. Otherwise set offsets in import.toml (offset, \
+         keep_offset = true) and run the same command again: results so far are kept. Next time record sound and \
+         clap, or let two cameras at most 20 degrees apart see the same motion for a second.",
     ))
 }
 

@@ -143,8 +143,8 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
         Rig::Moving => true,
     };
     if cameras.len() == 1 && !moving {
-        return Err(Error::input("one camera that stands still shows nothing from two sides")
-            .remedy("Give the videos of all cameras, or --rig moving if this one was carried about."));
+        return Err(Error::input("one fixed camera gives no depth")
+            .remedy("Give the videos of at least two cameras, or use --rig moving if this camera moved."));
     }
     // It can be corrected even if the calibration does not fit.
     corrections.write(folder)?;
@@ -264,8 +264,8 @@ fn check(solved: &poses::Solved, pictures: &[Pictures], report: &mut Report) -> 
             .collect();
         let reasons = if reasons.is_empty() { String::new() } else { format!(" ({})", reasons.join("; ")) };
         return Err(Error::input(format!("only {placed} of {asked} {what} could be placed{reasons}")).remedy(format!(
-            "Film one scene from neighbouring places (at most 30 degrees apart), in focus and in light; or leave those out \
-             (use = false in {}) and run the same command again.",
+            "Place neighbouring cameras at most 20 degrees apart, in focus and well lit (docs/filming.md); or leave \
+             these out (use = false in {}) and run the same command again.",
             corrections::FILE
         )));
     }

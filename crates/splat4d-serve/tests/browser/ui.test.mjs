@@ -314,7 +314,7 @@ test('every control has a name, and the keyboard reaches it', options, async () 
   }
   const tree = await page.locator('splat-4d').ariaSnapshot();
   for (const part of ['application "Scene: Two knights"', 'toolbar "Playback"', 'slider "Time"', 'button "Play"',
-    'button "Loop"', 'combobox "Speed"', 'radiogroup "Picture"', 'radio "Depth"', 'button "Cameras and paths"',
+    'button "Loop"', 'combobox "Speed"', 'radiogroup "Channel"', 'radio "Depth"', 'button "Cameras and paths"',
     'dialog "View"', 'combobox "Resolution"', 'radiogroup "Theme"', 'button "Save image"', 'button "Copy link"',
     'button "Full screen"', 'button "Keys and gestures"']) {
     assert.ok(tree.includes(part), `${part} in\n${tree}`);
