@@ -254,7 +254,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_committed_pictures_are_what_this_code_draws() {
+    fn the_committed_images_are_what_this_code_draws() {
         check(&bundled_folder(), &[(8, 14)]).expect("same bytes");
     }
 

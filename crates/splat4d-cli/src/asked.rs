@@ -249,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_said_with_its_line() {
+    fn mistakes_are_reported_with_their_line() {
         for (text, words) in [
             ("", "empty"),
             ("camera,x,y,time\n", "names none"),

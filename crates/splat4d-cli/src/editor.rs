@@ -658,7 +658,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_drawn_over_the_picture_becomes_words() {
+    fn shapes_drawn_over_the_image_become_text() {
         let bench = Bench::new();
         let pick = |shape: &str, corners: Value, through: bool| {
             bench.ask(json!({"do": "pick", "steps": [], "shape": shape, "corners": corners, "view": view(), "t": 0.0,
@@ -719,7 +719,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_bad_is_said_and_changes_nothing() {
+    fn invalid_requests_are_refused_and_change_nothing() {
         let bench = Bench::new();
         bench.ask(json!({"do": "save", "steps": [{"do": "delete", "select": "color(1,0,0, 0.5)"}]}));
         let save = |step: Value| bench.refused(json!({"do": "save", "steps": [step]}));
@@ -754,7 +754,7 @@ mod tests {
 
     /// What would have taken all memory, or made numbers of none: the server answers, and goes on with the page's steps.
     #[test]
-    fn what_is_too_much_is_refused_and_the_rest_goes_on() {
+    fn excessive_requests_are_refused_and_others_continue() {
         let bench = Bench::new();
         let good = json!({"do": "delete", "select": "box(-9,-9,-9, 0,9,9)"});
         for (bad, word) in [
@@ -773,7 +773,7 @@ mod tests {
     }
 
     #[test]
-    fn nodes_are_pulled_and_the_picture_follows() {
+    fn nodes_are_pulled_and_the_image_follows() {
         let bench = Bench::new();
         let bent = bench.ask(
             json!({"do": "bend", "steps": [], "select": "box(-9,-9,-9, 0,9,9)", "at": 0.5, "t": 0.5, "nodes": 16}),

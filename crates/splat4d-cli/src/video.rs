@@ -257,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_holds_numbered_pictures() {
+    fn a_folder_holds_numbered_images() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("frames");
         let mut film = Film::create(&path, [4, 4], 24.0, 2).unwrap();

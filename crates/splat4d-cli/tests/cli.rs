@@ -98,7 +98,7 @@ fn help_teaches_and_completions_complete() {
 }
 
 #[test]
-fn pictures_are_found_in_a_scene_and_cameras_compared_with_their_truth() {
+fn images_are_found_in_a_scene_and_cameras_compared_with_their_truth() {
     let work = tempfile::tempdir().unwrap();
     let capture = Capture::new(work.path()).write();
     let run = work.path().join("run");
@@ -368,7 +368,7 @@ fn one_gaussian(folder: &Path) -> PathBuf {
 }
 
 #[test]
-fn a_scene_becomes_a_page_alone_or_beside_its_file() {
+fn a_scene_becomes_a_page_alone_or_next_to_its_file() {
     let work = tempfile::tempdir().unwrap();
     let (file, page) = (one_gaussian(work.path()), work.path().join("page.html"));
     splat4d(&["export", str(&file), "--html", "-o", str(&page)]).run().ok();
@@ -618,7 +618,7 @@ fn an_interrupt_saves_and_says_how_to_continue() {
 }
 
 #[test]
-fn a_playback_file_is_told_exported_and_refused_when_damaged() {
+fn a_playback_file_is_described_exported_and_refused_when_damaged() {
     let work = tempfile::tempdir().unwrap();
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../splat4d/tests/data/tiny.s4d");
     let told: Value = serde_json::from_str(&splat4d(&["info", "--json", str(&file)]).run().ok()).unwrap();

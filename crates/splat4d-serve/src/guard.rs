@@ -114,7 +114,7 @@ mod tests {
     }
 
     #[test]
-    fn a_told_host_is_known_and_addresses_are_no_names() {
+    fn a_given_host_is_accepted_and_addresses_are_not_names() {
         let open = Guard::new("Workstation", true);
         for host in ["workstation:4400", "192.168.1.7:4400", "[fe80::1]:4400", "localhost"] {
             assert_eq!(ask(&open, host, None), Ok(()), "{host}");

@@ -291,7 +291,7 @@ mod tests {
     }
 
     #[test]
-    fn a_capture_without_masks_is_told_so() {
+    fn missing_masks_are_reported() {
         let folder = tempfile::tempdir().unwrap();
         let mut capture = capture(folder.path());
         capture.frames.iter_mut().for_each(|f| f.labels = None);

@@ -115,7 +115,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn codes_become_pixels_and_other_pictures_are_refused() {
+    fn codes_become_pixels_and_other_images_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("cam00_0003.png");
         let codes = |u: f64, v: f64, b: u16| image::Rgb([(ZERO + STEPS * u) as u16, (ZERO + STEPS * v) as u16, b]);

@@ -47,7 +47,7 @@ fn fill(run: &Path) {
 }
 
 #[test]
-fn the_page_tells_everything_and_needs_nothing() {
+fn the_report_is_complete_and_self_contained() {
     let folder = tempfile::tempdir().unwrap();
     fill(folder.path());
     let path = write(&Run::open(folder.path()).unwrap()).unwrap();

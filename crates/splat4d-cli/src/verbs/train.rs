@@ -610,7 +610,7 @@ mod tests {
     }
 
     #[test]
-    fn typed_knobs_win_over_the_quality_and_another_length_has_its_own_schedules() {
+    fn explicit_settings_override_quality_and_length_sets_schedules() {
         let steps = |r: &Recipe| [r.run.iterations, r.densify.max_cap, r.capture.downscale];
         let draft = steps(&typed(&["--quality", "draft"]));
         assert_eq!(draft, steps(&Recipe::default().of_quality(Quality::Draft)));
@@ -630,7 +630,7 @@ mod tests {
     }
 
     #[test]
-    fn knobs_are_listed_by_topic() {
+    fn settings_are_listed_by_topic() {
         let all = knob_list("").unwrap();
         assert!(Recipe::knobs().iter().all(|k| all.contains(&k.key())));
         let merge = knob_list("merge").unwrap();

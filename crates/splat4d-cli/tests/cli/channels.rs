@@ -30,7 +30,7 @@ fn npy(path: &Path) -> Npy {
 }
 
 #[test]
-fn every_channel_is_a_picture_and_numbers() {
+fn every_channel_is_an_image_and_numbers() {
     let work = tempfile::tempdir().unwrap();
     let [file, camera] = birds(work.path());
     let (png, raw) = (work.path().join("a.png"), work.path().join("a"));
@@ -77,7 +77,7 @@ fn every_channel_is_a_picture_and_numbers() {
 }
 
 #[test]
-fn what_has_a_label_goes_out_alone() {
+fn a_label_is_exported_alone() {
     let work = tempfile::tempdir().unwrap();
     let [file, _] = birds(work.path());
     let at = |name: &str| work.path().join(name);

@@ -52,7 +52,7 @@ fn parts_by_number_and_one_command_make_the_same_scene_and_file() {
 }
 
 #[test]
-fn what_cannot_be_done_in_chunks_says_so() {
+fn unsupported_chunk_options_are_refused() {
     let work = tempfile::tempdir().unwrap();
     let (capture, run) = (take(work.path()), work.path().join("run"));
     for (more, says) in [

@@ -37,7 +37,7 @@ fn filmed_by(cameras: &[(&str, usize)], frames: usize, to: &Path) {
 }
 
 #[test]
-fn pictures_alone_become_a_capture_with_clocks_and_poses() {
+fn images_alone_become_a_capture_with_clocks_and_poses() {
     let dir = tempfile::tempdir().unwrap();
     let (films, take) = (dir.path().join("films"), dir.path().join("take"));
     filmed(&films);
@@ -331,7 +331,7 @@ fn colmap_is_called_where_it_is_asked_for_and_its_model_is_taken() {
 
 /// Of three cameras geometry does not tell clocks, and these are silent: what is left is a guess.
 #[test]
-fn clocks_that_nothing_confirms_are_refused_and_can_be_told() {
+fn unconfirmed_time_offsets_are_refused_and_can_be_given() {
     let dir = tempfile::tempdir().unwrap();
     let (films, take) = (dir.path().join("films"), dir.path().join("take"));
     filmed_by(&CAMERAS[1..4], 8, &films);
@@ -370,7 +370,7 @@ fn clocks_that_nothing_confirms_are_refused_and_can_be_told() {
 }
 
 #[test]
-fn a_moment_from_all_sides_needs_no_clock() {
+fn images_of_one_time_need_no_time_offsets() {
     let dir = tempfile::tempdir().unwrap();
     let (films, take) = (dir.path().join("films"), dir.path().join("take"));
     for (name, _) in CAMERAS {

@@ -32,7 +32,7 @@ fn predict(run: &Path, args: &[&str]) -> Answer {
 }
 
 #[test]
-fn a_run_goes_on_and_is_compared_with_what_came() {
+fn a_run_is_forecast_and_compared_with_later_frames() {
     let work = tempfile::tempdir().unwrap();
     let (_, run) = seen(work.path(), SHARE);
     let actions = work.path().join("actions.csv");

@@ -405,7 +405,7 @@ fn qualisys_files_are_read_in_metres() {
 }
 
 #[test]
-fn transforms_captures_and_colmap_are_read_without_pictures() {
+fn transforms_captures_and_colmap_are_read_without_images() {
     let truth = truth();
     let good = transforms(&truth);
     same(&folder(&[("transforms.json", good.clone())]).unwrap(), &truth);

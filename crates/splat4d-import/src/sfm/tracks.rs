@@ -398,7 +398,7 @@ mod tests {
     }
 
     #[test]
-    fn features_of_different_moments_never_match() {
+    fn features_of_different_times_never_match() {
         let a = sight(vec![feature(1, 10.0, 0), feature(2, 50.0, 1), feature(3, 90.0, 2)]);
         let b = sight(vec![
             feature(4, 30.0, 0),

@@ -273,7 +273,7 @@ mod tests {
 
     /// Two metres of the world are one unit; the floor is askew in it.
     #[test]
-    fn tags_tell_metres_and_upwards() {
+    fn tags_give_metres_and_up() {
         let board: Board = "36h11:0.3:floor".parse().expect("it is right");
         let unit = 2.0;
         let tilt = Se3::look_at([0.0; 3], [0.3, 1.0, 0.2], [0.1, 0.2, 1.0]).rotation;

@@ -266,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn colours_that_nobody_tells_follow_from_the_size() {
+    fn default_colours_follow_from_the_size() {
         let matrix = |width: usize, height: usize, codec: &str, pixels: &str| {
             let film = phone(|f| {
                 for key in ["color_space", "color_range"] {

@@ -321,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn complaints_are_told_without_addresses() {
+    fn warnings_are_reported_without_addresses() {
         let line = "[mov,mp4,m4a,3gp,3g2,mj2 @ 0x558] [error] moov atom not found\n";
         assert_eq!(plain(line, Path::new("a.mp4")), "moov atom not found");
         assert_eq!(plain("file:-a.mp4: Invalid data found", Path::new("-a.mp4")), "Invalid data found");

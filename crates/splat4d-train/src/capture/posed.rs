@@ -91,7 +91,7 @@ mod tests {
     use serde_json::json;
 
     #[test]
-    fn cameras_are_read_without_their_pictures() {
+    fn cameras_are_read_without_their_images() {
         let dir = tempfile::tempdir().unwrap();
         let frame = |path: &str, x: f64| {
             json!({"file_path": path,

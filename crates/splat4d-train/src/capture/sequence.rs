@@ -197,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn names_tell_photos_from_films() {
+    fn names_distinguish_photos_from_videos() {
         let films: [&dyn Fn(usize) -> String; 7] = [
             &|i| format!("frame_{:04}.png", i + 1),
             &|i| format!("{i:06}.jpg"),
@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn rigs_number_their_frames_or_show_one_moment() {
+    fn rigs_number_their_frames_or_show_one_time() {
         let rig = |name: &dyn Fn(usize, usize) -> String| numbered(12, |i| name(i / 4, i % 4));
         assert_eq!(timing(&rig(&|c, t| format!("cam{c}/{t:04}.png"))), (Timing::Numbers, 3, 0, 0));
         assert_eq!(timing(&rig(&|c, t| format!("side{c}/DSC{t}.png"))), (Timing::Moment, 12, 0, 1));
@@ -237,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn cameras_of_a_moment_are_named_by_their_pictures() {
+    fn cameras_of_a_time_are_named_by_their_images() {
         let order = moment(&["images/b.png", "images/a.jpg"]);
         assert_eq!((order.cameras, order.frames), (vec!["a".into(), "b".into()], vec![(1, 0, 0.0), (0, 0, 0.0)]));
         assert_eq!(moment(&["x/a.png", "y/a.png"]).cameras, ["x/a", "y/a"]);
@@ -253,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_said_goes_before_what_names_tell() {
+    fn stated_times_override_names() {
         let (names, poses) = (["frame_1.png", "frame_2.png", "frame_3.png"], poses(3));
         let mut said = (Vec::new(), Vec::new());
         let mut of = |names, sequence| order(names, &poses, sequence, 30.0, &mut said.0, &mut said.1);

@@ -396,7 +396,7 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_is_found_in_space_and_time_and_a_strange_one_is_not() {
+    fn an_image_is_localised_and_a_foreign_one_refused() {
         let scene = scene();
         let starts: Vec<Camera> = (0..6).map(|k| camera(f64::from(k), 0.3)).collect();
         let (truth, when) = (camera(2.12, 0.55), 0.37);

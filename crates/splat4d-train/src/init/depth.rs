@@ -200,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn what_moves_belongs_to_its_moment_and_all_else_to_all() {
+    fn what_moves_belongs_to_its_time_and_all_else_to_all() {
         let deep = Deep(Made::new(4, 3, 24));
         let seeds = points(&deep, 400, true, Rng::new(1, "test", 0)).unwrap();
         let moving: Vec<usize> = (0..seeds.len()).filter(|&i| seeds.times[i].is_some()).collect();

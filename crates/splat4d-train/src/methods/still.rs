@@ -226,7 +226,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn many_gaussians_take_smaller_steps_unless_told() {
+    fn many_gaussians_take_smaller_steps_unless_set() {
         let of = |words: &[&str]| {
             let r = Recipe::of(words).unwrap().resolve();
             groups(&r, 2.0).iter().find(|g| g.column == "means").map(|g| [g.rate.start, g.rate.end]).unwrap()

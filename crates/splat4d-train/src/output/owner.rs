@@ -392,7 +392,7 @@ mod tests {
     }
 
     #[test]
-    fn of_many_who_find_a_dead_owner_one_takes_over() {
+    fn one_of_many_processes_takes_over_from_a_dead_owner() {
         let folder = tempfile::tempdir().unwrap();
         elsewhere(folder.path(), "1");
         set_time(folder.path(), SystemTime::now() - Duration::from_secs(3600));

@@ -173,7 +173,7 @@ mod tests {
     }
 
     #[test]
-    fn who_has_few_points_or_leaves_out_a_part_of_the_pictures_and_no_cut_out_object_is_looked_at() {
+    fn who_has_few_points_or_leaves_out_a_part_of_the_images_and_no_cut_out_object_is_looked_at() {
         let place = Place::new();
         let wants = |sets: &[&str], spread: &dyn Fn(&Capture) -> Vec<[f64; 3]>, background: Option<[f32; 3]>| {
             let recipe = recipe(sets);

@@ -542,7 +542,7 @@ fn minutes_fix_a_recipe_that_repeats() {
 }
 
 #[test]
-fn where_no_gaussian_is_opaque_pictures_show_their_mean_colour_and_others_what_they_were_cut_out_of() {
+fn where_no_gaussian_is_opaque_images_show_their_mean_colour_and_others_what_they_were_cut_out_of() {
     let (place, recipe) = (Place::new(), recipe(&[]));
     let shown = |capture: Arc<Capture>| {
         let opened = OpenCapture::new(capture, &recipe).unwrap();
@@ -569,7 +569,7 @@ fn where_no_gaussian_is_opaque_pictures_show_their_mean_colour_and_others_what_t
 }
 
 #[test]
-fn photos_of_one_camera_learn_no_exposure_unless_told_and_a_rig_learns_them_from_one_picture_each() {
+fn exposure_is_learned_for_rigs_and_for_one_camera_only_if_set() {
     let place = Place::new();
     let exposed = |named: bool, changes: &[&str]| {
         let recipe = recipe(changes);

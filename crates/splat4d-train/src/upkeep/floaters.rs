@@ -168,7 +168,7 @@ mod tests {
     use splat4d::scene::GEOMETRY;
 
     #[test]
-    fn what_hangs_before_a_camera_and_one_other_alone_sees_goes() {
+    fn floaters_before_a_camera_are_removed() {
         let frames = Made::new(8, 1, 16);
         let places = Places::of(&frames);
         assert_eq!(places.cameras.len(), 8);

@@ -124,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn the_faintest_move_a_few_at_a_time_and_the_picture_stays() {
+    fn the_faintest_move_a_few_at_a_time_and_the_image_stays() {
         let mut s = scene(200);
         let g = &mut s.layers[0].params[GEOMETRY];
         for r in 0..200 {

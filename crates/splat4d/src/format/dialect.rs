@@ -223,7 +223,7 @@ mod tests {
     }
 
     #[test]
-    fn every_dialect_is_written_told_and_opened() {
+    fn every_dialect_is_written_recognised_and_opened() {
         // What is not written needs a file made by hand.
         let glb = gltf::tests::sample(&gaussians(20, 4), [0.0; 3]);
         let by_hand = [(sog::DIALECT, sog::tests::sample(), 2), (gltf::DIALECT, glb, 20)];
@@ -265,7 +265,7 @@ mod tests {
     }
 
     #[test]
-    fn names_and_endings_are_told_apart() {
+    fn names_and_extensions_are_distinguished() {
         for (i, a) in DIALECTS.iter().enumerate() {
             assert!(a.ending.starts_with('.') && a.ending == a.ending.to_ascii_lowercase(), "{a:?}");
             assert_eq!(Dialect::by_ending(&format!("x{}", a.ending)), Some(*a));
@@ -284,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn every_version_of_spz_is_told_by_its_bytes() {
+    fn every_version_of_spz_is_recognised_by_its_bytes() {
         for spz_version in spz::VERSIONS {
             let mut bytes = Vec::new();
             let options = WriteOptions { spz_version, ..WriteOptions::default() };

@@ -134,7 +134,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rows_are_told_in_three_ways() {
+    fn rows_are_printed_in_three_formats() {
         let row = |name: &str, fps: f64, psnr: Option<f64>| Played {
             file: name.into(),
             threads: 2,

@@ -55,7 +55,7 @@ fn no_capture_and_no_frames() {
 }
 
 #[test]
-fn missing_and_truncated_pictures() {
+fn missing_and_truncated_images() {
     let sample = samples::own();
     for name in ["0005", "0006"] {
         std::fs::remove_file(sample.path(&format!("images/cam00/{name}.png"))).unwrap();

@@ -112,7 +112,7 @@ fn windows(bytes: &[u8]) -> Vec<usize> {
 }
 
 #[test]
-fn sizes_are_compared_with_the_picture_before_anything_is_decoded() {
+fn sizes_are_compared_with_the_image_before_decoding() {
     use exr::prelude::*;
     let sample = sample();
     let mut bytes = std::io::Cursor::new(Vec::new());

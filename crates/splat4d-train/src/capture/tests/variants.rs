@@ -214,7 +214,7 @@ fn orientations_follow_whose_pixels_the_poses_describe() {
 }
 
 #[test]
-fn poses_of_another_convention_are_read_as_told() {
+fn poses_of_a_given_convention_are_read() {
     for (layout, sample) in samples::all() {
         let plain = open(&sample);
         let told = CaptureOptions { poses: "inverse".parse().unwrap(), ..CaptureOptions::default() };
@@ -385,7 +385,7 @@ fn keys_of_lenses_are_used_or_refused() {
 }
 
 #[test]
-fn masks_beside_images_are_found_in_every_layout() {
+fn masks_next_to_images_are_found_in_every_layout() {
     let names: [fn(&str) -> String; 5] = [
         |n| format!("masks/{n}.png"),
         |n| format!("masks/{}_mask.png", n.trim_end_matches(".png")),
@@ -436,7 +436,7 @@ fn masks_beside_images_are_found_in_every_layout() {
 }
 
 #[test]
-fn two_poses_of_one_image_are_said() {
+fn two_poses_of_one_image_are_reported() {
     let sample = samples::photos(4, |c| format!("cam{c}.png"), None);
     sample.edit("transforms.json", |v| v["frames"][3]["file_path"] = json!("images/cam1.png"));
     assert_said(&open(&sample), Aspect::Assumed, Severity::Warning, &["1 frames have the image", "cam1", "both have"]);

@@ -78,7 +78,7 @@ fn the_network_suits_the_cameras() {
 }
 
 #[test]
-fn what_cannot_work_is_said_before_training() {
+fn impossible_settings_are_refused_before_training() {
     let mut single = plan(&[]);
     single.times = 1;
     assert!(DeformProgram.check(&single).unwrap_err().to_string().contains("still"));

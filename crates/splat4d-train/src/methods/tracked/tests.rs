@@ -208,7 +208,7 @@ fn a_turning_ball_is_followed_and_without_ties_it_is_not() {
 }
 
 #[test]
-fn what_goes_on_evenly_needs_no_steps() {
+fn even_motion_needs_no_steps() {
     let params = ball(50, 0);
     let world = truth(&params, 50, 6, 0.0);
     let plan = plan(6, 4, false, &["iterations=1", "first_share=0"]);
@@ -227,7 +227,7 @@ fn what_goes_on_evenly_needs_no_steps() {
 }
 
 #[test]
-fn masks_tell_what_stands_and_it_stays() {
+fn masks_identify_static_parts_which_stay() {
     let params = ball(200, 60);
     let world = truth(&params, 200, 3, 0.05);
     let frames: Arc<dyn Frames> = Arc::new(draw(&world, cameras(8, 32), 3, Some(200)));
