@@ -279,7 +279,7 @@ mod tests {
     }
 
     #[test]
-    fn times_of_a_layer_outlive_a_rebuild_and_those_of_another_do_not() {
+    fn moments_of_a_layer_outlive_a_rebuild_and_those_of_another_do_not() {
         let mut learner = Learner::new(scene(20));
         learner.tables_mut().1[0].table_mut(GEOMETRY).fill(2.0);
         learner.rebuild(&|_, _| true, |_| Ok(())).unwrap();

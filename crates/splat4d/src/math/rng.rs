@@ -74,7 +74,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn times_and_independence_of_streams() {
+    fn moments_and_independence_of_streams() {
         let (a, b) = (Rng::new(1, "a", 0), Rng::new(1, "b", 0));
         let n = 100_000;
         let mean: f64 = (0..n).map(|i| a.normal(i)).sum::<f64>() / n as f64;
