@@ -4,7 +4,7 @@
 import { History, boxOf, combined, easedKey, factorAt, fadedTo, keyed, keysOf, movedTo, nameOf, placeAt, pulledAt, pulledTo, quatOf,
   ready, round, shiftedKey, turnOf, withBox, withKey, withoutKey } from './edit-steps.js';
 import { Overlay } from './edit-tools.js';
-import { button, choice, clock, field, h, segments, tool } from './dom.js';
+import { allow, button, choice, clock, field, h, segments, tool } from './dom.js';
 import { clamp } from './camera.js';
 
 /** Longer side of pictures that the program draws, pixels: at rest, and while something is pulled. */
@@ -293,9 +293,9 @@ export class Editing {
 
   refresh() {
     const { history } = this, focused = this.panel.contains(this.ui.focused()) ? this.ui.focused().getAttribute('aria-label') : null;
-    this.undoTool.disabled = !history.undoable;
-    this.redoTool.disabled = !history.redoable;
-    this.saveTool.disabled = !history.dirty;
+    allow(this.undoTool, !history.undoable && 'Nothing to undo', 'Undo (Ctrl+Z)');
+    allow(this.redoTool, !history.redoable && 'Nothing to redo', 'Redo (Ctrl+Y)');
+    allow(this.saveTool, !history.dirty && 'All edits are saved', 'Save (Ctrl+S)');
     this.#keep();
     this.#numbers(this.overlay.box = this.active < 0 && this.open ? boxOf(this.text) : null);
     this.overlay.redraw();
@@ -309,8 +309,7 @@ export class Editing {
     const some = this.#told?.gaussians > 0 && this.active < 0;
     for (const b of this.acts.children) {
       if (b.textContent === 'Floaters' || (b.textContent === 'Bend' && !this.about.drag)) continue;
-      b.disabled = !some;
-      b.title = some ? ACTS[b.textContent] : this.active < 0 ? 'Select something first' : 'Close the open edit first: click it in the list';
+      allow(b, !some && (this.active < 0 ? 'Select something first' : 'Close the open edit first: click it in the list'), ACTS[b.textContent]);
     }
     this.#properties();
     this.#diamonds();
@@ -372,7 +371,8 @@ export class Editing {
         onchange: e => this.#set(easedKey(step, k.t, e.target.checked)) }), 'ease'),
       tool('bin', `Delete key ${i + 1}`, () => this.#set(withoutKey(step, k.t)))))),
     h('div', { class: 'wrap' }, button('Add key here', () => this.#set(withKey(step, this.time)),
-      { title: 'Add a key frame here. Changes at other times then add their own key frames', ...(step.do === 'drag' && !step.handles.length && { disabled: true }) })));
+      step.do === 'drag' && !step.handles.length ? { disabled: true, title: 'Drag a node first' }
+        : { title: 'Add a key frame here. Changes at other times then add their own key frames' })));
   }
 
   /** Keys of the step that is set, on the time line. */
@@ -567,7 +567,7 @@ export class Editing {
           this.#tell(null);
           this.refresh();
           this.#apply();
-        }, told.gaussians ? { class: 'soft main' } : { disabled: true }),
+        }, told.gaussians ? { class: 'soft main' } : { disabled: true, title: 'No floaters at this strength' }),
         button('Keep them', () => { this.#tell(null); this.refresh(); })));
     } catch (error) { this.say(error.message, true); }
   }

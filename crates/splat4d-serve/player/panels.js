@@ -2,7 +2,7 @@
 
 import { CHANNELS } from './player.js';
 import { Track } from './track.js';
-import { button, bytes, choice, clock, field, h, pick, save, segments, tool } from './dom.js';
+import { allow, button, bytes, choice, clock, field, h, pick, save, segments, tool } from './dom.js';
 
 export const CHANNEL_NAMES = { color: 'Colour', depth: 'Depth', alpha: 'Alpha', flow: 'Flow' };
 export const SPEEDS = [0.1, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 4];
@@ -80,7 +80,10 @@ export function viewPanel(ui) {
     labels.value = player.labels.only !== null ? String(player.labels.only) : player.labels.colors ? OFF + OFF : OFF;
     theme.set(ui.theme);
     figures.checked = ui.figuresOn;
-    for (const item of [path.children[0], path.children[1], speed, loop]) item.disabled = player.still;
+    for (const item of [path.children[0], path.children[1], speed, loop]) {
+      item.disabled = player.still;
+      if (player.still) item.title = 'The scene is static';
+    }
   };
   return node;
 }
@@ -120,10 +123,10 @@ export function cameraPanel(ui) {
     }
     list.value = String(player.viewed ?? -1);
     const n = player.track.keys.length;
-    play.disabled = n < 2 && !player.film;
+    allow(play, n < 2 && !player.film && 'A path needs two keys');
     play.lastChild.textContent = player.film && !player.film.frozen ? 'Stop path' : 'Play path';
     bullet.lastChild.textContent = player.film?.frozen ? 'Stop bullet time' : 'Bullet time';
-    out.disabled = !n;
+    allow(out, !n && 'There is no key to export', 'Save the path for splat4d render --path path.json');
     note.hidden = n > 1;
     keys.hidden = !n;
     if (!keys.contains(ui.focused())) keys.replaceChildren(...player.track.keys.map((key, i) => pathKey(ui, key, i)));

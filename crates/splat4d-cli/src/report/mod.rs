@@ -16,11 +16,12 @@ pub(crate) use refined::refined_in_words;
 use serde_json::Value;
 use splat4d::Result;
 use splat4d_train::path_text::in_command;
+use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::PathBuf;
 
 const STYLE: &str = include_str!("style.css");
-/// Held-out views shown: every camera class and moment gets a glance, the page stays below 2 MB.
+/// Held-out views shown; the page stays below 2 MB.
 const VIEWS: usize = 8;
 /// Curves of single cameras; more would be a tangle.
 const CAMERA_CURVES: usize = 5;
@@ -68,7 +69,30 @@ fn header(out: &mut String, run: &Run) {
     if let Some(seconds) = run.number("seconds") {
         words.push(format!("trained in {} minutes", human_seconds(seconds)));
     }
-    let _ = writeln!(out, "<header><h1>{}</h1><p>{}</p></header>", escape(&run.name()), escape(&words.join(" · ")));
+    let (name, words) = (escape(&run.name()), escape(&words.join(" · ")));
+    let _ = writeln!(out, "<header><h1>{name}</h1><p>{words}</p>{}</header>", verdict(run));
+}
+
+/// The result in a sentence, and what to do with it.
+fn verdict(run: &Run) -> String {
+    let Some(psnr) = run.score("PSNR") else { return String::new() };
+    let mut out = format!("<p class=\"verdict\">Held-out views: {psnr:.2} dB PSNR");
+    if let Some(dynamic) = run.score("PSNR-dynamic") {
+        let _ = write!(out, ", dynamic regions {dynamic:.2} dB");
+        if let Some(still) = run.baseline("PSNR-dynamic") {
+            let (by, word) = ((dynamic - still).abs(), if dynamic < still { "worse" } else { "better" });
+            let _ = write!(out, ", {by:.2} dB {word} than a static scene");
+        }
+    }
+    out += ".</p><p>";
+    let place = escape(&in_command(&run.path));
+    if run.number("playback_bytes").is_some() {
+        let _ = write!(out, "Play it: <code>splat4d view {place}</code>. ");
+    }
+    if run.score("PSNR-dynamic").is_some() && run.baseline("PSNR-dynamic").is_none() {
+        let _ = write!(out, "Compare with a static scene: <code>splat4d eval {place} --baseline</code>.");
+    }
+    out + "</p>"
 }
 
 fn cards(out: &mut String, run: &Run) {
@@ -145,8 +169,8 @@ fn film(out: &mut String, run: &Run) {
 fn views(out: &mut String, run: &Run) {
     let Some(folder) = run.pictures() else { return };
     let mut shown = String::new();
-    // One camera after the other would show one moment only: take views spread over the list of all.
-    for i in pictures::spread(run.views.len(), VIEWS) {
+    let place_of = |kind: &str, file: &str| Some(folder.strip_prefix(&run.path).ok()?.join(kind).join(file));
+    for i in worst(&run.views, VIEWS) {
         let view = &run.views[i];
         let pictures: Vec<Option<String>> = ["gt", "renders", "errors"]
             .iter()
@@ -162,8 +186,13 @@ fn views(out: &mut String, run: &Run) {
             _ => view.file.clone(),
         };
         let score = view.psnr.map(|p| format!("render, {p:.2} dB")).unwrap_or_else(|| "render".into());
-        for (picture, caption) in pictures.iter().zip([format!("truth, {place}"), score, "error".into()]) {
+        let captions = [("gt", format!("truth, {place}")), ("renders", score), ("errors", "error".into())];
+        for (picture, (kind, caption)) in pictures.iter().zip(captions) {
             let image = picture.as_ref().map(|p| format!("<img alt=\"{}\" src=\"{p}\">", escape(&caption)));
+            // The file itself, as long as the page lies in its run.
+            let image = image.zip(place_of(kind, &view.file)).map(|(image, place)| {
+                format!("<a href=\"{}\">{image}</a>", escape(&place.to_string_lossy().replace('\\', "/")))
+            });
             let _ = write!(
                 shown,
                 "<figure>{}<figcaption>{}</figcaption></figure>",
@@ -176,7 +205,7 @@ fn views(out: &mut String, run: &Run) {
     if !shown.is_empty() {
         let _ = write!(
             out,
-            "<h2>Held-out views</h2>\n<div class=\"views\">{shown}</div>\n<p class=\"note\">Error: mean difference \
+            "<h2>Held-out views, the worst of each camera first</h2>\n<div class=\"views\">{shown}</div>\n<p class=\"note\">Error: mean difference \
              of the channels, from 0 (dark) to a quarter of full scale or more (bright).</p>\n"
         );
     }
@@ -193,6 +222,26 @@ fn curves(out: &mut String, run: &Run) {
         ("Gaussians", lines(&series("", |m| m.gaussians), "step", "Gaussians")),
     ];
     panels(out, "Training curves", charts);
+}
+
+/// Views to show: the worst of each camera, worst first, then the next worst of each.
+fn worst(views: &[ViewScore], count: usize) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..views.len()).collect();
+    order.sort_by(|&a, &b| {
+        let score = |i: usize| views[i].psnr.unwrap_or(f64::INFINITY);
+        score(a).total_cmp(&score(b))
+    });
+    let mut seen: BTreeMap<Option<&str>, usize> = BTreeMap::new();
+    let mut ranked: Vec<(usize, usize)> = order
+        .into_iter()
+        .map(|i| {
+            let rank = seen.entry(views[i].camera.as_deref()).or_default();
+            *rank += 1;
+            (*rank, i)
+        })
+        .collect();
+    ranked.sort_by_key(|r| r.0);
+    ranked.into_iter().take(count).map(|r| r.1).collect()
 }
 
 fn scores(out: &mut String, run: &Run) {
@@ -406,8 +455,8 @@ fn panels<const N: usize>(out: &mut String, title: &str, charts: [(&str, Option<
         })
         .collect();
     if !shown.is_empty() {
-        let columns = N.clamp(2, 3);
-        let _ = write!(out, "<h2>{}</h2>\n<div class=\"grid{columns}\">{shown}</div>\n", escape(title));
+        // Two columns: charts of one width have letters of one size.
+        let _ = write!(out, "<h2>{}</h2>\n<div class=\"grid2\">{shown}</div>\n", escape(title));
     }
 }
 

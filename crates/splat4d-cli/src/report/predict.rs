@@ -35,7 +35,10 @@ pub(crate) struct Told {
     pub scene: &'static str,
 }
 
-/// What a model's forecast is worth; numbers by horizon begin with the first predicted frame.
+/// The model that every other is compared with: the last observed frame stays.
+const BASELINE: &str = "freeze";
+
+/// Scores of a model's forecast; numbers by horizon begin with the first predicted frame.
 #[derive(Clone, Debug, Default, Serialize)]
 pub(crate) struct ModelScores {
     pub name: String,
@@ -89,7 +92,7 @@ fn page(run: &str, told: &Told, films: &[(String, PathBuf)]) -> String {
         let _ = writeln!(body, "<p class=\"note\">{beyond} predicted frames have no image to compare with.</p>");
     }
     let all: Vec<&ModelScores> = told.models.iter().chain(&told.assimilated).chain(&told.oracle).collect();
-    table(&mut body, &all);
+    table(&mut body, &all, told.models.len());
     let seconds = |i: usize| (i + 1) as f64 / told.fps;
     let series = |of: &dyn Fn(&ModelScores) -> Vec<Option<f64>>| -> Vec<Series> {
         let one = |m: &&ModelScores| Series {
@@ -132,7 +135,8 @@ fn page(run: &str, told: &Told, films: &[(String, PathBuf)]) -> String {
     )
 }
 
-fn table(out: &mut String, models: &[&ModelScores]) {
+/// Columns without a value are left out; of the first `compared` rows the best is marked, and the baseline named.
+fn table(out: &mut String, models: &[&ModelScores], compared: usize) {
     let heads = [
         "model",
         "PSNR, dB",
@@ -147,12 +151,16 @@ fn table(out: &mut String, models: &[&ModelScores]) {
         "fitting time",
         "diverged",
     ];
-    let head = heads.map(|h| format!("<th>{h}</th>")).concat();
+    let score = |m: &ModelScores| m.psnr_dynamic.or(m.psnr);
+    let scored = models.iter().take(compared).enumerate().filter_map(|(i, m)| Some((i, score(m)?)));
+    let best = scored.max_by(|a, b| a.1.total_cmp(&b.1)).map(|b| b.0);
     let number = |x: Option<f64>, digits: usize| x.map_or_else(String::new, |x| format!("{x:.digits$}"));
     let percent = |x: Option<f64>| x.map_or_else(String::new, |x| format!("{:.0} %", 100.0 * x));
-    let row = |m: &&ModelScores| {
-        let cells = [
-            m.name.clone(),
+    let cells = |(i, m): (usize, &&ModelScores)| {
+        let role = if Some(i) == best { " · best" } else { "" };
+        let baseline = if m.name == BASELINE { " · baseline" } else { "" };
+        [
+            format!("{}{baseline}{role}", m.name),
             number(m.psnr, 2),
             number(m.psnr_dynamic, 2),
             number(m.skill_over_freeze, 3),
@@ -164,9 +172,16 @@ fn table(out: &mut String, models: &[&ModelScores]) {
             number(m.calibration.map(|c| c.ratio), 2),
             human_seconds(m.seconds_fit),
             m.diverged.map_or_else(String::new, |h| format!("at frame {h}")),
-        ];
-        format!("<tr>{}</tr>", cells.map(|c| format!("<td>{}</td>", escape(&c))).concat())
+        ]
     };
-    let rows: String = models.iter().map(row).collect();
+    let rows: Vec<[String; 12]> = models.iter().enumerate().map(cells).collect();
+    let filled: Vec<usize> = (0..heads.len()).filter(|&k| rows.iter().any(|r| !r[k].is_empty())).collect();
+    let head: String = filled.iter().map(|&k| format!("<th>{}</th>", heads[k])).collect();
+    let line = |(i, row): (usize, &[String; 12])| {
+        let class = if Some(i) == best { " class=\"best\"" } else { "" };
+        let cells: String = filled.iter().map(|&k| format!("<td>{}</td>", escape(&row[k]))).collect();
+        format!("<tr{class}>{cells}</tr>")
+    };
+    let rows: String = rows.iter().enumerate().map(line).collect();
     let _ = writeln!(out, "<div class=\"panel\"><table><tr>{head}</tr>{rows}</table></div>");
 }
