@@ -1,15 +1,14 @@
 //! `still`: one stage, every group of static 3DGS. Also the base that other programs add to.
 
 use super::auto::Seen;
-use super::{Group, Plan, Program, Rate, Stage};
+use super::{CommonSettings, Group, Plan, Program, Rate, Stage};
 use crate::capture::Agreement;
+use crate::loss::LossSettings;
 use crate::loss::neighbourhood::{MotionWeights, Neighbourhood};
 use crate::loss::scene::{MeanOpacity, MeanScale, OpacityEntropy};
 use crate::loss::terms::{ParamLoss, ProbeLoss};
 use crate::optim::{MCMC_EXTENT, Noise};
-use crate::recipe::Recipe;
 use crate::settings::{Choice, settings};
-use crate::upkeep;
 use crate::upkeep::{LEAST, Strategy};
 use splat4d::motion::Spec;
 use splat4d::scene::LifeKind;
@@ -68,6 +67,11 @@ const POSITIONS: [f64; 2] = [2e-3, 5e-5];
 const FINEST: f64 = 0.08;
 
 impl RateSettings {
+    /// A rate that falls to `decay` of itself over the stage.
+    pub(crate) fn falling(&self, rate: f64) -> Rate {
+        Rate { start: rate, end: rate * self.decay }
+    }
+
     /// Rates of positions at the start and at the end, of the extent. More Gaussians are smaller and lie closer, and the
     /// steps of the few throw them about: a real room with 70,000 gains 0.4 dB with a third of the rates, an object with 90,000
     /// neither gains nor loses (studies/records/2026-11-26-real-size.md).
@@ -140,19 +144,19 @@ impl Program for StillProgram {
 }
 
 /// The groups of geometry and colour.
-pub(crate) fn groups(r: &Recipe, extent: f64) -> Vec<Group> {
-    let [start, end] = r.rates.positions(r.densify.max_cap).map(|rate| rate * extent);
+pub(crate) fn groups(c: &CommonSettings, extent: f64) -> Vec<Group> {
+    let [start, end] = c.rates.positions(c.densify.max_cap).map(|rate| rate * extent);
     let positions = Rate { start, end };
     let mut groups = vec![
         Group::new("means", positions),
-        Group::new("quats", r.falling(r.rates.rotation)),
-        Group::new("log_scales", r.falling(r.rates.scaling)),
-        Group::new("opacity_logits", r.falling(r.rates.opacity)),
-        Group { part: Some((0, 3)), ..Group::new("sh", r.falling(r.rates.feature)) },
+        Group::new("quats", c.rates.falling(c.rates.rotation)),
+        Group::new("log_scales", c.rates.falling(c.rates.scaling)),
+        Group::new("opacity_logits", c.rates.falling(c.rates.opacity)),
+        Group { part: Some((0, 3)), ..Group::new("sh", c.rates.falling(c.rates.feature)) },
     ];
-    let rest = 3 * ((r.appearance.sh_degree + 1) * (r.appearance.sh_degree + 1) - 1);
+    let rest = 3 * ((c.appearance.sh_degree + 1) * (c.appearance.sh_degree + 1) - 1);
     if rest > 0 {
-        let rate = r.falling(r.rates.feature / SH_REST_SLOWDOWN);
+        let rate = c.rates.falling(c.rates.feature / SH_REST_SLOWDOWN);
         groups.push(Group { part: Some((3, rest)), ..Group::new("sh", rate) });
     }
     groups
@@ -160,76 +164,77 @@ pub(crate) fn groups(r: &Recipe, extent: f64) -> Vec<Group> {
 
 /// Lets a stage learn its Gaussians' lives: birth and death, for any model.
 pub(crate) fn learn_life(stage: &mut Stage, plan: &Plan, life: LifeKind) {
-    let r = &plan.recipe;
+    let c = &plan.common;
     if life != LifeKind::Infinite {
-        stage.groups.push(Group::new("life_centers", r.falling(r.life.center_lr * plan.seconds())));
-        stage.groups.push(Group::new("life_log_widths", r.falling(r.life.width_lr)));
-        stage.min_log_life = Some((r.life.min_frames / plan.fps).max(1e-6).ln());
+        stage.groups.push(Group::new("life_centers", c.rates.falling(c.life.center_lr * plan.seconds())));
+        stage.groups.push(Group::new("life_log_widths", c.rates.falling(c.life.width_lr)));
+        stage.min_log_life = Some((c.life.min_frames / plan.fps).max(1e-6).ln());
     }
     if life == LifeKind::Interval {
-        stage.groups.push(Group::new("life_log_softness", r.falling(r.life.width_lr)));
+        stage.groups.push(Group::new("life_log_softness", c.rates.falling(c.life.width_lr)));
     }
 }
 
-/// The recipe's weights of the losses on motion.
-pub(crate) fn motion_weights(r: &Recipe) -> MotionWeights {
+/// Weights of the losses on motion.
+fn motion_weights(loss: &LossSettings) -> MotionWeights {
     MotionWeights {
-        rigid: r.loss.rigid,
-        rot: r.loss.rot,
-        iso: r.loss.iso,
-        arap: r.loss.arap,
-        elastic: r.loss.elastic,
-        velocity: r.loss.velocity,
-        jerk: r.loss.jerk,
-        acceleration: r.loss.acceleration,
-        least: r.loss.least_motion,
+        rigid: loss.rigid,
+        rot: loss.rot,
+        iso: loss.iso,
+        arap: loss.arap,
+        elastic: loss.elastic,
+        velocity: loss.velocity,
+        jerk: loss.jerk,
+        acceleration: loss.acceleration,
+        least: loss.least_motion,
     }
 }
 
-/// A stage with the recipe's upkeep and regularisers.
+/// A stage with the upkeep and the regularisers that every motion model has.
 pub fn stage(name: &str, plan: &Plan) -> Stage {
-    let r = &plan.recipe;
+    let c = &plan.common;
     let mut params: Vec<Box<dyn ParamLoss<f32>>> = Vec::new();
     // These two belong to MCMC: they make room; under ADC they only dim.
-    if r.densify.strategy == Strategy::Mcmc {
-        if r.mcmc.opacity_reg > 0.0 {
-            params.push(Box::new(MeanOpacity { weight: r.mcmc.opacity_reg }));
+    if c.densify.strategy == Strategy::Mcmc {
+        if c.mcmc.opacity_reg > 0.0 {
+            params.push(Box::new(MeanOpacity { weight: c.mcmc.opacity_reg }));
         }
-        if r.mcmc.scale_reg > 0.0 {
+        if c.mcmc.scale_reg > 0.0 {
             // Sizes are in scene units: their weight is against the extent.
-            params.push(Box::new(MeanScale { weight: r.mcmc.scale_reg * MCMC_EXTENT / plan.extent }));
+            params.push(Box::new(MeanScale { weight: c.mcmc.scale_reg * MCMC_EXTENT / plan.extent }));
         }
     }
-    if r.loss.opacity_entropy > 0.0 {
-        params.push(Box::new(OpacityEntropy { weight: r.loss.opacity_entropy }));
+    if c.loss.opacity_entropy > 0.0 {
+        params.push(Box::new(OpacityEntropy { weight: c.loss.opacity_entropy }));
     }
     let mut probes: Vec<Box<dyn ProbeLoss<f32>>> = Vec::new();
-    let weights = motion_weights(r);
+    let weights = motion_weights(&c.loss);
     if !weights.is_off() {
         probes.push(Box::new(Neighbourhood::new(weights, plan.extent, plan.clip, plan.fps)));
     }
     Stage {
-        batch: r.run.batch_size,
-        groups: groups(r, plan.extent),
+        batch: plan.batch_size,
+        groups: groups(c, plan.extent),
         probes,
         params,
-        upkeep: upkeep::of(r),
-        noise: Noise::of(r, plan.extent),
-        sh_interval: r.appearance.sh_degree_interval,
-        half_size_steps: (r.run.half_size_until * r.run.iterations as f64) as usize,
-        ..Stage::new(name, r.run.iterations)
+        upkeep: c.upkeep(),
+        noise: c.densify.is_mcmc().then(|| Noise::new(c.mcmc.noise_lr, c.densify.until, plan.extent)),
+        sh_interval: c.appearance.sh_degree_interval,
+        half_size_steps: (plan.half_size_until * plan.iterations as f64) as usize,
+        ..Stage::new(name, plan.iterations)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::recipe::Recipe;
 
     #[test]
     fn many_gaussians_take_smaller_steps_unless_told() {
         let of = |words: &[&str]| {
-            let r = Recipe::of(words).unwrap().resolve();
-            groups(&r, 2.0).iter().find(|g| g.column == "means").map(|g| [g.rate.start, g.rate.end]).unwrap()
+            let plan = Recipe::of(words).unwrap().plan();
+            groups(&plan.common, 2.0).iter().find(|g| g.column == "means").map(|g| [g.rate.start, g.rate.end]).unwrap()
         };
         let near = |a: [f64; 2], b: [f64; 2]| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-12);
         assert!(near(of(&["max_cap=500"]), [4e-3, 1e-4]) && near(of(&[]), [4e-3, 1e-4]));
