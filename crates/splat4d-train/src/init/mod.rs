@@ -4,6 +4,7 @@
 mod depth;
 pub(crate) mod fill;
 pub(crate) mod hull;
+mod map;
 mod scene_flow;
 pub(crate) mod volume;
 

@@ -17,6 +17,7 @@ mod tests;
 pub(crate) mod tracked;
 
 pub use common::CommonSettings;
+pub(crate) use common::{AppearanceSettings, LifeSettings, RateSettings};
 pub(crate) use control::ControlSettings;
 pub(crate) use deform::DeformSettings;
 pub(crate) use filtered::FilterSettings;
@@ -24,7 +25,6 @@ pub(crate) use hexplane::HexplaneSettings;
 pub(crate) use native4d::Native4dSettings;
 pub(crate) use spacetime::SpacetimeSettings;
 pub(crate) use ssm::SsmSettings;
-pub(crate) use still::{AppearanceSettings, LifeSettings, RateSettings};
 pub(crate) use tracked::TrackedSettings;
 
 use crate::Result;

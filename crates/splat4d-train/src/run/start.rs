@@ -265,13 +265,3 @@ fn offset_of_scene(run: &Path) -> Result<Option<[f64; 3]>> {
     let bytes = std::fs::read(&path).map_err(|e| place(Error::io("the scene cannot be read", e)))?;
     Ok(Some(splat4d::format::scene::read(&bytes).map_err(place)?.offset))
 }
-
-pub(super) fn read_info(run: &Path) -> Result<serde_json::Value> {
-    let path = run.join("run.json");
-    serde_json::from_str(&read_text(&path)?)
-        .map_err(|e| Error::input(format!("it is not JSON: {e}")).at(path.display()))
-}
-
-pub(super) fn read_text(path: &Path) -> Result<String> {
-    crate::files::read_text_with(path, "Give the folder of a run")
-}

@@ -21,9 +21,9 @@ pub use plan::ChunkPlan;
 
 use super::checkpoint::write_atomically;
 use super::identity;
+use super::info::{read_info, read_text};
 use super::open::{OpenCapture, learnable, open_frames};
 use super::session::{Outcome, TrainOptions};
-use super::start::{read_info, read_text};
 use crate::capture::Capture;
 use crate::event::Event;
 use crate::output::Owner;
