@@ -9,6 +9,7 @@
 
 mod camera;
 mod capture;
+mod captures;
 mod chaos;
 mod count;
 mod files;
@@ -96,7 +97,7 @@ fn main() -> ExitCode {
 fn run(arguments: &[String]) -> Result<()> {
     let (chore, rest) = arguments.split_first().context(USAGE)?;
     match chore.as_str() {
-        "capture" => capture::command(rest),
+        "capture" => captures::command(rest),
         "chaos" => chaos::command(rest),
         "count" => count::command(rest),
         "fuzz" => fuzz::command(rest),

@@ -1,6 +1,6 @@
 //! What a camera's own pictures say.
 
-use super::check::{GAMMA, SHARPNESS, Told, grade, unit, worse};
+use super::finding::{GAMMA, SHARPNESS, Told, grade, unit, worse};
 use super::look::Seen;
 use super::{Grade, Report};
 use crate::sync::median;

@@ -1,6 +1,6 @@
 //! What cameras say of each other: poses, exposure, white balance and sharpness, by features that two of them see.
 
-use super::check::{GAMMA, MATCHES, SHARPNESS, Told, grade, unit};
+use super::finding::{AGREE, GAMMA, MATCHES, SHARPNESS, Told, grade, unit};
 use super::look::{Seen, Stand, detail};
 use super::{Options, PairReport, Report};
 use crate::sfm::pictures::{Feature, Sight};
@@ -27,8 +27,6 @@ const EXPOSURE: [f64; 2] = [0.15, 0.5];
 /// are farther apart most, degrees.
 const SURE: usize = 20;
 const APART: f64 = 60.0;
-/// So many of a camera's pairs must agree on its error at least, of so many that tell it; chance only makes errors larger.
-pub(super) const AGREE: usize = 2;
 const TELL: usize = 3;
 /// Median over lower quartile of the size of a normal error: 0.6745 / 0.3186.
 const QUARTILE_TO_MEDIAN: f64 = 2.117;

@@ -1,8 +1,7 @@
 //! Clocks of cameras against each other, by what moves.
 
 use super::Report;
-use super::between::AGREE;
-use super::check::{MATCHES, Told, grade, unit};
+use super::finding::{AGREE, MATCHES, Told, grade, unit};
 use super::look::Seen;
 use super::shutter::{self, Pair};
 use crate::sync::epipolar::{Range, fundamental, lag, neighbours};

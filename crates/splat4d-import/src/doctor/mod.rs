@@ -7,6 +7,7 @@ mod alone;
 mod between;
 mod check;
 mod clocks;
+mod finding;
 mod look;
 mod shutter;
 #[cfg(test)]

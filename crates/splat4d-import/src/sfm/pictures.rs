@@ -1,6 +1,6 @@
 //! What cameras see, as features: of what stands still on the median picture, of what moves at moments that all share.
 
-use super::known::Known;
+use super::lens::Known;
 use super::overlay::Shown;
 use crate::sync::grey::{Grey, Pyramid};
 use crate::sync::tracks::{LEVELS, follow};

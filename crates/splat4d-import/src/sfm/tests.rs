@@ -1,6 +1,6 @@
 //! From made-up features and pictures to cameras.
 
-use super::known::Known;
+use super::lens::Known;
 use super::lens::Lens;
 use super::mapper::{FOCALS, Mapping, map};
 use super::pictures::{Feature, Look, Pictures, Sight, fixed};

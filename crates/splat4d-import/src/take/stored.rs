@@ -1,7 +1,7 @@
 //! The stored pictures as structure from motion asks for them.
 
 use crate::sfm;
-use crate::sfm::known::Known;
+use crate::sfm::lens::Known;
 use crate::sync::graph::Offset;
 use crate::write::{Masks, Pictures};
 use crate::{Error, Result};

@@ -3,7 +3,8 @@
 use super::poses::Solved;
 use super::stored::Stored;
 use crate::board::{self, Board, Lies, Tag};
-use crate::sfm::known::{Known, pixel_unit};
+use crate::sfm::known::pixel_unit;
+use crate::sfm::lens::Known;
 use crate::sfm::pictures::Pictures as _;
 use crate::{Error, Result};
 use rayon::prelude::*;

@@ -1,7 +1,8 @@
 //! From what the files say to a checked capture: poses, sizes, files, duplicates, split, clock.
 
+use super::account::Severity;
 use super::account::{Aspect, Remark, first_names};
-use super::preflight::Severity;
+use super::pose::{SAME_POSE, same_pose};
 use super::{
     Capture, CaptureKind, CaptureOptions, Exif, Extent, FlowFile, Frame, HoldOut, PointCloud, RawFrame, Rig, Split,
     Take, Timing,
@@ -14,8 +15,6 @@ use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-/// Poses closer than this, relative to the distance from the origin, are one pose.
-const SAME_POSE: f64 = 1e-9;
 /// Every how many images one is held out where no rig and no convention says otherwise (LLFF's habit).
 const HOLD_EVERY: usize = 8;
 /// White: what transparent pixels are composited on unless told (the papers' choice for D-NeRF).
@@ -225,14 +224,6 @@ fn rigs(take: &Take) -> Vec<Rig> {
         fixed[frame.camera] &= same_pose(&reference.source, &frame.source);
     }
     take.cameras.iter().zip(fixed).map(|(name, fixed)| Rig { name: name.clone(), fixed }).collect()
-}
-
-/// Whether two cameras stand at one place and look the same way.
-pub(super) fn same_pose(a: &Camera, b: &Camera) -> bool {
-    let (p, q) = (&a.cam_from_world, &b.cam_from_world);
-    let turn = p.rotation.iter().flatten().zip(q.rotation.iter().flatten()).map(|(x, y)| (x - y).abs());
-    let moved = norm(sub(p.translation, q.translation));
-    turn.fold(0.0, f64::max) <= SAME_POSE && moved <= SAME_POSE * (1.0 + norm(p.translation))
 }
 
 /// Two fixed cameras with one pose are a slip of the hand: a copied matrix. Photos may be taken twice from one place,

@@ -7,12 +7,12 @@
 mod multiview;
 mod unregistered;
 
+use super::account::Severity;
 use super::account::{Account, Aspect};
 use super::colmap_files::{self, Point, Registered};
 use super::convention::{Convention, Poses};
 use super::lookup::{self, Lookup};
 use super::points::read_ply;
-use super::preflight::Severity;
 use super::splits::Lists;
 use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take, beside, rig, sequence};
 use splat4d::math::{Se3, quat};

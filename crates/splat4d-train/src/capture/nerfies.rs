@@ -5,11 +5,11 @@
 //! `pixel_aspect_ratio`, `principal_point`, `radial_distortion`, `tangential_distortion` and `image_size` [width, height] of
 //! the pictures at 1x. `scene.json` brings the world to about a unit: x becomes (x − center)·scale, cameras and points alike.
 
+use super::account::Severity;
 use super::account::{Account, Aspect, first_names};
 use super::convention::{Convention, Poses};
 use super::json::{self, Node};
 use super::lookup::Lookup;
-use super::preflight::Severity;
 use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take, pose};
 use splat4d::format::npy::Npy;
 use splat4d::math::Se3;

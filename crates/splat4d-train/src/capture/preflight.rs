@@ -4,15 +4,6 @@ use super::{Aspect, Capture, Frame};
 use splat4d::math::mat3::solve;
 use splat4d::math::se3::{dot, norm, normalize, sub};
 
-/// How bad a [`Finding`] is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Severity {
-    /// Worth knowing.
-    Note,
-    /// The result will probably suffer.
-    Warning,
-}
-
 /// Something about a capture that will show in the result.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Finding {

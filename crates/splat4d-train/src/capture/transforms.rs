@@ -7,12 +7,12 @@
 mod clock;
 mod frame;
 
+use super::account::Severity;
 use super::account::{Account, Aspect, first_names};
 use super::convention::{Convention, Poses};
 use super::json::{self, Node};
 use super::lookup::Lookup;
 use super::points::read_ply;
-use super::preflight::Severity;
 use super::sequence::{self, Order};
 use super::splits::Lists;
 use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Sequence, Split, Take, colmap, picture};

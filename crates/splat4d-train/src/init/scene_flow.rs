@@ -1,6 +1,6 @@
 //! How fast what a depth map shows moves: optical flow to the pictures before and after, and the depth at both of its ends.
 
-use super::depth::Map;
+use super::map::Map;
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};
 use crate::vision::flow::{Pyramid, dense};

@@ -1,6 +1,6 @@
 //! `--motion auto`: looks at the capture, and takes the first program that says why it suits.
 
-use super::{PROGRAMS, Plan};
+use super::{Plan, Program};
 use crate::Result;
 use crate::capture::Agreement;
 use crate::capture::frames::{Frames, Picture};
@@ -49,7 +49,7 @@ impl Seen {
             fewest: plan.moments.iter().map(|m| m.1).min().unwrap_or(0),
             masks: frames.has_masks(),
             depth: frames.has_depth(),
-            predicted: plan.recipe.capture.observe < 1.0,
+            predicted: plan.predicted,
         })
     }
 
@@ -73,10 +73,15 @@ pub(crate) struct Choice {
     pub why: String,
 }
 
-/// Chooses for the training frames of a capture: the first program that says why it suits.
-pub(crate) fn choose(plan: &Plan, frames: &dyn Frames) -> Result<Choice> {
+/// Chooses for the training frames of a capture: the first of the programs that says why it suits.
+pub(crate) fn choose(
+    plan: &Plan,
+    programs: impl IntoIterator<Item = (&'static str, Box<dyn Program>)>,
+    frames: &dyn Frames,
+) -> Result<Choice> {
     let seen = Seen::of(plan, frames)?;
-    let choice = PROGRAMS.into_iter().find_map(|(motion, make)| Some(Choice { motion, why: make().suits(&seen)? }));
+    let mut programs = programs.into_iter();
+    let choice = programs.find_map(|(motion, program)| Some(Choice { motion, why: program.suits(&seen)? }));
     Ok(choice.expect("one program suits whatever no other does"))
 }
 
@@ -151,8 +156,8 @@ mod tests {
         }
 
         fn choose(&self, fixed: bool) -> Choice {
+            let recipe = Recipe::default().with(|r| r.capture.observe = self.observe);
             let plan = Plan {
-                recipe: Recipe::default().with(|r| r.capture.observe = self.observe).resolve(),
                 extent: 1.0,
                 center: [0.0; 3],
                 clip: [0.0, 1.0],
@@ -161,8 +166,9 @@ mod tests {
                 fixed_cameras: if fixed { self.cameras } else { 0 },
                 moments: (0..self.times).map(|t| (t as f64 / 30.0, if fixed { self.cameras } else { 0 })).collect(),
                 masks: self.masks,
+                ..recipe.plan()
             };
-            choose(&plan, self).unwrap()
+            choose(&plan, recipe.programs(), self).unwrap()
         }
     }
 

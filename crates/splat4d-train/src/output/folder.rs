@@ -1,9 +1,10 @@
 //! [`OutputFolder`]: the folder that a command writes, from the first look at it to the last file.
 
+use super::cannot_write;
 use super::list::{self, List};
 use super::owner::{Owner, in_use};
 use super::place::{Input, check_apart};
-use super::write::{cannot_write, is_temporary};
+use super::temporary::is_temporary;
 use super::{STATE, legacy, write_atomically};
 use crate::path_text::in_command;
 use crate::{Error, Result};

@@ -1,5 +1,6 @@
 use super::flat::FLAT;
 use super::*;
+use crate::step::replans::Replan;
 
 /// A recipe from before there were tables: all defaults, in order.
 const FLAT_DEFAULTS: &str = include_str!("tests/flat-defaults.toml");

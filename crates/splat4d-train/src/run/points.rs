@@ -8,7 +8,7 @@ use crate::Result;
 use crate::capture::{Capture, PointCloud, read_points};
 use crate::event::{Event, Progress};
 use crate::init::{self, Source};
-use crate::methods::{Plan, program_of};
+use crate::methods::Plan;
 use crate::recipe::Recipe;
 use crate::vision;
 use splat4d::scene::Camera;
@@ -40,7 +40,7 @@ pub(super) fn complete(
     if !wanted(capture, recipe) {
         return Ok(opened);
     }
-    let moments = moments(&plan)?;
+    let moments = moments(recipe, &plan)?;
     let count = (WANTED * recipe.init.count as f64) as usize;
     let mark = format!("comment of {} {} {count} {moments:?}", fingerprint(capture), env!("CARGO_PKG_VERSION"));
     let kept =
@@ -113,16 +113,16 @@ fn uncovered(camera: &Camera, points: &[[f64; 3]]) -> f64 {
 }
 
 /// The moments at which moving points are wanted.
-fn moments(plan: &Plan) -> Result<Vec<f64>> {
-    let program = program_of(&plan.recipe)?;
-    let mut first = program.first(plan);
+fn moments(recipe: &Recipe, plan: &Plan) -> Result<Vec<f64>> {
+    let program = recipe.program()?;
+    let mut settings = recipe.init.clone();
     if !program.capabilities(plan).moves || plan.times < 2 {
         return Ok(Vec::new());
     }
     if program.one_moment(plan) {
-        first.recipe.init.keyframes = 1;
+        settings.keyframes = 1;
     }
-    Ok(init::keyframes(&first))
+    Ok(init::keyframes(&program.first(plan), &settings))
 }
 
 #[cfg(test)]

@@ -3,7 +3,8 @@
 use super::back::{Came, End};
 use super::buffers::UNIFORM_STRIDE;
 use super::clock::Recorder;
-use super::frame::{Back, Band, Frame, Groups, RECORD_BYTES, THREADS, TILE, count, slot};
+use super::frame::{Back, Band, Frame, Groups, RECORD_BYTES, TILE, count, slot};
+use super::limits::THREADS;
 use super::pictures::Held;
 use super::{GpuRenderer, GpuStats, GpuTimings, MOST_GROUPS, PLANES, Way, largest_binding, plane_bytes};
 use crate::Result;

@@ -16,6 +16,7 @@
 pub(crate) mod backend;
 pub mod bin;
 mod blend;
+mod compare;
 mod count;
 mod gather;
 mod head;
@@ -31,9 +32,11 @@ pub mod shade;
 mod tests;
 
 pub use crate::simd::Simd;
-pub use backend::{Backend, Comparison, Oracle, Shot, Tables, Target, Wanted};
+pub use backend::{Backend, Shot, Tables, Wanted};
+pub use compare::{Comparison, Target};
 pub(crate) use count::PairCounts;
 pub use importance::{Importance, Sensitivity};
+pub use oracle::Oracle;
 pub use project::{Projected, ProjectedGrads, View};
 pub use resident::{
     KEPT, KeptCameras, KeptLayer, KeptNoise, KeptNumbers, KeptRule, KeptStep, KeptStepped, KeptTable, KeptTies,

@@ -3,7 +3,7 @@
 
 use super::super::*;
 use super::samples::{self, FOCAL, HEIGHT, Sample, WIDTH};
-use crate::capture::assemble::same_pose;
+use crate::capture::pose::same_pose;
 use serde_json::{Value, json};
 use std::path::PathBuf;
 

@@ -3,7 +3,6 @@
 use super::{FRAMES, WHOLE};
 use crate::capture::{Capture, ImageStore};
 use crate::event::Event;
-use crate::methods::program_of;
 use crate::recipe::Recipe;
 use crate::run::open::plan;
 use crate::{Error, Result};
@@ -47,7 +46,7 @@ impl ChunkPlan {
         let (take, count) = ([first, end], end.saturating_sub(first));
         let fixed = capture.cameras.iter().filter(|c| c.fixed).count() > 1;
         // `auto` has yet to say.
-        let moves = || program_of(recipe).map_or(true, |p| p.capabilities(&plan(capture, recipe)).moves);
+        let moves = || recipe.program().map_or(true, |p| p.capabilities(&plan(capture, recipe)).moves);
         let length = match settings.frames {
             0 if count > WHOLE && fixed && moves() && super::check(recipe).is_ok() => FRAMES,
             0 => return Ok(None),
