@@ -205,7 +205,8 @@ mod tests {
     #[test]
     fn results_of_other_programs_are_rows() {
         let folder = tempfile::tempdir().unwrap();
-        let a = written(folder.path(), "gs", r#"{"ours_7000": {"PSNR": 1}, "ours_30000": {"PSNR": 27.25, "SSIM": 0.8}}"#);
+        let a =
+            written(folder.path(), "gs", r#"{"ours_7000": {"PSNR": 1}, "ours_30000": {"PSNR": 27.25, "SSIM": 0.8}}"#);
         let b = written(folder.path(), "ns", r#"{"method_name": "x", "results": {"psnr": 26.5, "lpips": 0.2}}"#);
         let entries = open(&[a.clone(), b, a.join("results.json")]).unwrap();
         let names: Vec<&str> = entries.iter().map(|e| e.name.as_str()).collect();

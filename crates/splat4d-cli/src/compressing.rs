@@ -109,9 +109,9 @@ impl Work {
     pub(crate) fn reopen(dir: &Path) -> Result<Self> {
         let path = dir.join(ORDER);
         if !path.is_file() {
-            return Err(Error::input("this folder holds no compression")
+            return Err(Error::input("this folder contains no compression")
                 .at(dir.display())
-                .remedy("Give the folder that `splat4d compress` wrote, or begin anew: splat4d compress RUN."));
+                .remedy("Give the folder that `splat4d compress` wrote, or start again: splat4d compress RUN."));
         }
         Self::opened(dir, OutputFolder::amend(dir, COMMAND)?)
     }
@@ -121,7 +121,7 @@ impl Work {
         let order: Order = toml::from_str(&files::read_text(&path)?).map_err(|e| {
             Error::input(format!("it is not readable: {}", e.message()))
                 .at(path.display())
-                .remedy("Begin anew: splat4d compress RUN.")
+                .remedy("Start again: splat4d compress RUN.")
         })?;
         order.settings.check().map_err(|e| e.at(path.display()))?;
         Ok(Self { dir: dir.to_owned(), folder, order, fresh: false, device: Device::Cpu, size: SIZE })
@@ -276,7 +276,7 @@ impl Work {
             self.order.free,
             &cameras,
             [most, BESIDES],
-            &mut |done, total| console.phase("looking for a size", done, total),
+            &mut |done, total| console.phase("searching for the size", done, total),
         )?;
         console.clear();
         let last = trials.iter().rev().find(|t| t.prune == chosen.prune).expect("what was chosen was tried");
@@ -358,7 +358,7 @@ impl Work {
             }
             return Ok(false);
         }
-        console.say(&format!("again, with {:.0} % pruned instead of {:.0} %", 100.0 * next, 100.0 * prune));
+        console.say(&format!("repeating with {:.0} % pruned instead of {:.0} %", 100.0 * next, 100.0 * prune));
         self.order.tried.push(Tried { prune, bytes, psnr: is });
         self.order.settings.prune = next;
         self.folder.clear()?;
@@ -422,7 +422,7 @@ fn steps(run: &Run) -> Vec<Step> {
 /// Before and after in a few lines.
 fn say(told: &Compressed, size: [usize; 2], console: &Console) {
     let fair = told.fair();
-    let name = if told.unpruned.is_some() { "unpruned, as many steps more" } else { "before" };
+    let name = if told.unpruned.is_some() { "unpruned, same additional steps" } else { "before" };
     let line = |name: &str, side: &Side| {
         let number = |value: Option<f64>, digits: usize| value.map_or("-".into(), |v| format!("{v:.digits$}"));
         format!(

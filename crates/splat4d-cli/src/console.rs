@@ -189,7 +189,8 @@ impl Console {
             Event::Predicted { iterations, gaussians, size: [width, height], seconds, memory_estimate } => {
                 self.clear();
                 self.say(&format!(
-                    "{} steps on pictures of {width}x{height}, at most {} Gaussians: about {} minutes in all and {} of memory",
+                    "{} steps on images of {width}x{height}, at most {} Gaussians: about {} minutes in total and {} \
+                     of memory",
                     grouped(*iterations),
                     grouped(*gaussians),
                     human_seconds(*seconds),
@@ -197,7 +198,7 @@ impl Console {
                 ));
             }
             Event::Replanned { iteration, iterations, seconds, minutes } => self.detail(&format!(
-                "step {}: at this speed it would end after {} and not {}; from here on it is {} steps in all",
+                "step {}: at this speed training would take {} instead of {}; planned steps are now {}",
                 grouped(*iteration),
                 human_seconds(*seconds),
                 human_seconds(60.0 * minutes),
@@ -234,7 +235,7 @@ impl Console {
                 self.detail(&format!("checkpoint of step {} in {}", grouped(*iteration), path.display()));
             }
             Event::RolledBack { iteration, to, what } => self.warn(&format!(
-                "step {iteration} was not finite ({what}); training went back to step {to} and continues with \
+                "step {iteration} was not finite ({what}); training rolled back to step {to} and continues with \
                  smaller steps"
             )),
             Event::Finished { iteration, seconds, gaussians, peak_memory, advice } => {

@@ -113,7 +113,7 @@ pub(crate) fn all(run: &Path, measure: &Measure, deadline: &Deadline, console: &
         amend(run, [("evaluation_seconds".into(), json!(deadline.now() - started))])?;
     }
     playback_by(run, deadline, console)?;
-    if Times::leaves("there is no orbit film", [time.film, 0.0], run, deadline, console) {
+    if Times::leaves("the orbit film is missing", [time.film, 0.0], run, deadline, console) {
         let started = deadline.now();
         match orbit(run, &scene, console) {
             Ok(film) => {
@@ -121,7 +121,7 @@ pub(crate) fn all(run: &Path, measure: &Measure, deadline: &Deadline, console: &
                 amend(run, [("orbit_seconds".into(), json!(deadline.now() - started))])?;
             }
             // The scene and its scores stand without the film.
-            Err(error) => console.warn(&format!("there is no orbit film: {error:#}")),
+            Err(error) => console.warn(&format!("the orbit film was not written: {error:#}")),
         }
     }
     write_report(run, console)
@@ -177,7 +177,7 @@ impl Times {
             return true;
         }
         console.warn(&format!(
-            "{missing}: about {} are needed, and {} are left of --minutes. `splat4d eval {}` makes up for it.",
+            "{missing}: it takes about {}, and {} are left of --minutes. `splat4d eval {}` does it later.",
             human_seconds(seconds),
             human_seconds(left - kept),
             in_command(run)
@@ -215,7 +215,7 @@ pub(crate) fn playback_by(run: &Path, deadline: &Deadline, console: &Console) ->
             ],
         ),
         Err(error) => {
-            console.warn(&format!("there is no playback file: {error:#}"));
+            console.warn(&format!("the playback file was not written: {error:#}"));
             Ok(())
         }
     }
@@ -235,8 +235,8 @@ pub fn scores(run: &Path, scene: &Scene<f32>, measure: &Measure, console: &Conso
     flow(run, scene, &capture, &recipe, console)?;
     if capture.held.is_empty() {
         console.warn(
-            "no view was held out, so that quality on new views cannot be measured. Hold out a camera (--hold-out \
-             camera=0) or every 8th image (--hold-out every=8).",
+            "no view was held out, so quality on new views is not measured. Hold out a camera (--hold-out camera=0) \
+             or every 8th image (--hold-out every=8).",
         );
     }
     Ok(evaluation)
@@ -262,11 +262,11 @@ pub(crate) fn scores_on(
     if measured.frames(&capture).is_empty() {
         return Err(Error::input(format!("the run's capture has no views of the split `{split}`"))
             .at(run.display())
-            .remedy("A data set has `val` where it brings a list of them, such as transforms_val.json.")
+            .remedy("A data set has `val` if it contains a list of these views, such as transforms_val.json.")
             .into());
     }
     if !backgrounds.is_empty() && capture.background.is_none() {
-        return Err(Error::input("the run's pictures have no transparent pixels, and so no background to choose")
+        return Err(Error::input("the run's images have no transparent pixels, so there is no background to choose")
             .at(run.display())
             .remedy("Leave --background out.")
             .into());
@@ -389,7 +389,7 @@ pub(crate) fn trajectory(run: &Path, truth: &Path, console: &Console) -> anyhow:
         let _ = write!(words, "; RPE {turn:.3}°, {shift:.5} units");
     }
     if let Some([middle, most]) = found.clock_errors() {
-        let _ = write!(words, "; clocks off by {:.2} ms at the median, {:.2} ms at most", 1e3 * middle, 1e3 * most);
+        let _ = write!(words, "; time offsets wrong by {:.2} ms (median), {:.2} ms at most", 1e3 * middle, 1e3 * most);
     }
     console.say(&words);
     console.emit(&json!({"type": "trajectory", "results": found.report()}));
@@ -452,7 +452,7 @@ fn tracks(run: &Path, scene: &Scene<f32>, capture: &Capture, console: &Console) 
     let Some(e) = track_error(scene, capture)? else { return Ok(()) };
     console.say(&format!(
         "tracks of {} points in space: median error {:.4} units, {:.2} % of a character's height ({:.1} % of the \
-         moments followed); the nearest Gaussian itself is {:.4} units away, {:.4} at the first frame",
+         times tracked); nearest Gaussian at {:.4} units, {:.4} in the first frame",
         e.points,
         e.median,
         e.percent(),
@@ -469,7 +469,7 @@ fn tracks(run: &Path, scene: &Scene<f32>, capture: &Capture, console: &Console) 
     let Some(e) = point_errors(scene, capture)? else { return Ok(()) };
     let percent = |shares: &[f64]| shares.iter().map(|s| format!("{:.1}", 100.0 * s)).collect::<Vec<_>>().join(", ");
     let mut words = format!(
-        "points followed in space: median error {:.4} units, {} % within 1, 2, 4, 8, 16 % of their height, {:.1} % lost",
+        "points tracked in space: median error {:.4} units, {} % within 1, 2, 4, 8, 16 % of their height, {:.1} % lost",
         e.median,
         percent(&e.within),
         100.0 * e.lost
@@ -490,7 +490,7 @@ fn tracks(run: &Path, scene: &Scene<f32>, capture: &Capture, console: &Console) 
             let _ = write!(words, ", drift slope {slope:.2}");
         }
         if let Some(right) = p.visibility {
-            let _ = write!(words, ", visibility right for {:.1} %", 100.0 * right);
+            let _ = write!(words, ", visibility correct for {:.1} %", 100.0 * right);
         }
         console.say(&words);
     }
@@ -519,7 +519,7 @@ fn flow(run: &Path, scene: &Scene<f32>, capture: &Capture, recipe: &Recipe, cons
     whole.train.retain(|i| capture.train.contains(i));
     let Some(e) = flow_error(scene, &whole)? else { return Ok(()) };
     let mut words = format!(
-        "flow of {} {} views: end-point error {:.3} px in the mean, {:.3} at the median, {:.1} % within 1 px",
+        "flow of {} {} views: end-point error mean {:.3} px, median {:.3} px, {:.1} % within 1 px",
         e.pictures,
         if e.held { "held-out" } else { "training" },
         e.mean,
@@ -558,7 +558,7 @@ fn in_words(score: impl Fn(&str) -> Option<f64>) -> String {
         ("PSNR-aligned", "aligned", 2, " dB"),
         ("PSNR-cc", "colour-corrected", 2, " dB"),
         ("PSNR-dynamic", "dynamic regions", 2, " dB"),
-        ("PSNR-dynamic-aligned", "there aligned", 2, " dB"),
+        ("PSNR-dynamic-aligned", "dynamic regions, aligned", 2, " dB"),
         ("PSNR-foreground", "foreground", 2, " dB"),
         ("SSIM", "SSIM", 4, ""),
         ("MS-SSIM", "MS-SSIM", 4, ""),
@@ -616,7 +616,7 @@ fn orbit(run: &Path, scene: &Scene<f32>, console: &Console) -> anyhow::Result<Pa
     for (i, shot) in shots.iter().enumerate() {
         painter.draw(&shot.camera, shot.time);
         film.frame(&painter.rgb(Channel::Color, [0.0, 1.0]))?;
-        console.phase("filming the orbit", i + 1, shots.len());
+        console.phase("rendering the orbit film", i + 1, shots.len());
     }
     film.finish()?;
     console.clear();

@@ -285,7 +285,7 @@ mod tests {
     }
 
     #[test]
-    fn causes_are_told_once() {
+    fn causes_are_printed_once() {
         let io = std::io::Error::other("disk on fire");
         let error = anyhow::Error::from(Error::io("cannot be read", io)).context("the report");
         let text = told(&error);

@@ -108,12 +108,12 @@ impl Run {
     /// Reads the folder. Errors: it is no run; a file in it is damaged.
     pub fn open(path: &Path) -> Result<Self> {
         if !path.exists() {
-            return Err(Error::input("there is no such run")
+            return Err(Error::input("no such run")
                 .at(path.display())
                 .remedy("Give the folder that `splat4d train` wrote, for instance runs/knight."));
         }
         if !Self::is(path) {
-            return Err(Error::input("is not a run: it holds neither recipe.toml nor a scene nor checkpoints")
+            return Err(Error::input("is not a run: it contains neither recipe.toml nor a scene nor checkpoints")
                 .at(path.display())
                 .remedy("Give the folder that `splat4d train` wrote, for instance runs/knight."));
         }
@@ -189,7 +189,7 @@ impl Run {
         let text = self.recipe.as_deref().ok_or_else(|| {
             Error::input("the run has no recipe.toml")
                 .at(path.display())
-                .remedy("Train again; it is written at the start.")
+                .remedy("Train again: the file is written at the start.")
         })?;
         Recipe::from_toml(text).map_err(|e| e.at(path.display()))
     }
@@ -248,9 +248,9 @@ impl Run {
             return Ok(scene);
         }
         checkpoint::list(&self.path).pop().ok_or_else(|| {
-            Error::input("the run holds no scene and no checkpoint yet")
+            Error::input("the run has no scene and no checkpoint yet")
                 .at(self.path.display())
-                .remedy("Let it train, or continue it with `splat4d train --resume`.")
+                .remedy("Wait for the first checkpoint, or continue it with `splat4d train --resume`.")
         })
     }
 

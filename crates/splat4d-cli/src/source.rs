@@ -122,7 +122,7 @@ impl Source {
     pub(crate) fn finite(mut self) -> Self {
         let all = self.scene.len();
         let dropped = self.scene.drop_non_finite();
-        self.warnings.counted(dropped, all, "hold NaN or infinity and were left out");
+        self.warnings.counted(dropped, all, "contain NaN or infinity and were left out");
         self
     }
 
@@ -180,7 +180,7 @@ fn open_sequence(path: &Path, fps: f64) -> Result<Source> {
     // Frames far from the origin may each have an offset: that of the first is the scene's.
     let mut offset = None;
     if let Some(missing) = &found.missing {
-        warnings.say(format!("frames are missing: {missing}. Nothing is shown at their times, which are kept"));
+        warnings.say(format!("frames are missing: {missing}. The scene is empty at their times"));
     }
     for file in &found.files {
         let bytes = files::read(file)?;
@@ -194,7 +194,7 @@ fn open_sequence(path: &Path, fps: f64) -> Result<Source> {
         let mut opened = own.open(&bytes).map_err(|e| e.at(file.display()))?;
         warnings.append(opened.warnings);
         if *up.get_or_insert(opened.scene.up) != opened.scene.up {
-            return Err(Error::input("the frame's axes differ from those of the frames before it")
+            return Err(Error::input("the frame's axes differ from those of the previous frames")
                 .at(file.display())
                 .remedy("Convert all frames with the same --up."));
         }
@@ -222,7 +222,7 @@ pub fn read_scene(path: &Path) -> Result<Scene<f32>> {
 /// Refuses a scene without Gaussians.
 pub fn not_empty(scene: &Scene<f32>, path: &Path) -> Result<()> {
     if scene.is_empty() {
-        return Err(Error::input("holds no Gaussians")
+        return Err(Error::input("contains no Gaussians")
             .at(path.display())
             .remedy("Train it again, or give another file."));
     }

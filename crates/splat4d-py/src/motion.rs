@@ -19,8 +19,19 @@ use std::sync::Arc;
 
 /// Names of tables that every layer has.
 const TAKEN: [&str; 13] = [
-    "geometry", "means", "quats", "log_scales", "opacity_logits", "sh", "life", "life_centers", "life_log_widths",
-    "life_log_softness", "time", "features", "labels",
+    "geometry",
+    "means",
+    "quats",
+    "log_scales",
+    "opacity_logits",
+    "sh",
+    "life",
+    "life_centers",
+    "life_log_widths",
+    "life_log_softness",
+    "time",
+    "features",
+    "labels",
 ];
 /// Bytes that a question leaves for its backward, a Gaussian: raw and activated rows here and in Python.
 const SCRATCH: u64 = 256;
@@ -46,7 +57,9 @@ impl Hook {
             motion.getattr(name).map_err(|_| bad_input(format!("the motion has no `{name}`"), "Give a splat4d.Motion"))
         };
         let dict = |name: &'static str| {
-            get(name)?.cast_into::<PyDict>().map_err(|_| bad_input(format!("`{name}` of the motion is no dict"), "Give a dict"))
+            get(name)?
+                .cast_into::<PyDict>()
+                .map_err(|_| bad_input(format!("`{name}` of the motion is no dict"), "Give a dict"))
         };
         let (name, warmup, colors) = (get("name")?.extract()?, get("warmup")?.extract()?, get("colors")?.extract()?);
         let mut hook = Self {
@@ -60,7 +73,10 @@ impl Hook {
         for (table, width) in dict("per_gaussian")?.iter() {
             let (table, width): (String, usize) = (table.extract()?, width.extract()?);
             if width == 0 {
-                return Err(bad_input(format!("`{table}` has 0 numbers a Gaussian"), "Give 1 or more, or leave it out"));
+                return Err(bad_input(
+                    format!("`{table}` has 0 numbers a Gaussian"),
+                    "Give 1 or more, or leave it out",
+                ));
             }
             hook.check(&table)?;
             hook.per_gaussian.push((String::leak(table), width));
@@ -79,7 +95,8 @@ impl Hook {
         let mut rates = Vec::new();
         for (column, rate) in dict("rates")?.iter() {
             let column: String = column.extract()?;
-            let known = hook.per_gaussian.iter().any(|(n, _)| *n == column) || hook.shared.iter().any(|s| s.0 == column);
+            let known =
+                hook.per_gaussian.iter().any(|(n, _)| *n == column) || hook.shared.iter().any(|s| s.0 == column);
             if !known {
                 let remedy = "Name arrays of `per_gaussian` and `shared`; the others learn at the recipe's rates";
                 return Err(bad_input(format!("there is a rate for `{column}`, and no such array"), remedy));
@@ -248,11 +265,20 @@ impl PyMotion {
             Some(table) => rows(py, (0..n).map(|j| table.read::<3>(j, 0)).collect())?,
             None => py.None(),
         };
-        let arguments =
-            (answer.tape.as_ref(), rows(py, means)?, rows(py, quats)?, rows(py, scales)?, shaped(py, opacities, &[n])?, colors);
+        let arguments = (
+            answer.tape.as_ref(),
+            rows(py, means)?,
+            rows(py, quats)?,
+            rows(py, scales)?,
+            shaped(py, opacities, &[n])?,
+            colors,
+        );
         let back = self.hook.object.bind(py).call_method1("backward", arguments)?;
         let back = back.cast_into::<PyDict>().map_err(|_| {
-            bad_input("the motion's backward did not return a dict", "Return a gradient for each array that learns, by name")
+            bad_input(
+                "the motion's backward did not return a dict",
+                "Return a gradient for each array that learns, by name",
+            )
         })?;
         let mut d_time = 0.0;
         for (name, value) in back.iter() {
@@ -269,7 +295,12 @@ impl PyMotion {
                     "Return finite numbers",
                 ));
             }
-            let unknown = || bad_input(format!("the motion's backward returned `{name}`, which is no array of it"), "Return the names that forward is given");
+            let unknown = || {
+                bad_input(
+                    format!("the motion's backward returned `{name}`, which is no array of it"),
+                    "Return the names that forward is given",
+                )
+            };
             let (key, first, width, by_row) = match name.as_str() {
                 "means" => (GEOMETRY, 0, 3, true),
                 "quats" => (GEOMETRY, QUAT, 4, true),

@@ -69,7 +69,10 @@ pub(crate) fn with_parameters(scene: &Scene<f32>, new: &Bound<'_, PyDict>) -> Py
         }
         let data: Vec<f32> = array.as_array().iter().copied().collect();
         if let Some(bad) = data.iter().position(|x| !x.is_finite()) {
-            return Err(bad_input(format!("row {} of `{name}` holds NaN or infinity", bad / width), "Give finite numbers"));
+            return Err(bad_input(
+                format!("row {} of `{name}` holds NaN or infinity", bad / width),
+                "Give finite numbers",
+            ));
         }
         params[*key].column_from_rows(*first, *width, &data);
     }
@@ -179,8 +182,16 @@ impl Rendering {
                 let shot = Shot { depth: true, ..Shot::new(&splats, &self.camera, self.background) };
                 let pixels = ImageGrads { color: &color, alpha: alpha.as_ref(), depth: depth.as_ref(), extra: None };
                 let own = splats.parts.iter().map(|p| matches!(p.color, Color::Sh { base: true, .. }));
-                let mut d_sh: Vec<Option<&mut Table<f32>>> =
-                    grads.iter_mut().zip(own).map(|(g, own)| own.then(|| { let [t] = g.of([SH]); t })).collect();
+                let mut d_sh: Vec<Option<&mut Table<f32>>> = grads
+                    .iter_mut()
+                    .zip(own)
+                    .map(|(g, own)| {
+                        own.then(|| {
+                            let [t] = g.of([SH]);
+                            t
+                        })
+                    })
+                    .collect();
                 renderer.backward(&shot, &pixels, &mut d_sh, &mut d);
             }
             if let (Some((layer, keys)), Some(head)) = (scene.head_keys(), &d.head) {

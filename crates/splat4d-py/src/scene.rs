@@ -61,17 +61,13 @@ impl Scene {
     }
 
     /// Runs `work` on the file of the scene: its own or, where it has none, one in a folder that is deleted afterwards.
-    fn with_file<T>(
-        &self,
-        py: Python<'_>,
-        work: impl FnOnce(&Path, &Path) -> anyhow::Result<T> + Send,
-    ) -> PyResult<T>
+    fn with_file<T>(&self, py: Python<'_>, work: impl FnOnce(&Path, &Path) -> anyhow::Result<T> + Send) -> PyResult<T>
     where
         T: Send,
     {
         py.detach(|| {
-            let folder = tempfile::tempdir()
-                .map_err(|e| splat4d::Error::environment("no temporary folder could be made", e))?;
+            let folder =
+                tempfile::tempdir().map_err(|e| splat4d::Error::environment("no temporary folder could be made", e))?;
             let own = folder.path().join(SCENE);
             if self.path.is_none() {
                 let mut bytes = Vec::new();
@@ -373,7 +369,8 @@ impl Scene {
     /// The scene with a list of edits replayed (docs/edit.md), in no file yet. `edits`: the text of a list, or the path of
     /// one.
     fn edit(&self, py: Python<'_>, edits: &Bound<'_, PyAny>) -> PyResult<Self> {
-        let text: Option<String> = edits.extract().ok().filter(|text: &String| text.contains('\n') || text.contains('='));
+        let text: Option<String> =
+            edits.extract().ok().filter(|text: &String| text.contains('\n') || text.contains('='));
         let path: PathBuf = if text.is_some() { PathBuf::new() } else { edits.extract()? };
         let scene = self.with_file(py, |file, folder| {
             let list = match text {

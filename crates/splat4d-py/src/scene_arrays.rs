@@ -303,7 +303,11 @@ impl About<'_, '_> {
     /// Frames per second. Errors: not a positive number.
     pub(crate) fn checked_fps(&self) -> PyResult<f64> {
         let fps = self.fps;
-        if fps > 0.0 && fps.is_finite() { Ok(fps) } else { Err(bad_input(format!("fps is {fps}"), "Give a positive number")) }
+        if fps > 0.0 && fps.is_finite() {
+            Ok(fps)
+        } else {
+            Err(bad_input(format!("fps is {fps}"), "Give a positive number"))
+        }
     }
 
     /// The scene of these layers.

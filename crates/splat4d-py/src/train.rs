@@ -24,7 +24,7 @@ use std::sync::Arc;
 /// `settings` are those of docs/recipe.md: `iterations=300`, `downscale=2`; a setting of a table has two underscores,
 /// `densify__max_cap=20000`. `motion` is the name of a motion model or a `Motion` of your own; without one, the capture
 /// decides. `progress` is called with every event, a dict as in docs/events.md; without one, a bar is shown on terminals and in
-/// notebooks, and with `progress=False` nothing is. `loss(picture, truth, view)` gets arrays [h, w, 3] and returns (value,
+/// notebooks, and with `progress=False` nothing is. `loss(image, truth, view)` gets arrays [h, w, 3] and returns (value,
 /// gradient), which are added to the recipe's losses; in the first 40 % of the steps the arrays have half of the size, with
 /// `half_size_until=0` always the full one. `force` replaces a run that is in `out` already. Ctrl-C, or an exception in a
 /// function of yours, stops with a checkpoint; `resume` continues from there.

@@ -6,9 +6,10 @@
 //! follow from `run.iterations` (see [`Recipe::resolve`]). Names without a table (`max_cap` for `densify.max_cap`), which
 //! recipes had before they had tables, are read as well.
 
+mod chunks;
 mod flat;
+pub(crate) mod parts;
 mod quality;
-mod replans;
 mod run;
 #[cfg(test)]
 mod tests;
@@ -22,14 +23,14 @@ use crate::methods::{
     AppearanceSettings, ControlSettings, DeformSettings, FilterSettings, HexplaneSettings, LifeSettings,
     Native4dSettings, RateSettings, SpacetimeSettings, SsmSettings, TrackedSettings,
 };
-use crate::run::chunks::ChunkSettings;
 use crate::settings::Table;
+use crate::step::replans::Replans;
 use crate::upkeep::{
     AdcSettings, DensifySettings, FloaterSettings, GuidedSettings, McmcSettings, MergeSettings, NodeSettings,
     OpacityResetSettings, PruneSettings, RelocateSettings, SplitSettings,
 };
+pub use chunks::ChunkSettings;
 pub use quality::Quality;
-pub use replans::{Replan, Replans};
 pub use run::{MotionName, RunSettings};
 pub use text::Idle;
 

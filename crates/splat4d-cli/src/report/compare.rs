@@ -41,7 +41,8 @@ fn table(out: &mut String, entries: &[Entry]) {
 
 fn curves(out: &mut String, entries: &[Entry]) {
     let of = |x: fn(&crate::run_folder::Metrics) -> f64| -> Vec<Series> {
-        let series = |e: &Entry| Series { name: e.name.clone(), points: e.metrics.iter().map(|m| (x(m), m.psnr)).collect() };
+        let series =
+            |e: &Entry| Series { name: e.name.clone(), points: e.metrics.iter().map(|m| (x(m), m.psnr)).collect() };
         entries.iter().map(series).filter(|s| !s.points.is_empty()).collect()
     };
     let by_step = lines(&of(|m| m.iteration), "step", "dB");

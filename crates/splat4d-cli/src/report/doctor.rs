@@ -93,9 +93,9 @@ fn pairs(report: &Report) -> String {
     }
     let number = |v: f64, digits: usize| if v.is_finite() { format!("{v:+.digits$}") } else { "–".to_owned() };
     let mut out = format!(
-        "<details><summary>{} pairs of pictures that show the same, the worst poses first</summary>\n<table>\
-         <tr><th>cameras</th><th>features</th><th>poses, px of 1920</th><th>second is brighter, stops (red green blue)</th>\
-         <th>as sharp</th></tr>\n",
+        "<details><summary>{} pairs of images with common features, worst poses \
+         first</summary>\n<table><tr><th>cameras</th><th>features</th><th>pose error, px at 1920</th><th>brightness \
+         of the second, stops (red green blue)</th><th>sharpness ratio</th></tr>\n",
         report.pairs.len()
     );
     for p in &report.pairs {
@@ -126,11 +126,11 @@ pub(crate) fn word(grade: Grade) -> &'static str {
 pub(crate) fn about(report: &Report) -> Vec<String> {
     let mut out = Vec::new();
     if let Some(share) = report.seen_by_three {
-        out.push(format!("Of the space in which something moves three cameras see {:.0} %.", 100.0 * share));
+        out.push(format!("Three cameras see {:.0} % of the space in which something moves.", 100.0 * share));
     }
     if let Some(training) = &report.training {
         out.push(format!(
-            "Training learns the motion model {} and takes about {} MB of memory.",
+            "Training uses the motion model {} and needs about {} MB of memory.",
             training.motion,
             training.memory.div_ceil(1 << 20)
         ));

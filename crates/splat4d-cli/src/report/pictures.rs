@@ -59,7 +59,7 @@ pub(super) fn reduced(picture: RgbImage) -> Option<String> {
 
 /// The orbit film: inside the page if small, else linked beside it.
 pub(super) fn film(run: &Path) -> Option<String> {
-    film_file(&orbit(run)?, "The scene, seen from a camera that moves around it")
+    film_file(&orbit(run)?, "The scene, from a camera on an orbit")
 }
 
 /// A film's file: inside the page if small, else linked beside it.

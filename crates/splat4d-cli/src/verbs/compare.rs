@@ -105,7 +105,10 @@ fn text(head: &[String], rows: &[Vec<String>]) -> Vec<String> {
 fn csv(head: &[String], rows: &[Vec<String>]) -> Result<Vec<u8>> {
     let mut table = csv::Writer::from_writer(Vec::new());
     let failed = |e: csv::Error| Error::environment("the table could not be written", std::io::Error::other(e));
-    std::iter::once(head).chain(rows.iter().map(Vec::as_slice)).try_for_each(|row| table.write_record(row)).map_err(failed)?;
+    std::iter::once(head)
+        .chain(rows.iter().map(Vec::as_slice))
+        .try_for_each(|row| table.write_record(row))
+        .map_err(failed)?;
     Ok(table.into_inner().expect("a vector takes everything"))
 }
 
@@ -145,8 +148,14 @@ mod tests {
         assert_eq!(text(&head, &rows)[1], "one, \"quoted\"  30.12");
         let bytes = csv(&head, &rows).unwrap();
         let mut read = csv::Reader::from_reader(&bytes[..]);
-        assert_eq!(read.records().map(|r| r.unwrap()[0].to_owned()).collect::<Vec<_>>(), ["one, \"quoted\"", "two|three"]);
+        assert_eq!(
+            read.records().map(|r| r.unwrap()[0].to_owned()).collect::<Vec<_>>(),
+            ["one, \"quoted\"", "two|three"]
+        );
         let table = markdown(&entries());
-        assert!(table.contains("| two\\|three | **31.50** |") && table.lines().nth(1) == Some("| --- | ---: |"), "{table}");
+        assert!(
+            table.contains("| two\\|three | **31.50** |") && table.lines().nth(1) == Some("| --- | ---: |"),
+            "{table}"
+        );
     }
 }

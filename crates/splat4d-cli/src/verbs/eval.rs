@@ -164,7 +164,10 @@ fn on_capture(
     console: &Console,
 ) -> anyhow::Result<()> {
     let mut recipe = Recipe::default();
-    let wanted = [("hold_out", args.hold_out.as_ref().map(|v| format!("{v:?}"))), ("downscale", args.downscale.map(|k| k.to_string()))];
+    let wanted = [
+        ("hold_out", args.hold_out.as_ref().map(|v| format!("{v:?}"))),
+        ("downscale", args.downscale.map(|k| k.to_string())),
+    ];
     for (name, value) in wanted {
         value.map_or(Ok(()), |value| recipe.set(&format!("{name}={value}")))?;
     }
@@ -180,14 +183,24 @@ fn on_capture(
             Input::new(capture, "the capture"),
         ];
         let asked = format!("{} on {}", path.display(), capture.display());
-        let request = Request { command: "eval", inputs: &inputs, asked: &asked, force: args.force, mixes: Mixes::Anything };
+        let request =
+            Request { command: "eval", inputs: &inputs, asked: &asked, force: args.force, mixes: Mixes::Anything };
         OutputFolder::begin(output, &request).map(|(folder, _)| folder)
     });
     let folder = folder.transpose()?;
     let split = args.split.unwrap_or(Split::Test).measured();
     let backgrounds = args.background.map_or(&[][..], Background::colors);
     let out = folder.as_ref().map(OutputFolder::path);
-    finish::foreign_scores(source.scene, &open_capture(capture, &recipe)?, &recipe, out, split, backgrounds, measure, console)?;
+    finish::foreign_scores(
+        source.scene,
+        &open_capture(capture, &recipe)?,
+        &recipe,
+        out,
+        split,
+        backgrounds,
+        measure,
+        console,
+    )?;
     if let Some(folder) = folder {
         folder.finished();
     }
@@ -214,7 +227,7 @@ fn baseline(out: &OutputFolder, run: &Run, measure: &finish::Measure, console: &
         console.clear();
         if outcome.interrupted {
             return Err(splat4d::Error::new(ErrorKind::Interrupted, "the still scene is unfinished")
-                .remedy("Run `splat4d eval --baseline` again; it trains anew.")
+                .remedy("Run `splat4d eval --baseline` again; it trains again.")
                 .into());
         }
     }

@@ -127,7 +127,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let folder = &args.output;
     let foreign = folder.join("capture.json").is_file() && !folder.join(corrections::FILE).is_file();
     if foreign {
-        return Err(Error::input("there is a capture already, and it is not from here")
+        return Err(Error::input("the folder contains a capture of another program")
             .at(folder.display())
             .remedy("Give another folder with -o.")
             .into());
@@ -162,7 +162,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         masks: args.masks.clone(),
         synchronous: args.synchronous,
     };
-    let stop = interrupt::flag("stopping: what is stored is kept");
+    let stop = interrupt::flag("stopping: stored results are kept");
     let mut tell = |event: &splat4d_train::event::Event| console.event(event);
     let made = take::import(&request, &mut Progress(&mut tell), &|| stop.load(Ordering::SeqCst));
     console.clear();
@@ -208,7 +208,7 @@ fn told(report: &Report, looked: Option<&(Looked, PathBuf)>, console: &Console) 
     let silent: Vec<&str> = report.cameras.iter().filter(|c| c.offset.is_none()).map(|c| c.name.as_str()).collect();
     if report.cameras.len() > 1 && !silent.is_empty() && !report.still {
         console.warn(&format!(
-            "nothing tells how the clocks of these cameras differ, their files' are taken: {} (tell it in {})",
+            "the time offsets of these cameras are unknown, those of their files are used: {} (correct them in {})",
             silent.join(", "),
             corrections::FILE
         ));

@@ -108,7 +108,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let foreign = sog || levels || (path.is_dir() && bundle::is_scene(path));
     let is_capture = !Run::is(path) && !foreign && (path.is_dir() || marker);
     if args.doctor && !is_capture {
-        return Err(Error::input("the doctor looks at captures, and this is none")
+        return Err(Error::input("the doctor checks captures only")
             .at(path.display())
             .remedy("Give a capture's folder, or leave --doctor out.")
             .into());
@@ -191,17 +191,17 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
     line(&mut text, "capture", &format!("{} ({:?})", capture.name, capture.kind));
     line(&mut text, "cameras", &format!("{fixed} fixed, {moving} moving"));
     let plural = if times.len() == 1 { "" } else { "s" };
-    let pictures = format!("{} at {} moment{plural}", grouped(capture.frames.len()), grouped(times.len()));
+    let pictures = format!("{} at {} time{plural}", grouped(capture.frames.len()), grouped(times.len()));
     line(&mut text, "pictures", &pictures);
     let all: Vec<String> = sizes.iter().map(|s| format!("{}x{}", s[0], s[1])).collect();
     line(&mut text, "size", &all.join(", "));
-    let span = format!("{first:.3} to {last:.3} s, {} frames a second", capture.fps);
+    let span = format!("{first:.3} to {last:.3} s, {} frames per second", capture.fps);
     line(
         &mut text,
         "time",
         &match capture.timing {
-            Timing::Moment => "one moment: a photo set, no times are stated".to_owned(),
-            Timing::Numbers => format!("{span}; by the numbers in picture names, no times are stated"),
+            Timing::Moment => "one time: a photo set, no times are given".to_owned(),
+            Timing::Numbers => format!("{span}; from the numbers in image names, no times are given"),
             _ => span,
         },
     );
@@ -217,11 +217,11 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
     let points = capture.points.as_ref().map_or("none".into(), |p| grouped(p.points.len()));
     line(&mut text, "initial points", &points);
     if !priors.is_empty() {
-        line(&mut text, "beside pictures", &priors.join(", "));
+        line(&mut text, "priors", &priors.join(", "));
     }
     let reach = capture.reach();
     if let Some(reach) = &reach {
-        line(&mut text, "views hold", &in_words(reach));
+        line(&mut text, "valid views", &in_words(reach));
     }
     line(&mut text, "memory", &format!("about {} with the default recipe", human_bytes(memory)));
     if let Some(outlook) = &outlook {
@@ -277,11 +277,12 @@ fn priors(capture: &Capture) -> Vec<String> {
 fn in_words(reach: &Reach) -> String {
     let [x, y, z] = reach.center;
     let mut out = format!(
-        "to about {:.0}° from a training camera, seen from ({x:.2}, {y:.2}, {z:.2}), {:.2} to {:.2} units from there",
+        "within about {:.0}° of a training camera, seen from ({x:.2}, {y:.2}, {z:.2}), at distances of {:.2} to \
+         {:.2} units",
         reach.degrees, reach.distances[0], reach.distances[1]
     );
     if reach.held[1] > 0 {
-        let _ = write!(out, "; of {} held-out cameras {} stand farther away", reach.held[0], reach.held[1]);
+        let _ = write!(out, "; {1} of {0} held-out cameras are farther away", reach.held[0], reach.held[1]);
     }
     out
 }
@@ -309,8 +310,9 @@ fn of_run(path: &Path) -> anyhow::Result<Told> {
     if let Some(capture) = run.capture() {
         line(&mut text, "capture", &capture.display().to_string());
         if !capture.exists() {
-            troubles
-                .push("The capture has moved away: the run can be rendered, but neither resumed nor measured.".into());
+            troubles.push(
+                "The capture is not there any more: the run can be rendered, but neither resumed nor measured.".into(),
+            );
         }
     }
     let recipe = run.recipe()?;
@@ -337,7 +339,7 @@ fn of_run(path: &Path) -> anyhow::Result<Told> {
         line(&mut text, "memory", &format!("{} at most", human_bytes(bytes as u64)));
     }
     if let Some(n) = run.number("rollbacks").filter(|n| *n > 0.0) {
-        troubles.push(format!("Training went back {n} times because a number was not finite: look at the poses."));
+        troubles.push(format!("Training rolled back {n} times because a value was not finite: check the poses."));
     }
     if let Some(results) = run.results.as_ref().and_then(Value::as_object) {
         let scores: Vec<String> = results.iter().filter_map(|(k, v)| Some(format!("{k} {:.4}", v.as_f64()?))).collect();
@@ -457,19 +459,24 @@ fn of_scene(scene: &Scene<f32>) -> Told {
     let sound = (n - damaged).max(1) as f64;
     let mut troubles = Vec::new();
     if n == 0 {
-        troubles.push("It holds no Gaussians.".into());
+        troubles.push("It contains no Gaussians.".into());
     }
     if damaged > 0 {
         troubles.push(format!(
-            "{} Gaussians hold NaN or infinity: they are not drawn. Train or export again.",
+            "{} Gaussians contain NaN or infinity: they are not rendered. Train or export again.",
             grouped(damaged)
         ));
     }
     if zero_quats > 0 {
-        troubles.push(format!("{} Gaussians have a zero rotation: they are not drawn as meant.", grouped(zero_quats)));
+        troubles
+            .push(format!("{} Gaussians have a zero rotation: they are not rendered correctly.", grouped(zero_quats)));
     }
     if opacity[0] as f64 > MANY_FAINT * sound && n >= FEW {
-        troubles.push(format!("{} of {} Gaussians are too faint to be seen.", grouped(opacity[0]), grouped(n)));
+        troubles.push(format!(
+            "{} of {} Gaussians are too transparent to be visible.",
+            grouped(opacity[0]),
+            grouped(n)
+        ));
     }
     if huge as f64 > MANY_HUGE * sound && n >= FEW {
         troubles.push(format!("{} Gaussians are larger than the whole scene: floaters, or a sky.", grouped(huge)));
@@ -480,22 +487,18 @@ fn of_scene(scene: &Scene<f32>) -> Told {
         line(&mut text, "layer", &format!("{name}: {} by {motion}, life {life}, SH degree {degree}", grouped(*rows)));
     }
     if scene.head != Head::Identity {
-        line(
-            &mut text,
-            "colours",
-            "by a small network, pixel by pixel (features = full); only render and eval draw them",
-        );
+        line(&mut text, "colours", "by a small network per pixel (features = full); only render and eval support it");
     }
     if scene.clip[1] > scene.clip[0] {
         line(
             &mut text,
             "clip",
-            &format!("{:.3} to {:.3} s, {} frames a second", scene.clip[0], scene.clip[1], scene.fps),
+            &format!("{:.3} to {:.3} s, {} frames per second", scene.clip[0], scene.clip[1], scene.fps),
         );
     }
     if scene.offset != [0.0; 3] {
         let [x, y, z] = scene.offset;
-        line(&mut text, "offset", &format!("{x} {y} {z}: add it to positions for those of the world"));
+        line(&mut text, "offset", &format!("{x} {y} {z}: add it to positions to get world coordinates"));
     }
     let finite = low[0] <= high[0];
     if finite {

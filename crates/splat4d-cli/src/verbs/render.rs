@@ -124,10 +124,10 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
 fn one(args: &Args, path: &Path, camera: &Path, console: &Console) -> anyhow::Result<()> {
     let (camera, background) = camera_file::read(camera)?;
     let Some(output) = args.output.as_ref().or(args.raw.as_ref()) else {
-        return Err(Error::input("there is nowhere to write to").remedy("Add -o NAME.png, --raw NAME or both.").into());
+        return Err(Error::input("no output was given").remedy("Add -o NAME.png, --raw NAME or both.").into());
     };
     if args.output.as_ref().is_some_and(|o| o.extension().is_none_or(|e| !e.eq_ignore_ascii_case("png"))) {
-        return Err(Error::input("one picture is written as .png")
+        return Err(Error::input("one image is written as .png")
             .at(output.display())
             .remedy("Use -o NAME.png.")
             .into());
@@ -191,7 +191,7 @@ fn channel<'a>(
     console: &'a Console,
 ) -> anyhow::Result<Painter<'a>> {
     let views = if args.channel == Channel::Uncertainty { source.views()? } else { Vec::new() };
-    let mut phase = |done, of| console.phase("asking the training pictures", done, of);
+    let mut phase = |done, of| console.phase("evaluating the training images", done, of);
     let painter = painter.of_channel(args.channel, &views, &mut phase)?.on(args.device, console);
     console.clear();
     Ok(painter)
@@ -221,9 +221,12 @@ fn film(args: &Args, path: &Path, console: &Console) -> anyhow::Result<()> {
         fps: args.fps.or(told).unwrap_or(FPS),
     };
     if clock.to < clock.from {
-        return Err(Error::input(format!("the time range ends ({} s) before it begins ({} s)", clock.to, clock.from))
-            .remedy(format!("The scene lasts from {} to {} s.", scene.clip[0], scene.clip[1]))
-            .into());
+        return Err(Error::input(format!(
+            "invalid time range: its end ({} s) is before its start ({} s)",
+            clock.to, clock.from
+        ))
+        .remedy(format!("The scene lasts from {} to {} s.", scene.clip[0], scene.clip[1]))
+        .into());
     }
     let stage = source.stage(&views);
     let shots = shots(&route, &clock, &views, &stage, args.size)?;
@@ -234,10 +237,10 @@ fn film(args: &Args, path: &Path, console: &Console) -> anyhow::Result<()> {
         && output.extension().is_some()
     {
         return Err(Error::input(format!(
-            "the views have several sizes ({}x{} and {}x{}), a film has one",
+            "the views have several sizes ({}x{} and {}x{}), a film needs one",
             size[0], size[1], other.camera.width, other.camera.height
         ))
-        .remedy("Add --size, or write a folder of pictures (-o FOLDER).")
+        .remedy("Add --size, or write a folder of images (-o FOLDER).")
         .into());
     }
     let background = args.background.unwrap_or(scene.background);
@@ -278,7 +281,7 @@ fn film(args: &Args, path: &Path, console: &Console) -> anyhow::Result<()> {
         console.written(raw);
     }
     console.detail(&format!(
-        "{} frames of {}x{}, drawn on {} at {:.1} frames/s, coding apart",
+        "{} frames of {}x{}, rendered on {} at {:.1} frames/s, encoding excluded",
         shots.len(),
         size[0],
         size[1],
@@ -344,31 +347,31 @@ fn default_output(path: &Path, route: &Route, run: bool) -> PathBuf {
 }
 
 fn number(text: &str) -> Result<f64, String> {
-    text.trim().parse::<f64>().ok().filter(|x| x.is_finite()).ok_or_else(|| "give a number".to_owned())
+    text.trim().parse::<f64>().ok().filter(|x| x.is_finite()).ok_or_else(|| "expected a number".to_owned())
 }
 
 fn second(text: &str) -> Result<f64, String> {
-    number(text).map_err(|_| "give seconds of the scene, for instance 0.5".into())
+    number(text).map_err(|_| "expected seconds of the scene, for instance 0.5".into())
 }
 
 fn factor(text: &str) -> Result<f64, String> {
     match number(text) {
         Ok(f) if (0.001..=1000.0).contains(&f) => Ok(f),
-        _ => Err("give a factor from 0.001 to 1000; 4 is four times slower than life".into()),
+        _ => Err("expected a factor from 0.001 to 1000; 4 is four times slower than real time".into()),
     }
 }
 
 fn length(text: &str) -> Result<f64, String> {
     match number(text) {
         Ok(s) if (0.01..=36_000.0).contains(&s) => Ok(s),
-        _ => Err("give the film's length in seconds, 0.01 to 36000".into()),
+        _ => Err("expected the film's length in seconds, 0.01 to 36000".into()),
     }
 }
 
 fn fps(text: &str) -> Result<f64, String> {
     match number(text) {
         Ok(f) if (0.1..=1000.0).contains(&f) => Ok(f),
-        _ => Err("give frames a second, 0.1 to 1000".into()),
+        _ => Err("expected frames per second, 0.1 to 1000".into()),
     }
 }
 
@@ -377,6 +380,6 @@ fn color(text: &str) -> Result<Color, String> {
     match parts.as_deref() {
         Ok([r, g, b]) => Ok([*r as f32, *g as f32, *b as f32]),
         Ok([v]) => Ok([*v as f32; 3]),
-        _ => Err("give red, green and blue, 0 to 1, for instance 1,1,1".into()),
+        _ => Err("expected red, green and blue, 0 to 1, for instance 1,1,1".into()),
     }
 }

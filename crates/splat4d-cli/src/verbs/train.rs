@@ -188,7 +188,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let clock = Stopwatch::start();
     args.measure.check()?;
     if !args.view && args.place.is_told() {
-        return Err(Error::input("--port, --host and --no-open belong to --view").remedy("Add --view.").into());
+        return Err(Error::input("--port, --host and --no-open need --view").remedy("Add --view.").into());
     }
     let stop = interrupt::flag("stopping: a checkpoint is being saved");
     let watch = |title: &str| {
@@ -287,9 +287,9 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             false => capture.clone(),
         };
         if args.chunk.is_some() {
-            return Err(Error::input("the take fits one chunk, and has no parts")
+            return Err(Error::input("the capture fits into one chunk")
                 .at("--chunk")
-                .remedy("Train it without --chunk, or ask for shorter chunks with --chunk-frames")
+                .remedy("Train it without --chunk, or set shorter chunks with --chunk-frames")
                 .into());
         }
         let (folder, found) = place()?;
@@ -310,7 +310,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             listen(event, &watch);
         };
         let trained = if found == Found::Unfinished {
-            console.say(&format!("{} holds what the same command left unfinished: it is continued", run.display()));
+            console.say(&format!("{} contains an unfinished run of the same command: it is continued", run.display()));
             run::resume_with(&run, &options, &stop, &mut hear)
         } else {
             // The recipe first: whatever comes to pass from here on, the folder is known for what it is.
@@ -356,7 +356,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     console.next("view", &run);
     console.emit(&json!({"type": "done", "run": run.to_string_lossy()}));
     if watch.is_on() && console.terminal() {
-        console.say("the player stays until Ctrl-C");
+        console.say("the player keeps running until Ctrl-C");
         serving::wait(&stop);
     }
     Ok(())
@@ -456,7 +456,7 @@ fn extract(source: &Path, recipe: &Recipe, stop: &AtomicBool, console: &Console)
     found.warnings.iter().for_each(|w| console.warn(w));
     let told = recipe.capture.fps > 0.0;
     if let Some(rate) = found.rate.filter(|r| !told && (r / DEFAULT_FPS - 1.0).abs() > SAME_RATE) {
-        console.warn(&format!("the videos have {rate:.2} frames a second: say so with --set capture.fps={rate:.2}."));
+        console.warn(&format!("the videos have {rate:.2} frames per second: use --set capture.fps={rate:.2}."));
     }
     console.say(&format!(
         "frames of {} videos are in {}: {} of {}x{}",
@@ -513,11 +513,11 @@ fn describe(capture: &Capture, memory: u64, console: &Console) {
     };
     let size = capture.frames.first().map_or([0, 0], |f| [f.view.width, f.view.height]);
     let span = match capture.timing {
-        Timing::Moment => "at one moment".to_owned(),
+        Timing::Moment => "at one time".to_owned(),
         _ => format!("over {:.2} s", last - first),
     };
     console.say(&format!(
-        "{}: {} camera{}, {} pictures of {}x{} {span}{}",
+        "{}: {} camera{}, {} images of {}x{} {span}{}",
         capture.name,
         capture.cameras.len(),
         if capture.cameras.len() == 1 { "" } else { "s" },
@@ -543,8 +543,8 @@ fn describe(capture: &Capture, memory: u64, console: &Console) {
 fn minutes(text: &str) -> Result<f64, String> {
     /// A week: longer is a slip.
     const MOST: f64 = 7.0 * 24.0 * 60.0;
-    let value: f64 = text.parse().map_err(|_| "give minutes, for instance 10 or 2.5".to_owned())?;
-    if value > 0.0 && value <= MOST { Ok(value) } else { Err(format!("give minutes above 0, at most {MOST}")) }
+    let value: f64 = text.parse().map_err(|_| "expected minutes, for instance 10 or 2.5".to_owned())?;
+    if value > 0.0 && value <= MOST { Ok(value) } else { Err(format!("expected minutes above 0, at most {MOST}")) }
 }
 
 /// The examples, and the knobs that most runs are told by.
@@ -552,7 +552,7 @@ fn long_help() -> String {
     let knobs = Recipe::knobs();
     let lines: String = IMPORTANT
         .iter()
-        .map(|key| line(knobs.iter().find(|k| k.key() == *key).expect("IMPORTANT names knobs of the recipe")))
+        .map(|key| line(knobs.iter().find(|k| k.key() == *key).expect("IMPORTANT lists settings of the recipe")))
         .collect();
     format!("{EXAMPLES}\n\nSettings (--set KEY=VALUE, or a TOML file for --recipe; --help-knobs: all):\n{lines}")
 }
@@ -610,7 +610,7 @@ mod tests {
     }
 
     #[test]
-    fn typed_knobs_win_over_the_quality_and_another_length_has_its_own_schedules() {
+    fn explicit_settings_override_quality_and_length_sets_schedules() {
         let steps = |r: &Recipe| [r.run.iterations, r.densify.max_cap, r.capture.downscale];
         let draft = steps(&typed(&["--quality", "draft"]));
         assert_eq!(draft, steps(&Recipe::default().of_quality(Quality::Draft)));
@@ -630,7 +630,7 @@ mod tests {
     }
 
     #[test]
-    fn knobs_are_listed_by_topic() {
+    fn settings_are_listed_by_topic() {
         let all = knob_list("").unwrap();
         assert!(Recipe::knobs().iter().all(|k| all.contains(&k.key())));
         let merge = knob_list("merge").unwrap();

@@ -23,7 +23,7 @@ fn parts_by_number_and_one_command_make_the_same_scene_and_file() {
     let said = splat4d(&["info", str(&capture), "--set=chunks.frames=6", "--set=chunks.overlap=2"]).run().ok();
     assert!(said.contains("2 chunks of at most 7 frames"), "{said}");
     let said = train(&capture, &one, &[]).ok();
-    assert!(said.contains("flicker where chunks meet"), "{said}");
+    assert!(said.contains("flicker at chunk boundaries"), "{said}");
     assert!(train(&capture, &parts, &["--chunk=0"]).refused().contains("--chunk shared"));
     let film = parts.join("scene.s4d");
     for part in ["shared", "0", "1", "1"] {
@@ -44,7 +44,7 @@ fn parts_by_number_and_one_command_make_the_same_scene_and_file() {
         assert_eq!(std::fs::read(one.join(file)).unwrap(), std::fs::read(parts.join(file)).unwrap(), "{file}");
     }
     assert!(json_of(&one.join("run.json"))["seams"]["inside"].is_f64());
-    assert!(std::fs::read_to_string(one.join("report.html")).unwrap().contains("Flicker where chunks meet"));
+    assert!(std::fs::read_to_string(one.join("report.html")).unwrap().contains("Flicker at chunk boundaries"));
     // A run like any other: all of it is done, and it is measured and drawn.
     splat4d(&["train", "--resume", str(&one), "--no-eval"]).run().ok();
     splat4d(&["eval", str(&parts)]).run().ok();
@@ -52,11 +52,11 @@ fn parts_by_number_and_one_command_make_the_same_scene_and_file() {
 }
 
 #[test]
-fn what_cannot_be_done_in_chunks_says_so() {
+fn unsupported_chunk_options_are_refused() {
     let work = tempfile::tempdir().unwrap();
     let (capture, run) = (take(work.path()), work.path().join("run"));
     for (more, says) in [
-        (&["--chunk=0", "--set=chunks.frames=12"][..], "fits one chunk"),
+        (&["--chunk=0", "--set=chunks.frames=12"][..], "fits into one chunk"),
         (&["--chunk=7"], "no chunk 7"),
         (&["--chunk=x"], "shared, a number or all"),
         (&["--set=chunks.overlap=5"], "even --overlap"),

@@ -240,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn walls_and_floor_tell_the_axes() {
+    fn walls_and_floor_give_the_axes() {
         let turn = rotation([20.0, -70.0, 35.0]);
         let points = room(&turn, 0.005);
         let true_up = [turn[0][2], turn[1][2], turn[2][2]];

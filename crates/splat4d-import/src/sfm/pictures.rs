@@ -1,6 +1,6 @@
 //! What cameras see, as features: of what stands still on the median picture, of what moves at moments that all share.
 
-use super::known::Known;
+use super::lens::Known;
 use super::overlay::Shown;
 use crate::sync::grey::{Grey, Pyramid};
 use crate::sync::tracks::{LEVELS, follow};
@@ -125,8 +125,8 @@ const FASTEST: f64 = 40.0;
 fn load(pictures: &dyn Pictures, camera: usize, frame: usize, most: usize) -> Result<(Planes<f32>, f64)> {
     let mut picture = pictures.load(camera, frame)?;
     if picture.channels != 3 || picture.width.min(picture.height) < 32 {
-        let what = format!("a picture of {}x{} with {} channels", picture.width, picture.height, picture.channels);
-        return Err(Error::input(what).at(pictures.name(camera)).remedy("Give colour pictures of 32x32 and more."));
+        let what = format!("an image of {}x{} with {} channels", picture.width, picture.height, picture.channels);
+        return Err(Error::input(what).at(pictures.name(camera)).remedy("Give colour images of 32x32 and more."));
     }
     let mut factor = 1.0;
     while picture.pixels() > most {
@@ -436,7 +436,7 @@ pub fn walking(
 ) -> Result<Vec<(usize, usize, Sight)>> {
     let total: usize = (0..pictures.cameras()).map(|c| pictures.frames(c)).sum();
     if total == 0 {
-        return Err(Error::input("there are no pictures"));
+        return Err(Error::input("there are no images"));
     }
     let all: Vec<(usize, usize)> =
         (0..pictures.cameras()).flat_map(|c| (0..pictures.frames(c)).map(move |k| (c, k))).collect();

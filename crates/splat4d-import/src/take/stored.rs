@@ -1,7 +1,7 @@
 //! The stored pictures as structure from motion asks for them.
 
 use crate::sfm;
-use crate::sfm::known::Known;
+use crate::sfm::lens::Known;
 use crate::sync::graph::Offset;
 use crate::write::{Masks, Pictures};
 use crate::{Error, Result};
@@ -109,7 +109,7 @@ impl sfm::pictures::Pictures for Stored<'_> {
     fn load(&self, camera: usize, frame: usize) -> Result<Planes<f32>> {
         let picture = self.rgb(camera, frame)?;
         if [picture.width, picture.height] != self.pictures[camera].size {
-            return Err(Error::input("a stored picture is of another size than the rest")
+            return Err(Error::input("a stored image is of another size than the rest")
                 .at(self.folder.join(self.pictures[camera].file(frame)).display())
                 .remedy("Remove the folder \"images\" and import again."));
         }

@@ -3,7 +3,8 @@
 use super::poses::Solved;
 use super::stored::Stored;
 use crate::board::{self, Board, Lies, Tag};
-use crate::sfm::known::{Known, pixel_unit};
+use crate::sfm::known::pixel_unit;
+use crate::sfm::lens::Known;
 use crate::sfm::pictures::Pictures as _;
 use crate::{Error, Result};
 use rayon::prelude::*;
@@ -90,7 +91,7 @@ pub(super) fn measured(
     let sightings = seen.len();
     let placed = placed(&seen);
     of(board, &placed, solved.up).map_err(|e| match sightings {
-        0 => Error::input(format!("no tag of {} is seen in {} pictures that were looked at", board.family.name, looks.len()))
+        0 => Error::input(format!("no tag of {} was found in {} images", board.family.name, looks.len()))
             .remedy(
                 "Is it this family, is each of its bits at least two pixels wide, and is there white around every tag? Without \
                  --board the unit is a guess.",
@@ -273,7 +274,7 @@ mod tests {
 
     /// Two metres of the world are one unit; the floor is askew in it.
     #[test]
-    fn tags_tell_metres_and_upwards() {
+    fn tags_give_metres_and_up() {
         let board: Board = "36h11:0.3:floor".parse().expect("it is right");
         let unit = 2.0;
         let tilt = Se3::look_at([0.0; 3], [0.3, 1.0, 0.2], [0.1, 0.2, 1.0]).rotation;

@@ -54,7 +54,7 @@ impl Format {
             let rgba: Vec<u8> = pixels.flat_map(|(rgb, a)| [rgb[0], rgb[1], rgb[2], *a]).collect();
             PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive)
                 .write_image(&rgba, width, height, ExtendedColorType::Rgba8)
-                .map_err(|e| Error::input(format!("a picture of {width}x{height} cannot be stored ({e})")))?;
+                .map_err(|e| Error::input(format!("an image of {width}x{height} cannot be stored ({e})")))?;
             return Ok(bytes);
         }
         let done = match self {
@@ -67,7 +67,7 @@ impl Format {
             Self::Png => PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive)
                 .write_image(&picture.data, width, height, ExtendedColorType::Rgb8),
         };
-        done.map_err(|e| Error::input(format!("a picture of {width}x{height} cannot be stored ({e})")))?;
+        done.map_err(|e| Error::input(format!("an image of {width}x{height} cannot be stored ({e})")))?;
         Ok(bytes)
     }
 }
@@ -167,7 +167,7 @@ pub fn pictures(
     if let Format::Jpeg(quality) = format
         && !(MIN_QUALITY..=100).contains(&quality)
     {
-        return Err(Error::input(format!("pictures of quality {quality} are asked for"))
+        return Err(Error::input(format!("invalid JPEG quality {quality}"))
             .remedy(format!("Take {MIN_QUALITY} to 100: training learns the blocks of lower ones.")));
     }
     let mut out = Vec::new();
@@ -269,7 +269,7 @@ fn camera(folder: &Path, clip: &Clip<'_>, format: Format, stop: &dyn Fn() -> boo
     note.doubled = clock.doubled;
     note.warnings = reader.warnings().to_vec();
     if transparent {
-        note.warnings.push("Some of its pixels are transparent: its pictures are stored as PNG with alpha.".into());
+        note.warnings.push("Some of its pixels are transparent: its images are stored as PNG with alpha.".into());
     }
     // Left from a time when more of the same could be read.
     let mut number = note.shots.len();
@@ -328,5 +328,5 @@ fn clear(folder: &Path) -> Result<()> {
 }
 
 fn remove(path: &Path) -> Result<()> {
-    std::fs::remove_file(path).map_err(|e| Error::environment("an old picture cannot be removed", e).at(path.display()))
+    std::fs::remove_file(path).map_err(|e| Error::environment("an old image cannot be removed", e).at(path.display()))
 }

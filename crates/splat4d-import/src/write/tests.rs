@@ -84,7 +84,7 @@ fn what_was_interrupted_ends_in_the_same_bytes() {
 }
 
 #[test]
-fn what_is_made_of_something_else_is_made_anew() {
+fn derived_values_are_computed_again() {
     let (_folder, sources) = rig();
     let out = tempfile::tempdir().unwrap();
     store(out.path(), &clips(&sources, &Selection::default()), usize::MAX).unwrap();
@@ -111,7 +111,7 @@ fn names_of_cameras_are_names_of_folders() {
 }
 
 #[test]
-fn masks_are_stored_beside_their_pictures() {
+fn masks_are_stored_next_to_their_images() {
     let (_folder, sources) = rig();
     let out = tempfile::tempdir().unwrap();
     let half = Selection { every: 2, ..Selection::default() };

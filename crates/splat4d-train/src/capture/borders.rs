@@ -7,9 +7,9 @@
 //! is anywhere in the scene, next to the object's outline it is the background again: so a border counts only if the
 //! images are mostly bright a few pixels further inside.
 
+use super::account::Severity;
 use super::account::{Aspect, Remark};
 use super::options::Borders;
-use super::preflight::Severity;
 use super::{Capture, CaptureOptions, Frame, panorama, picture};
 use rayon::prelude::*;
 use splat4d::scene::Lens;

@@ -198,14 +198,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn shutters_that_do_not_open_at_once_share_their_moments() {
+    fn shutters_that_do_not_open_at_once_share_their_times() {
         let rig = |late: f64| (0..12).map(move |i| (i % 3, (i / 3) as f64 + late * (i % 3) as f64));
         assert_eq!([moments(rig(0.0)), moments(rig(0.2)), moments(rig(1.0))], [4, 4, 6]);
         assert_eq!((half_frame(rig(0.2)), half_frame([(0, 1.0), (1, 3.0)].into_iter())), (0.5, 0.0));
     }
 
     #[test]
-    fn half_a_picture_is_the_mean_of_its_boxes() {
+    fn half_an_image_is_the_mean_of_its_boxes() {
         let mut p = Planes::from_interleaved(1, 3, 5, &(0..15).map(|x| x as f32).collect::<Vec<_>>());
         halve(&mut p);
         assert_eq!((p.height, p.width, p.data), (1, 2, vec![3.0, 5.0]));

@@ -49,7 +49,7 @@ mod stray;
 mod tracks;
 mod transforms;
 
-pub use account::{Aspect, Remark};
+pub use account::{Aspect, Remark, Severity};
 pub use convention::{Convention, Poses};
 pub use depth::{DepthFile, DepthKind};
 pub use evidence::{Agreement, PoseCheck};
@@ -61,7 +61,7 @@ pub use options::{
 };
 pub use points::PointCloud;
 pub use posed::{PosedCamera, check_intrinsics, colmap_cameras, is_colmap, rigid, transforms_cameras};
-pub use preflight::{Finding, Reach, Severity};
+pub use preflight::{Finding, Reach};
 pub use rgb8::Rgb8;
 pub use sequence::Timing;
 pub use store::{ImageStore, Picture, StoredPicture};

@@ -309,7 +309,7 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
         }
         let pose = if moving { poses.get(index) } else { poses.first() };
         let Some(&cam_from_world) = pose else {
-            let what = format!("there are {} poses, but a picture of frame {index}", poses.len());
+            let what = format!("there are {} poses, but an image of frame {index}", poses.len());
             return Err(node.error(what).remedy("Give one pose per frame, or \"count\"."));
         };
         let time = match times.as_ref().map(|t| t.get(index)) {
@@ -317,7 +317,7 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
             Some(Some(&time)) => time,
             Some(None) => {
                 let what =
-                    format!("there are {} times, but a picture of frame {index}", times.as_ref().map_or(0, Vec::len));
+                    format!("there are {} times, but an image of frame {index}", times.as_ref().map_or(0, Vec::len));
                 return Err(node.error(what).remedy("Give one time per frame, in seconds, or \"frames\"."));
             }
         };
@@ -376,7 +376,7 @@ impl Depth {
         };
         if scale.is_none() && whole && kind == DepthKind::Metric {
             return Err(camera
-                .error("\"depth\" are pictures of whole numbers, and nothing says what one of them is")
+                .error("\"depth\" refers to integer images without a unit")
                 .remedy("Give \"depth_scale\": scene units a number, for instance 0.001 for millimetres in metres."));
         }
         Ok(Self { files, kind, scale: scale.unwrap_or(1.0) })
@@ -393,7 +393,7 @@ fn read_times(node: &Node<'_>) -> Result<Vec<f64>> {
     let times = node.list()?.iter().map(|n| n.number()).collect::<Result<Vec<f64>>>()?;
     if let Some(k) = times.windows(2).position(|w| w[0] >= w[1]) {
         let what = format!("time {} ({} s) is not later than the one before ({} s)", k + 1, times[k + 1], times[k]);
-        return Err(node.error(what).remedy("Give the times in seconds, in the order of the pictures."));
+        return Err(node.error(what).remedy("Give the times in seconds, in the order of the images."));
     }
     Ok(times)
 }

@@ -7,12 +7,12 @@
 mod clock;
 mod frame;
 
+use super::account::Severity;
 use super::account::{Account, Aspect, first_names};
 use super::convention::{Convention, Poses};
 use super::json::{self, Node};
 use super::lookup::Lookup;
 use super::points::read_ply;
-use super::preflight::Severity;
 use super::sequence::{self, Order};
 use super::splits::Lists;
 use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Sequence, Split, Take, colmap, picture};
@@ -120,7 +120,7 @@ fn untimed(
     let poses: Vec<_> = entries.iter().map(|e| e.source.cam_from_world).collect();
     if several && options.sequence == Sequence::Auto {
         notes.push(format!(
-            "{TRAIN} states no times: its pictures are one moment. If they are frames of a film, say --set \
+            "{TRAIN} has no times: its images are given the same time. If they are frames of a video, use --set \
              capture.sequence=video."
         ));
         return sequence::moment(&names);

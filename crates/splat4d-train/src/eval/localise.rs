@@ -109,9 +109,9 @@ pub fn localise(
     question: Question,
     told: &mut dyn FnMut(usize, usize),
 ) -> Result<Located> {
-    assert!(!starts.is_empty(), "a picture is looked for from somewhere");
+    assert!(!starts.is_empty(), "localisation has a start camera");
     let fits = |c: &Camera| (c.width, c.height) == (picture.width, picture.height);
-    assert!(starts.iter().all(fits), "starts have the picture's size");
+    assert!(starts.iter().all(fits), "starts have the image's size");
     let backend = device::cpu(RenderConfig { antialias: question.antialias, ..RenderConfig::default() });
     let (instant, image) = (Evaluation::default(), Image::default());
     let mut search = Search { scene, backend, instant, image, lens: question.lens };
@@ -396,7 +396,7 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_is_found_in_space_and_time_and_a_strange_one_is_not() {
+    fn an_image_is_localised_and_a_foreign_one_refused() {
         let scene = scene();
         let starts: Vec<Camera> = (0..6).map(|k| camera(f64::from(k), 0.3)).collect();
         let (truth, when) = (camera(2.12, 0.55), 0.37);

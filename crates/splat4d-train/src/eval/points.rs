@@ -160,7 +160,10 @@ fn visibility(capture: &Capture, truth: &Truth) -> Result<Option<Visible>> {
     if array.shape != wanted {
         return Err(Error::input(format!("visibility has shape {:?}, not {wanted:?}", array.shape))
             .at(path.display())
-            .remedy("Save it as uint8 [cameras, frames, points] beside tracks.npy, or delete it: it is only used to measure"));
+            .remedy(
+                "Save it as uint8 [cameras, frames, points] next to tracks.npy, or delete it: it is only used to \
+                 measure",
+            ));
     }
     Ok(Some(Visible { frames: truth.frames, points: truth.points, data: array.to_f32() }))
 }

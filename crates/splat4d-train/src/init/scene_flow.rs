@@ -1,6 +1,6 @@
 //! How fast what a depth map shows moves: optical flow to the pictures before and after, and the depth at both of its ends.
 
-use super::depth::Map;
+use super::map::Map;
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};
 use crate::vision::flow::{Pyramid, dense};
@@ -201,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn flow_and_depth_at_both_ends_tell_velocity_in_space() {
+    fn flow_and_depth_at_both_ends_give_velocity() {
         let far = |of: &[[f64; 3]]| -> f64 {
             let off = |v: &[f64; 3]| (0..3).map(|k| (v[k] - VELOCITY[k]).powi(2)).sum::<f64>().sqrt();
             let mut all: Vec<f64> = of.iter().map(off).collect();
@@ -218,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_without_neighbours_tells_nothing() {
+    fn an_image_without_neighbours_gives_no_evidence() {
         let mut wall = Wall::new(None);
         wall.cameras.truncate(1);
         assert!(of(&wall, 0).iter().all(|v| *v == [0.0; 3]));

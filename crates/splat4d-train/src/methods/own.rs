@@ -3,7 +3,6 @@
 
 use super::deform::{WARM_UP, WARM_UP_SHARE, canonical};
 use super::{Group, Plan, Program, Rate, Stage, still};
-use crate::recipe::Recipe;
 use crate::{Error, Result};
 use splat4d::motion::{MakeMotion, Motion, Phase, Spec, is_registered, register as register_motion};
 use splat4d::scene::Params;
@@ -57,7 +56,7 @@ pub(crate) fn name(name: &str) -> Option<&'static str> {
 }
 
 /// The program of a model from outside.
-pub(super) fn program(name: &str) -> Option<Box<dyn Program>> {
+pub(crate) fn program(name: &str) -> Option<Box<dyn Program>> {
     let own = OWN.read().unwrap_or_else(PoisonError::into_inner).get(name).cloned()?;
     assert!(is_registered(name), "a model that training knows is known to readers");
     Some(Box::new(OwnProgram(own)))
@@ -66,8 +65,8 @@ pub(super) fn program(name: &str) -> Option<Box<dyn Program>> {
 struct OwnProgram(Arc<OwnMotion>);
 
 impl OwnProgram {
-    fn warmup(&self, r: &Recipe) -> usize {
-        (self.0.warmup * r.run.iterations as f64) as usize
+    fn warmup(&self, plan: &Plan) -> usize {
+        (self.0.warmup * plan.iterations as f64) as usize
     }
 
     /// Steps `from .. to` of the recipe's one schedule as a stage of its own.
@@ -90,7 +89,7 @@ impl Program for OwnProgram {
 
     fn check(&self, plan: &Plan) -> Result<()> {
         if plan.times < 2 {
-            return Err(Error::input("every picture of the capture is of one moment: there is nothing to move")
+            return Err(Error::input("all images of the capture have the same time: there is nothing to move")
                 .remedy("Train it with the motion model `still`"));
         }
         Ok(())
@@ -101,7 +100,7 @@ impl Program for OwnProgram {
     }
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
-        let (all, warmup) = (plan.recipe.run.iterations, self.warmup(&plan.recipe));
+        let (all, warmup) = (plan.iterations, self.warmup(plan));
         let mut stages = Vec::new();
         if warmup > 0 {
             let mut first = self.stage(plan, 0, warmup);

@@ -13,6 +13,7 @@ mod legacy;
 mod list;
 mod owner;
 mod place;
+mod temporary;
 #[cfg(test)]
 mod tests;
 mod write;
@@ -24,5 +25,15 @@ pub use owner::{Owner, Standing, check_free};
 pub use place::{Input, check_apart, check_file};
 pub use write::{Staged, write_atomically, write_atomically_with};
 
+use crate::Error;
+use std::path::Path;
+
 /// Subfolder of an output folder with its lock, its owner and the list of its files.
 pub const STATE: &str = ".splat4d";
+/// What to do about a file that cannot be written.
+const NO_SPACE: &str = "Check that the folder exists, that you may write there and that the disk is not full";
+
+/// The error of a failed write.
+fn cannot_write(path: &Path, error: std::io::Error) -> Error {
+    Error::environment("cannot be written", error).at(path.display()).remedy(NO_SPACE)
+}

@@ -1,7 +1,7 @@
 //! The settings of a run as a whole.
 
-use super::Replans;
 use crate::settings::{Value, among, settings};
+use crate::step::replans::Replans;
 use splat4d::motion::MODELS;
 
 settings! {

@@ -10,11 +10,11 @@
 //! captures and nothing on an object (docs/suite.md).
 
 use super::{
-    At, Change, Context, Every, Limits, Order, Strategy, Upkeep, covariances, grow, is_dead, logit, opacity, sample,
+    At, Change, Context, DensifySettings, Every, Limits, Order, Strategy, Upkeep, covariances, grow, is_dead, logit,
+    opacity, sample,
 };
 use crate::Result;
 use crate::learner::Learner;
-use crate::recipe::Recipe;
 use crate::settings::settings;
 use rayon::prelude::*;
 use splat4d::layers::{Layer, Scene};
@@ -105,10 +105,10 @@ impl Adc {
         1.0 - ((left - 1.0) / left).powi(2)
     }
 
-    /// As a recipe has it; `None`: another strategy.
-    pub(crate) fn of(r: &Recipe) -> Option<Self> {
-        let some = || Self { settings: r.adc, steps: r.densify.steps() };
-        (r.densify.strategy == Strategy::Adc).then(some)
+    /// With these settings; `None`: another strategy.
+    pub(crate) fn of(settings: AdcSettings, densify: &DensifySettings) -> Option<Self> {
+        let some = || Self { settings, steps: densify.steps() };
+        (densify.strategy == Strategy::Adc).then(some)
     }
 }
 

@@ -4,11 +4,10 @@
 //! between the other cameras, where it veils every view from there. What it showed is learnt again where others see it, or
 //! farther away. What stands before the camera that sees it may be there, and stays; so does all that two cameras see.
 
-use super::{At, Change, Context, Every, Order, Upkeep};
+use super::{At, Change, Context, DensifySettings, Every, Order, Upkeep};
 use crate::Result;
 use crate::capture::frames::Frames;
 use crate::learner::Learner;
-use crate::recipe::Recipe;
 use crate::settings::settings;
 use rayon::prelude::*;
 use splat4d::layers::{Evaluation, Scene};
@@ -44,10 +43,10 @@ pub(crate) struct Floaters {
 }
 
 impl Floaters {
-    /// As a recipe has it; `None`: never.
-    pub(crate) fn of(r: &Recipe) -> Option<Self> {
-        let steps = Every { interval: r.floaters.interval, ..r.densify.steps() };
-        (r.floaters.interval > 0).then_some(Self { settings: r.floaters, steps })
+    /// With these settings; `None`: never.
+    pub(crate) fn of(settings: FloaterSettings, densify: &DensifySettings) -> Option<Self> {
+        let steps = Every { interval: settings.interval, ..densify.steps() };
+        (settings.interval > 0).then_some(Self { settings, steps })
     }
 }
 
@@ -168,7 +167,7 @@ mod tests {
     use splat4d::scene::GEOMETRY;
 
     #[test]
-    fn what_hangs_before_a_camera_and_one_other_alone_sees_goes() {
+    fn floaters_before_a_camera_are_removed() {
         let frames = Made::new(8, 1, 16);
         let places = Places::of(&frames);
         assert_eq!(places.cameras.len(), 8);

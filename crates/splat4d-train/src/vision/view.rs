@@ -143,7 +143,7 @@ pub(crate) fn spread(count: usize, most: usize) -> impl Iterator<Item = usize> {
 
 /// How often a picture is halved to the size that is worked with.
 pub(crate) fn halvings(width: usize, height: usize) -> usize {
-    (0..).find(|&k| (width >> k) * (height >> k) <= PIXELS).expect("a picture can be halved to nothing")
+    (0..).find(|&k| (width >> k) * (height >> k) <= PIXELS).expect("an image can be halved to nothing")
 }
 
 /// A frame's picture at the size that is worked with, and its camera.

@@ -543,7 +543,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scene_comes_back_bit_for_bit() {
+    fn a_scene_round_trips_bit_for_bit() {
         let s = scene();
         let mut bytes = Vec::new();
         write(&s, &mut bytes).unwrap();

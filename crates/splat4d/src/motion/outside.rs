@@ -23,8 +23,9 @@ pub fn register(name: &str, make: MakeMotion) -> Result<()> {
             .remedy("Give your model another name"));
     }
     if name.is_empty() || !name.chars().all(|c| c.is_ascii_alphanumeric() || c == '-' || c == '_') {
-        return Err(Error::input(format!("a motion model cannot be called `{name}`"))
-            .remedy("Use letters, digits, - and _"));
+        return Err(
+            Error::input(format!("a motion model cannot be called `{name}`")).remedy("Use letters, digits, - and _")
+        );
     }
     REGISTERED.write().unwrap_or_else(PoisonError::into_inner).insert(name.to_owned(), make);
     Ok(())
@@ -104,7 +105,8 @@ mod tests {
         let key = params.find("speeds").unwrap();
         params[key].set(1, 0, 2.0);
         let layer = Layer::new("falling", params, motion, LifeKind::Infinite);
-        let written = Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, up: [0.0, 1.0, 0.0], ..Scene::default() };
+        let written =
+            Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, up: [0.0, 1.0, 0.0], ..Scene::default() };
         let mut bytes = Vec::new();
         scene::write(&written, &mut bytes).unwrap();
         let unknown = scene::read(&bytes).expect_err("nobody has registered it").to_string();

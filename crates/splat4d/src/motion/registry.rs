@@ -2,7 +2,6 @@
 //! [`motion`](super) into [`Spec`](super::Spec), its names and [`build`](super::build).
 
 use super::Motion;
-use super::spacetime::MAX_ORDER;
 use crate::Result;
 use crate::math::Real;
 use crate::scene::life::CENTER;
@@ -220,3 +219,6 @@ macro_rules! registry {
     };
 }
 pub(super) use registry;
+
+/// Highest order of the polynomial.
+pub(crate) const MAX_ORDER: usize = 3;

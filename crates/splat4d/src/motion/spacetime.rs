@@ -20,9 +20,6 @@ use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-/// Highest order of the polynomial.
-pub(crate) const MAX_ORDER: usize = 3;
-
 /// The model as plain data.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

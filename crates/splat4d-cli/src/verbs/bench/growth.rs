@@ -179,7 +179,7 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
         }
     };
     Capture {
-        name: "made up".into(),
+        name: "synthetic".into(),
         root: root.to_owned(),
         kind: CaptureKind::Own,
         cameras: (0..pinned.views.len()).map(|i| Rig { name: format!("camera {i}"), fixed: true }).collect(),
@@ -213,7 +213,7 @@ fn write_pictures(folder: &Path, pictures: &[Planes<f32>]) -> Result<Vec<PathBuf
         let mut file = Vec::new();
         JpegEncoder::new_with_quality(&mut file, JPEG_QUALITY)
             .encode(&bytes, picture.width as u32, picture.height as u32, ExtendedColorType::Rgb8)
-            .map_err(|e| Error::input(format!("a picture cannot be written as JPEG: {e}")))?;
+            .map_err(|e| Error::input(format!("an image cannot be written as JPEG: {e}")))?;
         crate::files::write(&path, &file)?;
         Ok(path)
     };

@@ -194,7 +194,7 @@ fn names_with_codes_and_folders_of_elsewhere_are_found() {
 }
 
 #[test]
-fn files_that_are_no_readable_images_say_what_they_are() {
+fn unreadable_images_are_named_by_their_format() {
     let heads: [(&[u8], &[&str]); 8] = [
         (b"\0\0\0\x18ftypheic\0\0\0\0", &["HEIC", "Convert"]),
         (b"\0\0\0\x18ftypavif\0\0\0\0", &["AVIF", "Convert"]),

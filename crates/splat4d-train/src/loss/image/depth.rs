@@ -219,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn maps_of_another_unit_or_upside_down_are_told_apart() {
+    fn maps_of_another_unit_or_upside_down_are_recognised() {
         let like = |data: Vec<f32>| Planes { channels: 1, height: 10, width: 10, data };
         let z: Vec<f32> = (0..100).map(|i| 2.0 + 0.01 * i as f32).collect();
         let (depth, alpha) = (like(z.clone()), like(vec![1.0; 100]));

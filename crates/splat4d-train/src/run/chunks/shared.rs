@@ -148,7 +148,7 @@ fn nothing_still(capture: &Capture) -> Option<&'static str> {
     if fixed.len() < 2 || !all {
         Some("cameras move")
     } else if capture.background.is_some() {
-        Some("pictures are cut out of their background")
+        Some("images are cut out of their background")
     } else {
         None
     }
@@ -267,7 +267,7 @@ fn write_png(path: &Path, data: &[u8], view: &Camera, color: ExtendedColorType) 
     let mut out = Vec::new();
     PngEncoder::new(&mut out)
         .write_image(data, view.width as u32, view.height as u32, color)
-        .map_err(|e| Error::new(ErrorKind::Io, format!("a picture cannot be encoded: {e}")).at(path.display()))?;
+        .map_err(|e| Error::new(ErrorKind::Io, format!("an image cannot be encoded: {e}")).at(path.display()))?;
     write_atomically(path, &out)
 }
 
