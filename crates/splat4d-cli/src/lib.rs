@@ -9,8 +9,9 @@
 //!
 //! | module | content |
 //! |---|---|
-//! | `console.rs`, `run_folder.rs`, `camera_file.rs`, `video.rs` | output, run folders, camera files, films |
+//! | `camera_file.rs`, `console.rs`, `video.rs` | camera files, output, films |
 //! | `paths/` | orbits, data-set cameras and key-framed camera paths |
+//! | `run_folder.rs` | run folders |
 //! | `source.rs`, `source/` | scenes of other programs that are folders or archives |
 //! | `raw.rs`, `asked.rs` | channel values as files; files of queried points and their results |
 //! | `measure.rs`, `measure/` | how scenes and files play, for `compress`, the studies and `bench --playback` |

@@ -9,9 +9,10 @@
 //! | module | content |
 //! |---|---|
 //! | `errors.rs`, `arrays.rs`, `plain.rs`, `settings.rs` | errors, NumPy in and out, plain values, settings by name |
-//! | `camera.rs`, `gaussians.rs`, `scene.rs` | cameras, Gaussians at a time, scenes |
+//! | `camera.rs`, `gaussians.rs` | cameras, Gaussians at a time |
 //! | `from_arrays.rs` | images in memory become a capture on disk |
 //! | `metrics.rs`, `loss.rs` | metrics; losses written in Python |
+//! | `scene.rs` | scenes |
 //! | `run.rs`, `capture.rs`, `train.rs` | runs, captures, training |
 
 mod arrays;
