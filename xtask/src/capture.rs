@@ -8,7 +8,7 @@ use crate::raster::{Visibility, rasterize};
 use crate::scene::{FPS, FRAMES, Frame, Stage};
 use crate::truth;
 use crate::vector::{V3, sin_cos, v3};
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Result, ensure};
 use image::ExtendedColorType;
 use jpeg_encoder::QuantizationTableType;
 use rayon::prelude::*;

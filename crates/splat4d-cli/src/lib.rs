@@ -9,15 +9,17 @@
 //!
 //! | module | content |
 //! |---|---|
-//! | `console.rs`, `run_folder.rs`, `camera_file.rs`, `video.rs` | output, run folders, camera files, films |
+//! | `camera_file.rs`, `console.rs`, `video.rs` | camera files, output, films |
 //! | `paths/` | orbits, data-set cameras and key-framed camera paths |
+//! | `run_folder.rs` | run folders |
 //! | `source.rs`, `source/` | scenes of other programs that are folders or archives |
 //! | `raw.rs`, `asked.rs` | channel values as files; files of queried points and their results |
 //! | `measure.rs`, `measure/` | how scenes and files play, for `compress`, the studies and `bench --playback` |
 //! | `baking.rs`, `baking/` | the playback file at the end of a run |
+//! | `comparing.rs` | runs and results of other programs, for `compare` |
 //! | `report/`, `report/compress/` | `report.html`, drawn without a library |
 //! | `film.rs` | the playback file of a long capture, which grows during training |
-//! | `labelling.rs`, `chunked.rs`, `comparing.rs`, `compressing.rs`, `predicting.rs`, `predicting/`, `editing.rs`, `editor.rs` | the work of `label`, `train --chunk` and `join`, `compare`, `compress`, `predict`, `edit`, `view --edit` |
+//! | `labelling.rs`, `chunked.rs`, `compressing.rs`, `predicting.rs`, `predicting/`, `editing.rs`, `editor.rs` | the work of `label`, `train --chunk` and `join`, `compress`, `predict`, `edit`, `view --edit` |
 //! | `verbs/`, `verbs/info/` | one file per command |
 //! | `verbs/bench/` | pinned scenes, stages, training steps, growth, GPU stages, other programs (`studies/beside/with_gsplat.py`); each time with its lower bound |
 //! | `bin/` | `s4d`, the command's second name: a launcher |

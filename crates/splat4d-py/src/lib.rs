@@ -9,9 +9,10 @@
 //! | module | content |
 //! |---|---|
 //! | `errors.rs`, `arrays.rs`, `plain.rs`, `settings.rs` | errors, NumPy in and out, plain values, settings by name |
-//! | `camera.rs`, `scene_arrays.rs`, `gaussians.rs`, `rendering.rs`, `scene.rs` | cameras, arrays into scenes, Gaussians at a time, renders with gradients, scenes |
+//! | `camera.rs`, `scene_arrays.rs`, `gaussians.rs` | cameras, arrays into scenes, Gaussians at a time |
 //! | `from_arrays.rs` | images in memory become a capture on disk |
 //! | `metrics.rs`, `loss.rs`, `motion.rs` | metrics; losses and motion models written in Python |
+//! | `rendering.rs`, `scene.rs` | renders with gradients, scenes |
 //! | `run.rs`, `capture.rs`, `train.rs` | runs, captures, training |
 
 mod arrays;

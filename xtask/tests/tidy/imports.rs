@@ -18,9 +18,9 @@ const ORDER: [(&str, &[&str]); 8] = [
         // Every part is built from its own settings and facts of the capture; `recipe` composes the settings and builds the
         // parts, so that only what runs a whole training imports it.
         &[
-            "path_text",
             "settings",
             "event",
+            "path_text",
             "text",
             "files",
             "keypoints",
@@ -107,6 +107,7 @@ const ORDER: [(&str, &[&str]); 8] = [
             "baking",
             "playable",
             "serving",
+            "comparing",
             "report",
             "finish",
             "film",
@@ -130,10 +131,13 @@ const ORDER: [(&str, &[&str]); 8] = [
             "plain",
             "settings",
             "camera",
+            "scene_arrays",
             "gaussians",
             "from_arrays",
             "metrics",
             "loss",
+            "motion",
+            "rendering",
             "scene",
             "run",
             "capture",
@@ -253,7 +257,7 @@ fn tree(words: &[String], prefix: &[String], out: &mut Vec<Named>) -> usize {
             "," | "}" | ";" => break,
             "{" => {
                 i += 1;
-                while words.get(i).is_some_and(|w| w != "}") {
+                while words.get(i).is_some_and(|w| w != "}" && w != ";") {
                     i += tree(&words[i..], &path, out);
                     i += usize::from(words.get(i).is_some_and(|w| w == ","));
                 }
@@ -279,7 +283,8 @@ fn tree(words: &[String], prefix: &[String], out: &mut Vec<Named>) -> usize {
 fn named(words: &[String]) -> (Vec<Named>, Vec<Vec<String>>) {
     let (mut imports, mut inline, mut i) = (Vec::new(), Vec::new(), 0);
     while i < words.len() {
-        if words[i] == "use" {
+        // `use<'a>` is a bound.
+        if words[i] == "use" && words.get(i + 1).is_some_and(|w| w != "<") {
             i += 1 + tree(&words[i + 1..], &[], &mut imports);
             continue;
         }
@@ -416,6 +421,8 @@ fn circles_are_found_through_re_exports() {
     assert!(
         of(&[lib, a, b("const TEXT: &str = \"use crate::A;\"; #[cfg(test)] mod tests { use crate::A; }")]).is_empty()
     );
+    let bound = "use crate::A; fn f<'a>() -> impl Sized + use<'a> { g(); }";
+    assert_eq!(of(&[lib, a, b(bound)]).len(), 2);
     let parent = [lib, ("a/mod.rs", "mod c; pub struct P; use c::C;"), ("a/c.rs", "use super::P; pub struct C;")];
     assert!(of(&parent).is_empty(), "a child may use what its parent holds");
     let siblings = [

@@ -7,7 +7,7 @@ use super::tracks::{self, Link};
 use crate::sync::epipolar::{fundamental, sampson};
 use splat4d::math::Se3;
 use splat4d::math::se3::dot;
-use splat4d::scene::{Camera, Intrinsics, Lens};
+use splat4d::scene::{Camera, Intrinsics};
 use splat4d_train::capture::Distortion;
 use splat4d_train::event::Progress;
 

@@ -8,7 +8,7 @@ use super::{
     Take, Timing,
 };
 use super::{borders, evidence, lookup, masks, options, panorama, picture, plausible, pose};
-use splat4d::math::se3::{norm, normalize, sub};
+use splat4d::math::se3::{norm, normalize};
 use splat4d::scene::{Camera, Lens, Time};
 use splat4d::{Error, Result};
 use std::collections::btree_map::Entry;

@@ -6,7 +6,7 @@ use super::convention::{Convention, Poses};
 use super::points::read_ply;
 use super::stray::{ffmpeg_command, videos};
 use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take};
-use super::{json, masks, picture, pose, rig, sequence};
+use super::{json, lookup, picture, pose, rig, sequence};
 use splat4d::format::npy::Npy;
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -163,7 +163,7 @@ fn folders(root: &Path) -> Vec<Folder> {
 /// Whether a folder's images are not the frames of one camera.
 fn is_other(name: &str) -> bool {
     ["depth", "sparse", "sparse_", "colmap", "image_colmap"].contains(&name)
-        || masks::may_be(name)
+        || lookup::may_hold_masks(name)
         || rig::is_plain(name)
 }
 

@@ -1,5 +1,6 @@
 //! Checks of a capture before hours of training: few cameras, narrow coverage, uneven clocks.
 
+use super::account::Severity;
 use super::{Aspect, Capture, Frame};
 use splat4d::math::mat3::solve;
 use splat4d::math::se3::{dot, norm, normalize, sub};

@@ -5,18 +5,13 @@
 use super::map::Map;
 use super::{Seeds, scene_flow};
 use crate::Result;
-use crate::capture::DepthKind;
 use crate::capture::frames::{Frames, Picture};
 use rayon::prelude::*;
 use splat4d::math::Rng;
-use splat4d::scene::{Camera, Planes};
 use std::f64::consts::TAU;
 
 /// Pictures that points are taken from and held against, at most, evenly chosen.
 const VIEWS: usize = 100;
-/// A picture sees through a point if what it shows there is farther away by more than this share: beyond the noise of
-/// sensors and the slant of surfaces within a pixel.
-const THROUGH: f64 = 0.05;
 /// Points a wanted one that stand still.
 const CANDIDATES: usize = 4;
 /// Pixels of a picture of which is asked whether they move, at most.
@@ -105,12 +100,14 @@ fn evenly<T>(all: Vec<T>, count: usize, rng: Rng) -> Vec<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::capture::DepthKind;
     use crate::capture::frames::Depth;
     use crate::methods::Plan;
     use crate::recipe::Recipe;
     use crate::step::tests::Made;
     use splat4d::math::se3::{dot, norm, normalize, sub};
     use splat4d::scene::Time;
+    use splat4d::scene::{Camera, Planes};
 
     /// The made-up ball with its depth, before a wall.
     struct Deep(Made);

@@ -5,6 +5,9 @@ use crate::capture::DepthKind;
 use crate::capture::frames::{Frames, Picture};
 use splat4d::scene::{Camera, Planes};
 
+/// A picture sees through a point if what it shows there is farther away by more than this share: beyond the noise of
+/// sensors and the slant of surfaces within a pixel.
+const THROUGH: f64 = 0.05;
 /// Pictures whose longer side exceeds this many pixels are halved until it does not: they have more pixels than there are
 /// seeds, and a hundred maps of that size fit into any memory.
 const LONGEST_SIDE: usize = 640;

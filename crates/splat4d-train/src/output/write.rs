@@ -145,6 +145,7 @@ mod tests {
     #[cfg(unix)]
     #[test]
     fn names_that_are_not_text_are_written() {
+        use std::ffi::OsStr;
         use std::os::unix::ffi::OsStrExt;
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join(OsStr::from_bytes(b"sc\xffne.ply"));

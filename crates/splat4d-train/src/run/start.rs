@@ -5,6 +5,7 @@ use super::checkpoint;
 use super::count::settled;
 use super::flows;
 use super::identity::identity;
+use super::info::{read_info, read_text};
 use super::memory::memory_estimate;
 use super::minutes::Timing;
 use super::open::{OpenCapture, check_flow, open_capture};

@@ -2,16 +2,15 @@
 
 use super::clock::{retime, seen_in, window};
 use super::limits::{Size, check_clip, check_room};
-use super::parts::{each_part, parts, pruned, unframe, wrap};
+use super::parts::{each_part, parts, pruned, wrap};
 use super::{Context, Expr, Place, PlaceKey, Selected, Step, drag, select};
 use crate::layers::{ALWAYS, Layer, Scene};
 use crate::math::se3::{add, norm, sub};
-use crate::math::{Rng, Sim3, quat};
-use crate::motion::edited::{Change, ColorMap, Edited, FadeKey, PathKey};
+use crate::math::{Sim3, quat};
+use crate::motion::edited::{Change, ColorMap, FadeKey, PathKey};
 use crate::scene::params::OPACITY;
-use crate::scene::{GEOMETRY, HeadKeys, RowEdit, SH, Space, labels};
+use crate::scene::{GEOMETRY, HeadKeys, SH, labels};
 use crate::{Error, Result};
-use std::sync::Arc;
 
 /// Weights of red, green and blue in brightness (ITU-R BT.709).
 const LUMA: [f64; 3] = [0.2126, 0.7152, 0.0722];

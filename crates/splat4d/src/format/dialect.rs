@@ -231,7 +231,7 @@ mod tests {
     use super::*;
     use crate::format::kinematic::tests::moving as moving_scene;
     use crate::format::samples::gaussians;
-    use crate::format::{gltf, ply, sog, splat, splatv};
+    use crate::format::{gltf, ply, sog, splat, splatv, spz};
     use crate::scene::GEOMETRY;
 
     /// A scene that every dialect can hold.

@@ -8,6 +8,7 @@
 //! Source: Li et al. 2024 (STG) §3; Wang et al. 2025 (FreeTimeGS) §3.
 
 use super::lanes::{Batch, Lane, Work, fill, scatter};
+use super::registry::MAX_ORDER;
 use super::still::{activate_backward_lanes, activate_lanes};
 use super::{At, Cache, Capabilities, Model, Motion, Polynomial, Spec, Tape, fill_rows};
 use crate::math::{Real, Sim3, quat, sh};

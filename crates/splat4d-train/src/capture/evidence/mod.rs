@@ -12,8 +12,9 @@ mod silhouettes;
 #[cfg(test)]
 mod tests;
 
+use super::account::Severity;
 use super::account::first_names;
-use super::preflight::{Finding, Severity};
+use super::preflight::Finding;
 use super::{Aspect, Capture, Frame, Poses};
 use look::Look;
 pub use motion::Agreement;
