@@ -39,7 +39,9 @@ fn page(report: &Report) -> String {
     for f in &report.findings {
         let class = if f.grade == Grade::Note { "note" } else { "warn" };
         let _ = write!(body, "<div class=\"{class}\"><b>{}</b> {}", word(f.grade), escape(&f.what));
-        for (label, text) in [("Effect", &f.looks), ("Remedy", &f.remedy)].into_iter().filter(|(_, t)| !t.is_empty()) {
+        for (label, text) in
+            [("Effect", f.looks), ("Remedy", f.remedy.as_str())].into_iter().filter(|(_, t)| !t.is_empty())
+        {
             let _ = write!(body, "<br><b>{label}:</b> {}", escape(text));
         }
         body.push_str("</div>\n");
