@@ -361,7 +361,7 @@ fn flags_in_documents_exist() {
 
 /// Where a motion model may be told by its name or its spec: the list and the models' own files, and how each is learnt.
 const MODEL_ROOMS: [&str; 2] = ["crates/splat4d/src/motion/", "crates/splat4d-train/src/methods/"];
-/// Besides these, each with its reason.
+/// In addition to these, each with its reason.
 const MODEL_NAMES: [(&str, &str); 1] = [("crates/splat4d/src/layers/convert.rs", "turns one model into another")];
 
 /// Names and variants of the list of motion models: lines like `Still = "still" => ...`.

@@ -37,9 +37,14 @@ fn page(report: &Report) -> String {
     }
     body.push_str("<h2>Findings, worst first</h2>\n");
     for f in &report.findings {
-        let text = format!("{} {} {}", f.what, f.looks, f.remedy);
         let class = if f.grade == Grade::Note { "note" } else { "warn" };
-        let _ = writeln!(body, "<div class=\"{class}\"><b>{}</b> {}</div>", word(f.grade), escape(text.trim()));
+        let _ = write!(body, "<div class=\"{class}\"><b>{}</b> {}", word(f.grade), escape(&f.what));
+        for (label, text) in
+            [("Effect", f.looks), ("Remedy", f.remedy.as_str())].into_iter().filter(|(_, t)| !t.is_empty())
+        {
+            let _ = write!(body, "<br><b>{label}:</b> {}", escape(text));
+        }
+        body.push_str("</div>\n");
     }
     if !report.leave_out.is_empty() {
         let _ = writeln!(body, "<h2>Leave out</h2>\n<p>{}</p>", escape(&report.leave_out.join(", ")));
@@ -50,7 +55,10 @@ fn page(report: &Report) -> String {
             let _ = writeln!(body, "<p class=\"note\">{}</p>", escape(left));
         }
     }
-    body.push_str("<h2>Cameras</h2>\n<div class=\"grid3\">");
+    body.push_str(
+        "<h2>Cameras</h2>\n<p class=\"note\">Images are medians over time, in which moving subjects are faint. Pixels are \
+         those of an image of 1920 pixels.</p>\n<div class=\"grid3\">",
+    );
     for camera in &report.cameras {
         let p = &camera.picture;
         let picture = RgbImage::from_raw(p.width as u32, p.height as u32, p.data.clone()).filter(|p| p.width() > 0);
@@ -67,8 +75,8 @@ fn page(report: &Report) -> String {
                 let _ = write!(body, "<tr><th>{name}</th><td>{}</td></tr>", escape(&value));
             }
         };
-        row("poses", camera.epipolar.map(|v| format!("{v:.2} px of 1920")));
-        row("clock", camera.offset.map(|[v, s]| format!("{:+.1} ± {:.1} ms", 1e3 * v, 1e3 * s)));
+        row("pose error", camera.epipolar.map(|v| format!("{v:.2} px of 1920")));
+        row("time offset", camera.offset.map(|[v, s]| format!("{:+.1} ± {:.1} ms", 1e3 * v, 1e3 * s)));
         row("exposure", camera.exposure.map(|e| e.map(|v| format!("{v:+.2}")).join(" ") + " stops"));
         row("sharpness", camera.sharpness.map(|v| format!("{v:.2} times the others'")));
         row("moved", camera.moved.map(|v| format!("{v:.2} px of 1920")));
