@@ -370,3 +370,44 @@ fn image_files() -> Vec<Vec<u8>> {
     let length = (exif.len() as u16 + 2).to_be_bytes();
     vec![[&plain[..2], b"\xFF\xE1", &length, exif, &plain[2..]].concat(), png()]
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn seeds_are_sound() {
+        let layouts = [
+            "own",
+            "nerf",
+            "panoptic",
+            "n3dv",
+            "colmap",
+            "colmap_txt",
+            "nerfies",
+            "metashape",
+            "realityscan",
+            "polycam",
+            "record3d",
+            "beside",
+            "tracks_npz",
+            "flow_png",
+            "flow_flo",
+            "flow_npy",
+            "exr",
+            "png",
+            "npy",
+        ];
+        for layout in layouts {
+            let folder = made(layout);
+            let capture = Capture::open(folder.path(), &CaptureOptions::default());
+            let capture = capture.unwrap_or_else(|e| panic!("{layout}: {e}"));
+            capture.check_labels(&capture.frames[0]).unwrap();
+            let store = ImageStore::new(Arc::new(capture), 1 << 20);
+            assert!(store.load(0).is_ok(), "{layout}: {:?}", store.load(0).err().map(|e| e.to_string()));
+        }
+        for image in image_files() {
+            assert!(Rgb8::decode(&image, Path::new("image")).is_ok());
+        }
+    }
+}

@@ -268,3 +268,19 @@ fn mend(bytes: &mut [u8]) {
     let sum = crc(&bytes[..HEADER_BYTES - 4]);
     bytes[HEADER_BYTES - 4..HEADER_BYTES].copy_from_slice(&sum);
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn seeds_are_sound() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("scene.zip");
+        for zip in ply_zips() {
+            std::fs::write(&path, zip).unwrap();
+            assert_eq!(Source::open(&path).unwrap_or_else(|e| panic!("{e}")).scene.len(), 5);
+        }
+        assert_eq!(levels::finest(LEVELS.as_bytes()).unwrap().pieces.len(), 2);
+    }
+}

@@ -68,3 +68,31 @@ fn made() -> TempDir {
     std::fs::write(folder.path().join("recipe.toml"), Recipe::default().to_toml()).expect("the disk takes a file");
     folder
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn seeds_are_sound() {
+        let folder = made();
+        let at = folder.path();
+        for (file, text) in [
+            ("run.json", run_json()),
+            ("metrics.csv", METRICS.into()),
+            ("results.json", RESULTS.into()),
+            ("per_view.json", PER_VIEW.into()),
+            ("cameras.json", CAMERAS.into()),
+            ("chunks/plan.json", PLAN.into()),
+            (".splat4d/files", FILES.into()),
+            (".splat4d/asked", asked()),
+        ] {
+            std::fs::write(at.join(file), text).unwrap();
+        }
+        let run = Run::open(at).unwrap();
+        assert_eq!((run.metrics.len(), run.views.len(), run.views().unwrap().len()), (1, 1, 1));
+        assert_eq!((run.name().as_str(), output::written(at).len()), ("a", 4));
+        assert!(Asked::unbegun(at).is_some());
+        assert!(Chunked::open(at).err().unwrap().to_string().contains("recipe"), "its fingerprint is another");
+    }
+}

@@ -139,7 +139,7 @@ fn rigs() -> Vec<Vec<u8>> {
 }
 
 /// `import.toml`, as it is written.
-const CORRECTIONS: &str = "[[camera]]\nname = \"a\"\nuse = true\noffset = 0.5\nkeep_offset = true\n[camera.lens]\nfx = 8\ncx = 4\ncy = 3\nk = [0.1]\n\n[[camera]]\nname = \"b\"\nuse = false\n";
+const CORRECTIONS: &str = "version = 1\n[[camera]]\nname = \"a\"\nuse = true\noffset = 0.5\nkeep_offset = true\n[camera.lens]\nfx = 8\ncx = 4\ncy = 3\nk = [0.1]\n\n[[camera]]\nname = \"b\"\nuse = false\n";
 
 thread_local! {
     static FOLDER: TempDir = tempfile::tempdir().expect("there is a place for temporary files");
@@ -156,7 +156,7 @@ fn in_folder(name: &str, bytes: &[u8], read: impl FnOnce(&Path)) {
 fn corrections(bytes: &[u8]) {
     in_folder(corrections::FILE, bytes, |folder| {
         if let Ok(read) = Corrections::read(folder, &["a".into(), "b".into()]) {
-            read.cameras.iter().for_each(|c| drop((c.given_offset(), c.given_lens())));
+            read.cameras.iter().for_each(|c| assert!(c.given_offset().is_none_or(f64::is_finite)));
         }
     });
 }
@@ -218,4 +218,35 @@ fn film(bytes: &[u8]) {
         let mut frame = video::Frame::default();
         while reader.next(&mut frame).unwrap_or(false) {}
     });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn seeds_are_sound() {
+        in_folder(corrections::FILE, CORRECTIONS.as_bytes(), |folder| {
+            let read = Corrections::read(folder, &["a".into(), "b".into()]).unwrap();
+            assert_eq!(read.given_offsets(), [Some(0.5), None]);
+        });
+        for (i, rig) in rigs().iter().enumerate() {
+            in_folder("rig", rig, |folder| {
+                let read = calibration::read(&folder.join("rig"));
+                assert!(read.is_ok(), "{i}: {}", read.unwrap_err());
+            });
+        }
+        in_folder("film.avi", &films()[0], |folder| {
+            let none = Err(Error::input("there is no ffmpeg"));
+            let film = video::open_with(&folder.join("film.avi"), 1.0, none).unwrap();
+            assert_eq!(film.info().frames, Some(2));
+        });
+        in_folder("x", b"", |folder| {
+            let page = Page::new(crate::formats::moving(), &folder.join("list.toml")).unwrap();
+            // What is pulled must have been bent before.
+            for request in &requests()[..7] {
+                page.ask(&text(request)).unwrap_or_else(|e| panic!("{}: {e}", text(request)));
+            }
+        });
+    }
 }

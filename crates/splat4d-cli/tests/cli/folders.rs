@@ -151,7 +151,9 @@ fn no_output_replaces_what_is_read() {
 fn no_output_replaces_what_a_capture_reads_from_elsewhere() {
     let work = tempfile::tempdir().unwrap();
     let at = |name: &str| work.path().join(name);
-    let capture = Capture { black_masks: true, ..Capture::new(&at("sets")) }.write();
+    let mut sample = Capture::new(&at("sets"));
+    sample.black_masks = true;
+    let capture = sample.write();
     let (images, masks, points) = (at("photos"), at("cut"), at("sets/points.ply"));
     std::fs::rename(capture.join("images"), &images).unwrap();
     std::fs::rename(capture.join("masks"), &masks).unwrap();
