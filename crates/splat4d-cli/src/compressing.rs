@@ -62,6 +62,8 @@ impl Order {
     }
 }
 
+/// What the first Ctrl-C is answered with while a scene is tuned.
+const SAVING: &str = "stopping: a checkpoint is being saved";
 /// What an owner's record calls this verb.
 const COMMAND: &str = "compress";
 
@@ -82,9 +84,9 @@ impl Work {
     /// A new compression, or what the same order left unfinished. Errors: the folder cannot be written, or is not to be.
     pub(crate) fn begin(dir: PathBuf, order: Order, force: bool) -> Result<Self> {
         let asked = order.text();
-        let capture = Run::open(&order.source)?.capture();
+        let origin = Run::open(&order.source)?.origin();
         let mut inputs = vec![Input::new(&order.source, "the run")];
-        inputs.extend(capture.as_deref().map(|c| Input::new(c, "the run's capture")));
+        inputs.extend(origin.inputs());
         let request = Request { command: COMMAND, inputs: &inputs, asked: &asked, force, mixes: Mixes::Anything };
         let (folder, found) = OutputFolder::begin(&dir, &request)?;
         if found == Found::Unfinished && dir.join(ORDER).is_file() {
@@ -146,7 +148,8 @@ impl Work {
 
     /// Until size and guard are content.
     fn work(&mut self, eval: bool, measure: &Measure, console: &Console) -> anyhow::Result<()> {
-        let stop = interrupt::flag("stopping: a checkpoint is being saved");
+        let stop = interrupt::flag(SAVING);
+        interrupt::ends(self.kept());
         let source = Source::open(&self.order.source)?;
         not_empty(&source.scene, &self.order.source)?;
         source.scene.without_head("a playback file")?;
@@ -161,7 +164,9 @@ impl Work {
         let before = if eval { Some(original.scores(original.scene, console)?) } else { None };
         self.choose_size(&original, console)?;
         let (file, after) = loop {
+            interrupt::asks(SAVING);
             let compressed = self.compress(&original, &stop, console)?;
+            interrupt::ends(self.kept());
             let file = self.write_file(&compressed, console)?;
             let Some(before) = &before else { break (file, None) };
             let scene = read_scene(&self.dir.join("scene.safetensors"))?;
@@ -182,6 +187,11 @@ impl Work {
         Ok(())
     }
 
+    /// What is said where a Ctrl-C ends it.
+    fn kept(&self) -> String {
+        format!("what was tuned is kept: splat4d compress --resume {} continues", in_command(&self.dir))
+    }
+
     /// Everything before and after, measured in one go.
     fn compare(
         &self,
@@ -191,7 +201,14 @@ impl Work {
         stop: &AtomicBool,
         console: &Console,
     ) -> anyhow::Result<Compressed> {
-        let unpruned = if self.order.unpruned { Some(self.train_unpruned(original, stop, console)?) } else { None };
+        let unpruned = if self.order.unpruned {
+            interrupt::asks(SAVING);
+            let trained = self.train_unpruned(original, stop, console)?;
+            interrupt::ends(self.kept());
+            Some(trained)
+        } else {
+            None
+        };
         let smooth = antialias(original.recipe.appearance.antialias);
         let read = |path: &Path| -> Result<Arc<[u8]>> { Ok(files::read(path)?.into()) };
         let file = read(&self.dir.join(playable::FILE))?;

@@ -76,6 +76,7 @@ Examples:
   splat4d train examples/knight            train, measure, report and film the bundled capture
   splat4d train my-take --minutes 10       finish within ten minutes
   splat4d train --resume runs/my-take      continue a run exactly
+  splat4d status runs/my-take              steps, workers and time left of a run
   splat4d eval runs/knight --baseline      compare with a static scene
   splat4d render runs/knight -o turn.mp4   film an orbit through space and time
   splat4d localise runs/knight photo.jpg   pose and time of an image
@@ -132,6 +133,7 @@ enum Verb {
     Import(verbs::import::Args),
     Train(Box<verbs::train::Args>),
     Join(verbs::join::Args),
+    Status(verbs::status::Args),
     Eval(verbs::eval::Args),
     Compare(verbs::compare::Args),
     Predict(verbs::predict::Args),
@@ -155,6 +157,7 @@ impl Verb {
             Verb::Import(args) => verbs::import::run(args, console),
             Verb::Train(args) => verbs::train::run(args, console),
             Verb::Join(args) => verbs::join::run(args, console),
+            Verb::Status(args) => verbs::status::run(args, console),
             Verb::Eval(args) => verbs::eval::run(args, console),
             Verb::Compare(args) => verbs::compare::run(args, console),
             Verb::Predict(args) => verbs::predict::run(args, console),
@@ -195,6 +198,7 @@ pub fn call(words: &[OsString]) -> anyhow::Result<Vec<serde_json::Value>> {
         let text = e.to_string();
         Error::input(text.trim_start_matches("error: ").trim_end().to_owned())
     })?;
+    interrupt::embedded();
     let console = Console::keeping_objects();
     cli.verb.run(None, &console)?;
     Ok(console.into_objects())

@@ -13,7 +13,7 @@ use splat4d_train::event::Event;
 use splat4d_train::output::{Found, Input, Mixes, OutputFolder, Owner, Request, STATE};
 use splat4d_train::path_text::of_text;
 use splat4d_train::recipe::Recipe;
-use splat4d_train::run::checkpoint;
+use splat4d_train::run::{capture_options, checkpoint};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -215,6 +215,16 @@ impl Run {
         self.info.get("capture").and_then(Value::as_str).map(of_text)
     }
 
+    /// What it was trained on.
+    pub(crate) fn origin(&self) -> Origin {
+        let opened = || {
+            let (root, recipe) = (self.capture()?, self.recipe().ok()?);
+            // Also masks and maps that the recipe does not look at.
+            Capture::open(&root, &capture_options(&recipe).ok()?).ok()
+        };
+        Origin { capture: self.capture(), elsewhere: opened().map(|c| c.elsewhere).unwrap_or_default() }
+    }
+
     /// Warnings and notes about the run: those of the capture's reader, and those since, in that order.
     pub(crate) fn findings(&self) -> Vec<String> {
         let mut out: Vec<String> = Vec::new();
@@ -352,6 +362,28 @@ pub fn usual_folder(capture: &str) -> PathBuf {
     Path::new("runs").join(if name.is_empty() { "run" } else { name })
 }
 
+/// The folder of a capture, and what it reads from elsewhere: none of it is an output.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(crate) struct Origin {
+    capture: Option<PathBuf>,
+    elsewhere: BTreeSet<PathBuf>,
+}
+
+impl Origin {
+    /// Of an opened capture.
+    pub(crate) fn of(capture: &Capture) -> Self {
+        Self { capture: Some(capture.root.clone()), elsewhere: capture.elsewhere.clone() }
+    }
+
+    /// All of it.
+    pub(crate) fn inputs(&self) -> impl Iterator<Item = Input<'_>> {
+        let what =
+            |path: &PathBuf| if path.is_dir() { "a folder of the capture's images," } else { "a file of the capture," };
+        let elsewhere = self.elsewhere.iter().map(move |path| Input::new(path, what(path)));
+        self.capture.iter().map(|c| Input::new(c, "the capture")).chain(elsewhere)
+    }
+}
+
 /// What a training run was asked for: the same command continues it, from whatever state a crash left.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Asked {
@@ -365,21 +397,21 @@ pub struct Asked {
     pub minutes: Option<f64>,
     /// Whether the time is foretold.
     pub predict: bool,
-    /// Folders elsewhere that the capture holds by links.
+    /// What the capture reads from elsewhere.
     #[serde(skip)]
-    linked: BTreeSet<PathBuf>,
+    elsewhere: BTreeSet<PathBuf>,
 }
 
 impl Asked {
     pub fn new(capture: &Path, recipe: &Recipe, minutes: Option<f64>, predict: bool) -> Self {
         let capture = capture.canonicalize().unwrap_or_else(|_| capture.to_owned());
         let (version, recipe) = (env!("CARGO_PKG_VERSION").into(), recipe.to_toml());
-        Self { version, capture, recipe, minutes, predict, linked: BTreeSet::new() }
+        Self { version, capture, recipe, minutes, predict, elsewhere: BTreeSet::new() }
     }
 
-    /// The same of an opened capture, whose linked folders hold no output either.
+    /// The same of an opened capture; what it reads from elsewhere holds no output either.
     pub fn of(capture: &Capture, recipe: &Recipe, minutes: Option<f64>, predict: bool) -> Self {
-        Self { linked: capture.linked_folders(), ..Self::new(&capture.root, recipe, minutes, predict) }
+        Self { elsewhere: capture.elsewhere.clone(), ..Self::new(&capture.root, recipe, minutes, predict) }
     }
 
     /// Of a run that ended before its first checkpoint, so that there is nothing else to continue from.
@@ -395,8 +427,8 @@ impl Asked {
     /// Takes the folder of the run for a new training or the rest of one. What is there of one that took no step is removed.
     pub fn begin(&self, run: &Path, force: bool, command: &str) -> Result<(OutputFolder, Found)> {
         let asked = serde_json::to_string(self).expect("it is plain data");
-        let linked = self.linked.iter().map(|folder| Input::new(folder, "a folder of the capture's images,"));
-        let inputs: Vec<Input<'_>> = std::iter::once(Input::new(&self.capture, "the capture")).chain(linked).collect();
+        let origin = Origin { capture: Some(self.capture.clone()), elsewhere: self.elsewhere.clone() };
+        let inputs: Vec<Input<'_>> = origin.inputs().collect();
         let request = Request { command, inputs: &inputs, asked: &asked, force, mixes: Mixes::Anything };
         let (folder, found) = OutputFolder::begin(run, &request)?;
         if found == Found::Unfinished && checkpoint::list(run).is_empty() {

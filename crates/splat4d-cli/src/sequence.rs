@@ -6,7 +6,7 @@ use splat4d::format::dialect;
 use splat4d::layers::Scene;
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::{Error, Result};
-use splat4d_train::output::{Input, Mixes, OutputFolder, Request};
+use splat4d_train::output::{Input, Mixes, OutputFolder, Request, check_file};
 use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
 
@@ -125,11 +125,18 @@ pub(crate) fn take(
     command: &str,
     force: bool,
 ) -> Result<OutputFolder> {
-    let capture = read.run.and_then(Run::capture);
-    let mut inputs: Vec<Input<'_>> = capture.iter().map(|c| Input::new(c, "the run's capture")).collect();
-    // Of files it is known by their names whether they would be in the way.
+    let origin = read.run.map(Run::origin).unwrap_or_default();
+    let mut inputs: Vec<Input<'_>> = origin.inputs().collect();
+    let sources = Pattern::of(read.path).filter(|_| !read.path.exists());
+    if let Some(sources) = &sources {
+        inputs.push(Input { may_hold: true, ..Input::new(sources.folder(), "the folder of what is read,") });
+    }
     if read.path.is_dir() {
         inputs.push(Input { may_hold: read.run.is_some(), ..Input::new(read.path, "what is read,") });
+    } else {
+        let own = [Input::new(read.path, "what is read,")];
+        let frames = patterns.iter().flat_map(|p| (0..count).map(|i| p.file(i)));
+        frames.into_iter().try_for_each(|frame| check_file(&frame, &own))?;
     }
     let is = |name: &OsStr| patterns.iter().any(|p| p.takes(name));
     let written = |name: &OsStr| patterns.iter().any(|p| p.writes(name, count));

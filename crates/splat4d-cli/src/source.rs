@@ -50,9 +50,10 @@ pub struct Source {
 /// Refuses an output that would replace what is read (the scene, a file of its run's capture, or one of `others`) or what any run
 /// needs, and one in a folder that another process owns.
 pub(crate) fn keep(path: &Path, run: Option<&Run>, output: &Path, others: &[&Path]) -> Result<()> {
-    let capture = run.and_then(Run::capture);
+    // A new file replaces nothing: the capture need not be opened.
+    let origin = run.filter(|_| output.is_file()).map(Run::origin).unwrap_or_default();
     let mut inputs = vec![Input { may_hold: run.is_some(), ..Input::new(path, "what is read,") }];
-    inputs.extend(capture.iter().map(|c| Input::new(c, "the run's capture")));
+    inputs.extend(origin.inputs());
     inputs.extend(others.iter().map(|file| Input::new(file, "what is read,")));
     check_file(output, &inputs)?;
     if Run::needs(output) {

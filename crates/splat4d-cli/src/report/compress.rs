@@ -3,7 +3,7 @@
 
 use super::chart::{Series, bars, escape, lines, short};
 use super::{panels, pictures};
-use crate::files::{grouped, human_bytes, human_seconds};
+use crate::files::{self, grouped, human_bytes, human_seconds};
 use crate::measure::Side;
 use crate::playable;
 use crate::run_folder::{COMPRESS as FILE, Run};
@@ -207,7 +207,7 @@ fn sides(out: &mut String, told: &Compressed) {
 
 /// Bytes by kind of section, from the file's own index.
 fn parts(file: &Path) -> Option<String> {
-    let bytes = std::fs::read(file).ok()?;
+    let bytes = files::read(file).ok()?;
     let index = Index::parse(&bytes, Some(bytes.len() as u64)).ok()?;
     let mut by_kind: BTreeMap<Kind, u64> = BTreeMap::new();
     for entry in &index.sections {

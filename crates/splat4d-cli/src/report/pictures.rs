@@ -1,7 +1,7 @@
 //! Pictures inside the page: held-out views beside their truth and error, as small JPEGs in data URIs.
 
 use crate::draw::color_rgb;
-use crate::files::base64;
+use crate::files::{self, base64};
 use crate::video::Rgb;
 use image::RgbImage;
 use image::codecs::jpeg::JpegEncoder;
@@ -69,7 +69,7 @@ pub(super) fn film_file(path: &Path, alt: &str) -> Option<String> {
     let name = path.file_name()?.to_string_lossy().into_owned();
     let source = if small {
         let kind = if video { "video/mp4" } else { "image/png" };
-        format!("data:{kind};base64,{}", base64(&std::fs::read(path).ok()?))
+        format!("data:{kind};base64,{}", base64(&files::read(path).ok()?))
     } else {
         name
     };

@@ -301,6 +301,11 @@ fn page(path: &Path, args: &Args, console: &Console) -> anyhow::Result<()> {
             .remedy("Use --link NAME.s4d.")
             .into());
     }
+    // A playback file may lie beside its page as it is.
+    let is_read = |link: &&PathBuf| link.canonicalize().ok().is_some_and(|l| path.canonicalize().is_ok_and(|p| p == l));
+    if let Some(link) = args.link.as_ref().filter(|link| !is_read(link)) {
+        keep(path, run.as_ref(), link, &[])?;
+    }
     let address = args.link.as_ref().map(|link| address(link, out)).transpose()?;
     let scene = Playable::open(path, console)?;
     let bytes = scene.bytes()?;

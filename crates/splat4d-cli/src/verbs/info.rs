@@ -6,8 +6,9 @@ mod playback;
 use crate::chunked;
 use crate::console::Console;
 use crate::files::{self, grouped, human_bytes, human_seconds};
-use crate::run_folder::Run;
+use crate::run_folder::{Origin, Run};
 use crate::source::{Source, bundle, cloud};
+use crate::verbs::status;
 use serde_json::{Value, json};
 use splat4d::Error;
 use splat4d::format::sog;
@@ -18,7 +19,7 @@ use splat4d::scene::{GEOMETRY, SH};
 use splat4d::text::in_line;
 use splat4d_train::capture::{self, Aspect, Capture, Finding, Frame, Reach, Severity, Timing};
 use splat4d_train::event::Event;
-use splat4d_train::output::{Input, check_apart};
+use splat4d_train::output::check_apart;
 use splat4d_train::path_text::{in_command, to_text};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::chunks::Outlook;
@@ -166,7 +167,7 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
         frame.tracks = frame.tracks.take().filter(|_| recipe.loss.tracks > 0.0);
     }
     if args.doctor {
-        check_apart(&args.output, &[Input::new(&capture.root, "the capture")])?;
+        check_apart(&args.output, &Origin::of(&capture).inputs().collect::<Vec<_>>())?;
         // Before the pictures are looked at, which takes a while.
         files::make_folder(&args.output)?;
         return doctor::of(&capture, &args.output, console);
@@ -321,22 +322,24 @@ fn of_run(path: &Path) -> anyhow::Result<Told> {
     let choices = if changed.is_empty() { "all defaults".to_owned() } else { changed.join(" ") };
     line(&mut text, "recipe", &format!("{recipe}; {choices}"));
     let total = run.number("iterations").or_else(|| run.recipe().ok().map(|r| r.run.iterations as f64));
-    let done = run.iteration().unwrap_or(0);
-    let finished = Run::is_finished(path);
-    let state = if finished { "finished" } else { "unfinished" };
-    line(
-        &mut text,
-        "progress",
-        &format!("{state}, step {} of {}", grouped(done), grouped(total.unwrap_or(0.0) as usize)),
-    );
+    let status = status::of(path)?;
+    let finished = status.finished;
+    // Each chunk has the recipe's steps.
+    let (done, total) = if status.chunked { (status.steps(), None) } else { (run.iteration().unwrap_or(0), total) };
+    let of = total.map(|n| format!(" of {}", grouped(n as usize))).unwrap_or_default();
+    line(&mut text, "progress", &format!("{}, step {}{of}", status.progress(), grouped(done)));
     if !finished {
-        troubles.push(format!("It is unfinished: splat4d train --resume {} continues it.", in_command(path)));
+        troubles.push(match status.chunked {
+            true => format!("It is unfinished: splat4d status {} lists its parts.", in_command(path)),
+            false => format!("It is unfinished: splat4d train --resume {} continues it.", in_command(path)),
+        });
     }
-    if let Some(seconds) = run.number("seconds") {
+    if let Some(seconds) = run.number("seconds").or(status.chunked.then(|| status.seconds())) {
         line(&mut text, "time", &human_seconds(seconds));
     }
-    if let Some(bytes) = run.number("peak_memory").filter(|b| *b > 0.0) {
-        line(&mut text, "memory", &format!("{} at most", human_bytes(bytes as u64)));
+    let bytes = run.number("peak_memory").map(|b| b as u64).max(status.peak_memory());
+    if let Some(bytes) = bytes.filter(|b| *b > 0) {
+        line(&mut text, "memory", &format!("{} at most", human_bytes(bytes)));
     }
     if let Some(n) = run.number("rollbacks").filter(|n| *n > 0.0) {
         troubles.push(format!("Training rolled back {n} times because a value was not finite: check the poses."));

@@ -16,5 +16,6 @@ pub(crate) mod label;
 pub(crate) mod localise;
 pub(crate) mod predict;
 pub(crate) mod render;
+pub(crate) mod status;
 pub mod train;
 pub(crate) mod view;

@@ -134,7 +134,8 @@ fn one(args: &Args, path: &Path, camera: &Path, console: &Console) -> anyhow::Re
     }
     args.raw_format.suits(args.channel)?;
     let source = Source::open(path)?;
-    for file in args.output.iter().chain(&args.raw) {
+    let raw = args.raw.as_deref().map(|prefix| raw_files(prefix, args)).unwrap_or_default();
+    for file in args.output.iter().chain(&raw) {
         source.keep(path, file, &[])?;
     }
     let depth = args.channel == Channel::Depth || args.raw.is_some();
@@ -147,33 +148,44 @@ fn one(args: &Args, path: &Path, camera: &Path, console: &Console) -> anyhow::Re
         files::write(out, &painter.rgb(args.channel, range).png())?;
         console.written(out);
     }
-    if let Some(raw) = args.raw.as_ref().filter(|_| args.channel.is_field() || args.raw_format != RawFormat::Npy) {
-        let mut name = stem(raw);
-        name.push(format!(".{}.{}", args.channel.name(), args.raw_format.ending()));
-        let path = PathBuf::from(name);
-        files::write(&path, &args.raw_format.bytes(args.channel, &painter.raw())?)?;
-        console.written(&path);
-    } else if let Some(raw) = &args.raw {
-        let image = &painter.image;
-        raw_array(raw, ".npy", &[camera.height, camera.width, 3], &image.color.interleaved(), console)?;
-        raw_array(raw, ".alpha.npy", &[camera.height, camera.width], plane(&image.alpha), console)?;
-        raw_array(raw, ".depth.npy", &[camera.height, camera.width], plane(&image.depth), console)?;
+    match &raw[..] {
+        [] => {}
+        [color, alpha, depth] => {
+            let (image, size) = (&painter.image, [camera.height, camera.width]);
+            raw_array(color, &[size[0], size[1], 3], &image.color.interleaved(), console)?;
+            raw_array(alpha, &size, plane(&image.alpha), console)?;
+            raw_array(depth, &size, plane(&image.depth), console)?;
+        }
+        files => {
+            files::write(&files[0], &args.raw_format.bytes(args.channel, &painter.raw())?)?;
+            console.written(&files[0]);
+        }
     }
     Ok(())
+}
+
+/// The files of `--raw PREFIX` for one camera: those of colour, opacity and depth, or one of the channel.
+fn raw_files(prefix: &Path, args: &Args) -> Vec<PathBuf> {
+    let named = |ending: &str| {
+        let mut name = stem(prefix);
+        name.push(ending);
+        PathBuf::from(name)
+    };
+    if args.channel.is_field() || args.raw_format != RawFormat::Npy {
+        return vec![named(&format!(".{}.{}", args.channel.name(), args.raw_format.ending()))];
+    }
+    [".npy", ".alpha.npy", ".depth.npy"].map(named).into()
 }
 
 fn plane(planes: &Planes<f32>) -> &[f32] {
     &planes.data
 }
 
-fn raw_array(prefix: &Path, ending: &str, shape: &[usize], data: &[f32], console: &Console) -> anyhow::Result<()> {
-    let mut name = stem(prefix);
-    name.push(ending);
-    let path = PathBuf::from(name);
+fn raw_array(path: &Path, shape: &[usize], data: &[f32], console: &Console) -> anyhow::Result<()> {
     let mut bytes = Vec::new();
     format::npy::write_f32(shape, data, &mut bytes)?;
-    files::write(&path, &bytes)?;
-    console.written(&path);
+    files::write(path, &bytes)?;
+    console.written(path);
     Ok(())
 }
 

@@ -34,6 +34,8 @@ const WAIT: Duration = Duration::from_millis(200);
 /// What an owner's record calls this verb, and `join`.
 const TRAIN: &str = "train";
 const JOIN: &str = "join";
+/// What the first Ctrl-C is answered with in training.
+const SAVING: &str = "stopping: a checkpoint is being saved";
 /// Frame rates that differ by less are one: 29.97 and 30.
 const SAME_RATE: f64 = 0.01;
 
@@ -190,7 +192,8 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     if !args.view && args.place.is_told() {
         return Err(Error::input("--port, --host and --no-open need --view").remedy("Add --view.").into());
     }
-    let stop = interrupt::flag("stopping: a checkpoint is being saved");
+    let stop = interrupt::flag(SAVING);
+    interrupt::ends("training had not begun, and the same command begins it");
     let watch = |title: &str| {
         if args.view { Watch::start(title, &args.place, console) } else { Watch::nobody() }
     };
@@ -213,6 +216,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         let device = device::to_train(args.device, console);
         let clock = clock.clone();
         let options = TrainOptions { device, snapshots: snapshots(&watch), clock, ..TrainOptions::default() };
+        interrupt::asks(SAVING);
         let trained = run::resume_with(run, &options, &stop, &mut |event| listen(event, &watch));
         (folder, run.clone(), watch, trained)
     } else {
@@ -309,6 +313,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             run_folder::hear(&folder, event);
             listen(event, &watch);
         };
+        interrupt::asks(SAVING);
         let trained = if found == Found::Unfinished {
             console.say(&format!("{} contains an unfinished run of the same command: it is continued", run.display()));
             run::resume_with(&run, &options, &stop, &mut hear)
@@ -337,6 +342,10 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         .remedy(format!("Continue with: splat4d train --resume {}", in_command(&run)))
         .into());
     }
+    let name = in_command(&run);
+    interrupt::ends(format!(
+        "the scene is trained and saved: splat4d eval {name} makes the scores, the film and the report"
+    ));
     console.say(&format!("wrote {}", run.join("scene.safetensors").display()));
     finish::say_refined(&run, console)?;
     if labelling::has_any(&Run::open(&run)?.open_capture()?.0) {
@@ -357,6 +366,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     console.emit(&json!({"type": "done", "run": run.to_string_lossy()}));
     if watch.is_on() && console.terminal() {
         console.say("the player keeps running until Ctrl-C");
+        interrupt::asks("stopping");
         serving::wait(&stop);
     }
     Ok(())
@@ -380,6 +390,7 @@ fn in_chunks(
         ..TrainOptions::default()
     };
     let wanted = args.chunk.unwrap_or(Wanted::All);
+    interrupt::asks(SAVING);
     let outcome = chunked::work(run, chunked, wanted, &options, stop, console, &mut |event| {
         watch.hear(event);
         console.event(event);
@@ -393,6 +404,7 @@ fn in_chunks(
     match args.chunk {
         Some(_) => console.emit(&json!({"type": "done", "run": run.to_string_lossy()})),
         None => {
+            interrupt::ends(format!("all parts are kept: splat4d join {} joins them", in_command(run)));
             // The other workers are done with it, or wait for the same.
             let _owner = Owner::wait(run, JOIN, &mut |_| !stop.load(Ordering::Relaxed))?;
             let deadline = Deadline::of(clock, args.minutes);

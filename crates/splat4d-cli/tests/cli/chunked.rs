@@ -26,7 +26,22 @@ fn parts_by_number_and_one_command_make_the_same_scene_and_file() {
     assert!(said.contains("flicker at chunk boundaries"), "{said}");
     assert!(train(&capture, &parts, &["--chunk=0"]).refused().contains("--chunk shared"));
     let film = parts.join("scene.s4d");
-    for part in ["shared", "0", "1", "1"] {
+    let status = |run: &Path| {
+        let said = splat4d(&["status", str(run), "--json"]).run().ok();
+        serde_json::from_str::<serde_json::Value>(said.trim()).unwrap()
+    };
+    let states = |run: &Path| {
+        let told = status(run);
+        let all = told["parts"].as_array().unwrap().iter().map(|p| p["state"].as_str().unwrap().to_owned());
+        all.collect::<Vec<_>>()
+    };
+    assert_eq!(states(&parts), ["open", "waiting", "waiting"]);
+    for (part, then) in [
+        ("shared", ["done", "open", "waiting"]),
+        ("0", ["done", "done", "open"]),
+        ("1", ["done", "done", "done"]),
+        ("1", ["done", "done", "done"]),
+    ] {
         train(&capture, &parts, &[&format!("--chunk={part}")]).ok();
         // It plays as far as it goes, and an older reader refuses it by its version.
         let bytes = std::fs::read(&film).unwrap();
@@ -34,7 +49,23 @@ fn parts_by_number_and_one_command_make_the_same_scene_and_file() {
         let told = splat4d(&["info", str(&film), "--json"]).run().ok();
         assert!(told.contains("\"version\":\"2.0\"") || told.contains("2.0"), "{told}");
         splat4d(&["export", str(&film), "-o", str(&work.path().join(format!("{part}.ply"))), "--time=0"]).run().ok();
+        assert_eq!(states(&parts), then, "{part}");
+        if part == "0" {
+            // A worker has the next one.
+            let owner = splat4d_train::output::Owner::of(&parts.join("chunks/01"), "train").unwrap();
+            let told = status(&parts);
+            assert!(told["done"] == 2 && told["total"] == 3 && told["finished"] == false, "{told}");
+            assert!(told["parts"][2]["worker"].as_str().unwrap().contains(&std::process::id().to_string()), "{told}");
+            assert!(
+                told["parts"][1]["iteration"] == told["parts"][1]["iterations"] && told["next"].is_null(),
+                "{told}"
+            );
+            drop(owner);
+            let said = splat4d(&["info", str(&parts)]).run().ok();
+            assert!(said.contains("unfinished, 2 of 3 parts done") && said.contains("splat4d status"), "{said}");
+        }
     }
+    assert!(status(&parts)["next"].as_str().unwrap().contains("splat4d join"));
     // Bytes of somebody who died in the midst of appending.
     let mut broken = std::fs::read(&film).unwrap();
     broken.extend([7; 999]);
@@ -43,6 +74,8 @@ fn parts_by_number_and_one_command_make_the_same_scene_and_file() {
     for file in ["scene.safetensors", "scene.s4d", "chunks/01/scene.safetensors"] {
         assert_eq!(std::fs::read(one.join(file)).unwrap(), std::fs::read(parts.join(file)).unwrap(), "{file}");
     }
+    let said = splat4d(&["info", str(&parts)]).run().ok();
+    assert!(said.contains("finished, 3 parts joined") && !said.contains(" of 20"), "{said}");
     assert!(json_of(&one.join("run.json"))["seams"]["inside"].is_f64());
     assert!(std::fs::read_to_string(one.join("report.html")).unwrap().contains("Flicker at chunk boundaries"));
     // A run like any other: all of it is done, and it is measured and drawn.

@@ -436,4 +436,14 @@ fn what_cannot_be_imported_is_explained() {
     std::fs::create_dir(&own).unwrap();
     std::fs::write(own.join("capture.json"), "{}").unwrap();
     assert!(splat4d(&["import", str(&films), "-o", str(&own)]).run().refused().contains("a capture already"));
+    // So do their images, and a calibration that the capture would contain.
+    let own = at("photos");
+    std::fs::create_dir_all(own.join("images/cam06")).unwrap();
+    std::fs::write(own.join("images/cam06/000000.jpg"), "mine").unwrap();
+    let said = splat4d(&["import", str(&films), "-o", str(&own)]).run().refused();
+    assert!(said.contains("holds images") && said.contains("no record"), "{said}");
+    assert_eq!(std::fs::read(own.join("images/cam06/000000.jpg")).unwrap(), b"mine");
+    std::fs::write(take.join("rig.toml"), "x = 1").unwrap();
+    let said = refused(&films, &["--calibration", str(&take.join("rig.toml"))]);
+    assert!(said.contains("contains the calibration"), "{said}");
 }

@@ -70,6 +70,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
     let points = take.points.map(|p| p.voxel_downsample(options.max_points)).filter(|p| !p.points.is_empty());
     let mut capture = Capture {
         name,
+        elsewhere: super::elsewhere::find(&take.root, &frames, &take.files),
         root: take.root,
         kind: take.kind,
         cameras,

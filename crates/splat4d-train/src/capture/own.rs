@@ -113,6 +113,7 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<T
     let mut account = Account::default();
     lookup.tell(&mut account);
     let convention = Convention { world_to_camera: !inverse, opengl, quaternions: false };
+    let points = top.opt("points")?.map(|n| lookup.file(n.text()?)).transpose()?;
     Ok(Take {
         name: top.opt("name")?.map(|n| n.text()).transpose()?.map(str::to_string),
         cameras,
@@ -121,7 +122,8 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<T
         named: true,
         hold_out,
         fps,
-        points: top.opt("points")?.map(|n| read_ply(&lookup.file(n.text()?)?)).transpose()?,
+        points: points.as_deref().map(read_ply).transpose()?,
+        files: points.into_iter().collect(),
         background: read_background(top)?,
         up: top.opt("up")?.map(|n| n.numbers::<3>()).transpose()?,
         labels,

@@ -20,7 +20,7 @@ mod write;
 
 pub use date::rfc3339;
 pub use folder::{Found, Mixes, OutputFolder, Request};
-pub use list::note;
+pub use list::{note, written};
 pub use owner::{Owner, Standing, check_free};
 pub use place::{Input, check_apart, check_file};
 pub use write::{Staged, write_atomically, write_atomically_with};

@@ -111,6 +111,8 @@ impl Owner {
         let record = state.join(RECORD);
         let lock = loop {
             std::fs::create_dir_all(&state).map_err(fail)?;
+            write::check_plain(&state.join(LOCK))?;
+            write::check_plain(&record)?;
             let opened = File::options().read(true).write(true).create(true).truncate(false).open(state.join(LOCK));
             let lock = match opened {
                 // Its owner has just removed the state of a folder in which nothing was begun.
@@ -185,8 +187,9 @@ impl Owner {
 
     /// Who has the folder now, without a trace in it; the inner `None`: somebody whose record cannot be read.
     pub fn holder(folder: &Path) -> Option<Option<Standing>> {
-        let record = folder.join(STATE).join(RECORD);
-        let lock = File::open(folder.join(STATE).join(LOCK)).ok()?;
+        let (record, lock) = (folder.join(STATE).join(RECORD), folder.join(STATE).join(LOCK));
+        write::check_plain(&lock).ok()?;
+        let lock = File::open(lock).ok()?;
         if let Err(TryLockError::WouldBlock) = lock.try_lock_shared() {
             return Some(Standing::read(&record));
         }

@@ -7,6 +7,16 @@ use crate::{Error, Result};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
+/// Refuses a link, folder, pipe or device in the place of a file of an output folder's state: it would lead elsewhere, or wait.
+pub(super) fn check_plain(path: &Path) -> Result<()> {
+    match std::fs::symlink_metadata(path) {
+        Ok(there) if !there.is_file() => Err(Error::input("is not a regular file, but a link, folder, pipe or device")
+            .at(path.display())
+            .remedy("Remove it: splat4d keeps a file of its own there")),
+        _ => Ok(()),
+    }
+}
+
 /// A file under a temporary name beside its place; [`keep`](Self::keep) renames it, dropping it removes it.
 #[derive(Debug)]
 pub struct Staged {
@@ -16,10 +26,13 @@ pub struct Staged {
 
 impl Staged {
     /// Prepares to write `path`. A link is followed, so that the file behind it is replaced and not the link; a device or
-    /// a pipe is written to.
+    /// a pipe is written to. In an output folder the link itself is replaced: folders come from other people.
     ///
     /// Errors: a folder is there; the list of the folder's files cannot be written.
     pub fn new(path: &Path) -> Result<Self> {
+        if path.is_symlink() && list::keeps(path) {
+            return Self::at(path.to_owned(), path);
+        }
         Self::at(std::fs::canonicalize(path).unwrap_or_else(|_| path.to_owned()), path)
     }
 

@@ -263,6 +263,6 @@ fn offset_of_scene(run: &Path) -> Result<Option<[f64; 3]>> {
     let finished = Some(run.join(SCENE)).filter(|path| path.is_file());
     let Some(path) = finished.or_else(|| checkpoint::list(run).pop()) else { return Ok(None) };
     let place = |e: Error| e.at(path.display());
-    let bytes = std::fs::read(&path).map_err(|e| place(Error::io("the scene cannot be read", e)))?;
+    let bytes = crate::files::read(&path)?;
     Ok(Some(splat4d::format::scene::read(&bytes).map_err(place)?.offset))
 }

@@ -25,6 +25,7 @@ use splat4d_train::capture::{Capture, CaptureKind, Convention, Extent, Frame, Im
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::dataset::Dataset;
 use splat4d_train::run::peak_memory;
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -181,6 +182,7 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
     Capture {
         name: "synthetic".into(),
         root: root.to_owned(),
+        elsewhere: BTreeSet::new(),
         kind: CaptureKind::Own,
         cameras: (0..pinned.views.len()).map(|i| Rig { name: format!("camera {i}"), fixed: true }).collect(),
         named: true,

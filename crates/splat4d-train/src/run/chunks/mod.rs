@@ -198,7 +198,7 @@ impl Chunked {
     }
 
     /// The parts that must be there before this one begins, of those that are not.
-    fn waits_for(&self, part: Part) -> Vec<Part> {
+    pub fn waits_for(&self, part: Part) -> Vec<Part> {
         let needs = match part {
             Part::Shared => Vec::new(),
             Part::Chunk(c) => std::iter::once(Part::Shared).chain(self.neighbours(c).map(Part::Chunk)).collect(),
