@@ -14,7 +14,7 @@ pub(crate) fn command(arguments: &[String]) -> Result<()> {
         [flag, rest @ ..] if flag == "--check" => {
             let count = match rest {
                 [] => 3,
-                [n] => n.parse().with_context(|| format!("{n} is not a number of pictures"))?,
+                [n] => n.parse().with_context(|| format!("{n} is not a number of images"))?,
                 _ => bail!("capture --check takes one number"),
             };
             let clock = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH)?.subsec_nanos();
