@@ -7,6 +7,7 @@
 //! taken over: a clock that jumps makes no owner dead.
 
 use super::date::rfc3339;
+use super::write::check_plain;
 use super::{STATE, cannot_write, temporary};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
@@ -111,8 +112,8 @@ impl Owner {
         let record = state.join(RECORD);
         let lock = loop {
             std::fs::create_dir_all(&state).map_err(fail)?;
-            write::check_plain(&state.join(LOCK))?;
-            write::check_plain(&record)?;
+            check_plain(&state.join(LOCK))?;
+            check_plain(&record)?;
             let opened = File::options().read(true).write(true).create(true).truncate(false).open(state.join(LOCK));
             let lock = match opened {
                 // Its owner has just removed the state of a folder in which nothing was begun.
@@ -188,7 +189,7 @@ impl Owner {
     /// Who has the folder now, without a trace in it; the inner `None`: somebody whose record cannot be read.
     pub fn holder(folder: &Path) -> Option<Option<Standing>> {
         let (record, lock) = (folder.join(STATE).join(RECORD), folder.join(STATE).join(LOCK));
-        write::check_plain(&lock).ok()?;
+        check_plain(&lock).ok()?;
         let lock = File::open(lock).ok()?;
         if let Err(TryLockError::WouldBlock) = lock.try_lock_shared() {
             return Some(Standing::read(&record));
