@@ -8,6 +8,7 @@ use crate::sfm::lens::Known;
 use crate::sfm::pictures::Pictures as _;
 use crate::{Error, Result};
 use rayon::prelude::*;
+use splat4d::math::median;
 use splat4d::math::se3::{add, cross, dot, norm, normalize, scale, sub};
 use splat4d::scene::Camera;
 use splat4d_train::event::Progress;
@@ -221,11 +222,6 @@ impl Placed {
     }
 }
 
-fn median(mut v: Vec<f64>) -> Option<f64> {
-    let half = v.len() / 2;
-    (!v.is_empty()).then(|| *v.select_nth_unstable_by(half, f64::total_cmp).1)
-}
-
 /// What placed tags tell.
 fn of(board: &Board, placed: &[Placed], held: [f64; 3]) -> Result<Found> {
     let contradicts = |what: String| {
@@ -235,10 +231,11 @@ fn of(board: &Board, placed: &[Placed], held: [f64; 3]) -> Result<Found> {
         )
     };
     let square: Vec<(&Placed, f64)> = placed.iter().filter_map(|p| Some((p, p.side()?))).collect();
-    let Some(side) = median(square.iter().map(|s| s.1).collect()) else {
+    let Some(side) = median(&mut square.iter().map(|s| s.1).collect::<Vec<_>>()) else {
         return Err(contradicts(format!("{} tags were placed, but none as a square", placed.len())));
     };
-    let spread = median(square.iter().map(|s| (s.1 / side - 1.0).abs()).collect()).expect("there are some");
+    let spread =
+        median(&mut square.iter().map(|s| (s.1 / side - 1.0).abs()).collect::<Vec<_>>()).expect("there are some");
     if spread > UNLIKE {
         return Err(contradicts(format!(
             "the tags' sizes contradict each other: the median one is {:.0} % off",
@@ -259,7 +256,7 @@ fn of(board: &Board, placed: &[Placed], held: [f64; 3]) -> Result<Found> {
         }
         let middles: Vec<[f64; 3]> = square.iter().filter(|s| s.0.id == ids[0]).map(|s| s.0.middle()).collect();
         let origin = std::array::from_fn(|k| {
-            scale * median(middles.iter().map(|m| m[k]).collect()).expect("the tag was placed")
+            scale * median(&mut middles.iter().map(|m| m[k]).collect::<Vec<_>>()).expect("the tag was placed")
         });
         Ok((mean(&near), origin))
     });

@@ -7,7 +7,6 @@
 //! has another exposure. What does not fit the scene much better than one plain colour would is refused ([`Located::is_sure`]).
 
 use crate::Result;
-use crate::capture::frames::halve;
 use crate::learner::moved;
 use splat4d::device;
 use splat4d::layers::{Evaluation, Scene};
@@ -336,7 +335,7 @@ fn response(x: &[f32], y: &[f32]) -> (f32, f32) {
 fn shrunk(picture: &Planes<f32>, side: usize) -> (Planes<f32>, usize) {
     let (mut out, mut times) = (picture.clone(), 1);
     while out.width.max(out.height) > side && out.width.min(out.height) > 1 {
-        halve(&mut out);
+        out.halve();
         times *= 2;
     }
     (out, times)

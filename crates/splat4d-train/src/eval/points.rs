@@ -7,11 +7,12 @@
 //! with it; else every point in the picture counts.
 
 use crate::capture::Capture;
-use crate::eval::tracks::{Truth, median};
+use crate::eval::tracks::Truth;
 use crate::{Error, Result};
 use splat4d::flow::query::{Place, Query, follow, sights};
 use splat4d::format::npy::Npy;
 use splat4d::layers::Scene;
+use splat4d::math::median;
 use splat4d::math::se3::{norm, sub};
 use splat4d::scene::{Camera, Time};
 

@@ -5,7 +5,7 @@
 //! weighs pixels here: w = 1 + k·⅓ Σ_c ψ(I_c − median_c), ψ(x) = x²/(x² + γ²).
 
 use crate::Result;
-use crate::capture::frames::{Frames, Picture, halve};
+use crate::capture::frames::{Frames, Picture};
 use crate::vision::view::{self, Rigs};
 use rayon::prelude::*;
 use splat4d::scene::Planes;
@@ -54,7 +54,7 @@ impl Emphasis {
             0 => &picture.color,
             _ => {
                 small = picture.color.clone();
-                (0..halvings).for_each(|_| halve(&mut small));
+                (0..halvings).for_each(|_| small.halve());
                 &small
             }
         };

@@ -5,6 +5,7 @@ use super::raster::{blurred, grey};
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};
 use rayon::prelude::*;
+use splat4d::math::median_by;
 use splat4d::scene::{Camera, Planes};
 use std::collections::BTreeMap;
 
@@ -189,8 +190,7 @@ fn median(frames: &dyn Frames, rig: &[usize]) -> Result<View> {
         sorted.clear();
         sorted.push(*value);
         sorted.extend(values.iter().map(|v| v[p]));
-        let middle = sorted.len() / 2;
-        *value = *sorted.select_nth_unstable_by(middle, f32::total_cmp).1;
+        *value = median_by(&mut sorted, f32::total_cmp).expect("the first is there");
     }
     Ok(View::new(camera, &first.color, wanted))
 }
