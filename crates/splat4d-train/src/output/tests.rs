@@ -251,7 +251,7 @@ fn a_sequence_does_not_take_over_the_tail_of_another() {
     let folder = work.path().join("frames");
     let is = |n: &OsStr| n.to_string_lossy().starts_with("frame_");
     let written = |count: usize| move |n: &OsStr| (0..count).any(|i| n.to_string_lossy() == format!("frame_{i}.ply"));
-    let export = |count: usize, force: bool, fails: bool| -> crate::Result<()> {
+    let export = |count: usize, force: bool, fails: bool| -> Result<()> {
         let written = written(count);
         let mixes = Mixes::Frames { is: &is, written: &written };
         let (out, _) = OutputFolder::begin(&folder, &Request { mixes, ..request("", force) })?;
