@@ -243,9 +243,14 @@ mod tests {
         });
         in_folder("x", b"", |folder| {
             let page = Page::new(crate::formats::moving(), &folder.join("list.toml")).unwrap();
-            // What is pulled must have been bent before.
-            for request in &requests()[..7] {
-                page.ask(&text(request)).unwrap_or_else(|e| panic!("{}: {e}", text(request)));
+            for request in requests() {
+                // All are understood, though not every one has something to do.
+                let error = page.ask(&text(&request)).err().map(|e| e.to_string()).unwrap_or_default();
+                assert!(
+                    !error.contains("the page asks") && !error.contains("invalid JSON"),
+                    "{}: {error}",
+                    text(&request)
+                );
             }
         });
     }

@@ -37,7 +37,7 @@ pub(crate) enum State {
     Training,
     /// It begins where other parts end that are not done.
     Waiting,
-    /// It was begun, and nobody has it.
+    /// It was begun, and no worker has it.
     Stopped,
     /// It can be begun.
     Open,
@@ -79,7 +79,7 @@ pub(crate) struct Status {
     /// With as many workers as there are now, at least one.
     seconds_left: Option<f64>,
     parts: Vec<PartStatus>,
-    /// Parts that were begun and that nobody works on.
+    /// Parts that were begun and that no worker has.
     failures: Vec<String>,
     /// What to type next.
     next: Option<String>,
@@ -206,7 +206,7 @@ impl PartStatus {
     }
 
     fn failure(&self) -> String {
-        format!("{} stopped at step {}, and nobody works on it", self.name(), grouped(self.iteration.unwrap_or(0)))
+        format!("{} stopped at step {}, and no worker has it", self.name(), grouped(self.iteration.unwrap_or(0)))
     }
 
     fn text(&self) -> String {
@@ -216,7 +216,7 @@ impl PartStatus {
             State::Done => "done".to_owned(),
             State::Training => format!("{step}, {}", self.worker.as_deref().unwrap_or_default()),
             State::Waiting => format!("waits for {}", self.waits_for.join(", ")),
-            State::Stopped => format!("stopped at {step}: nobody works on it"),
+            State::Stopped => format!("stopped at {step}: no worker has it"),
             State::Open => "not begun".to_owned(),
         };
         if let Some([from, to]) = self.frames {

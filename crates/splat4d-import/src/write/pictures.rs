@@ -329,9 +329,9 @@ fn clear(capture: &Path, folder: &Path, noted: bool) -> Result<()> {
     let noted = noted && !listed.iter().any(|file| file.starts_with(IMAGES));
     let ours = |path: &PathBuf| noted || path.strip_prefix(capture).is_ok_and(|file| listed.contains(file));
     if let Some(foreign) = there.iter().find(|path| !ours(path)) {
-        return Err(Error::input("there is no record that splat4d wrote this picture, which would be replaced")
+        return Err(Error::input("there is no record that splat4d wrote this image, which would be replaced")
             .at(foreign.display())
-            .remedy("Move the folder's pictures away, or give another folder with -o."));
+            .remedy("Move the folder's images away, or give another folder with -o."));
     }
     there.iter().try_for_each(|path| remove(path))
 }

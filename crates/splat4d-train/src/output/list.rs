@@ -3,8 +3,7 @@
 //! A file's line is written before the file gets its name, so that the list never misses one. Lines that end with a slash are
 //! folders in which files were written; half-written files are looked for there.
 
-use super::write::check_plain;
-use super::{STATE, cannot_write};
+use super::{STATE, cannot_write, check_plain};
 use crate::Result;
 use crate::path_text::{escaped, of_escaped};
 use std::collections::BTreeSet;

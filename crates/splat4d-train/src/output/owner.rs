@@ -7,8 +7,7 @@
 //! taken over: a clock that jumps makes no owner dead.
 
 use super::date::rfc3339;
-use super::write::check_plain;
-use super::{STATE, cannot_write, temporary};
+use super::{STATE, cannot_write, check_plain, temporary};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::fs::{File, TryLockError};

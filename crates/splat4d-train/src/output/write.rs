@@ -7,16 +7,6 @@ use crate::{Error, Result};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-/// Refuses a link, folder, pipe or device in the place of a file of an output folder's state: it would lead elsewhere, or wait.
-pub(super) fn check_plain(path: &Path) -> Result<()> {
-    match std::fs::symlink_metadata(path) {
-        Ok(there) if !there.is_file() => Err(Error::input("is not a regular file, but a link, folder, pipe or device")
-            .at(path.display())
-            .remedy("Remove it: splat4d keeps a file of its own there")),
-        _ => Ok(()),
-    }
-}
-
 /// A file under a temporary name beside its place; [`keep`](Self::keep) renames it, dropping it removes it.
 #[derive(Debug)]
 pub struct Staged {
