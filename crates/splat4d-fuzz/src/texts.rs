@@ -247,7 +247,7 @@ mod tests {
                 // All are understood, though not every one has something to do.
                 let error = page.ask(&text(&request)).err().map(|e| e.to_string()).unwrap_or_default();
                 assert!(
-                    !error.contains("the page asks") && !error.contains("invalid JSON"),
+                    !error.contains("unknown request") && !error.contains("invalid JSON"),
                     "{}: {error}",
                     text(&request)
                 );
