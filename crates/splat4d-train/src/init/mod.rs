@@ -10,6 +10,7 @@ pub(crate) mod volume;
 use crate::capture::PointCloud;
 use crate::capture::frames::Frames;
 use crate::methods::{Beginning, Plan, Program};
+use crate::recipe::Recipe;
 use crate::settings::{Value, among, settings};
 use crate::{Error, Result};
 use splat4d::layers::{Head, Layer, Scene};
@@ -98,9 +99,10 @@ settings! {
         /// Source of initial Gaussians: `auto`, `points`, `pictures` (found in the images), `hull`, `random`, or a .ply
         /// file.
         source: Source = Source::Auto;
-        /// Number of initial Gaussians. If a capture has fewer points, more are placed between them along surfaces;
-        /// hulls of masks and of dynamic regions, and random points, add as many.
-        count: usize = 10_000 => any().when(IsNot("init.source", &["points"]));
+        /// Number of initial Gaussians; 0: 10,000, and more in proportion for static scenes of more than 30,000 Gaussians. If
+        /// a capture has fewer points, more are placed between them along surfaces; hulls of masks and of dynamic regions,
+        /// and random points, add as many.
+        count: usize = 0 => any().when(IsNot("init.source", &["points"]));
         /// Initial opacity.
         opacity: f64 = 0.1 => inside_share();
         /// Number of times at which initial points are placed over the clip; 0: about every 5 frames.
@@ -109,6 +111,18 @@ settings! {
         /// the coverage of dynamic regions.
         life: f64 = 0.0
             => any().unit("clips").when(Any(&[Is("run.motion", &["spacetime", "native4d"]), Is("life.kind", &["gauss-half", "gauss-one", "interval"])]));
+    }
+}
+
+/// Initial Gaussians where [`InitSettings::count`] is 0: what small captures are tuned for (docs/suite.md). A static scene
+/// of many Gaussians has a third of them at once: a real room at half size gains 0.3 dB by half of them in the same steps, at an
+/// eighth more time (studies/records/2026-11-27-real-size.md).
+const COUNT: usize = 10_000;
+
+impl InitSettings {
+    /// The number of initial Gaussians of a recipe; without its largest number of Gaussians, the least that it becomes.
+    pub(crate) fn number(r: &Recipe) -> usize {
+        if r.init.count == 0 { (r.crowd() * COUNT as f64) as usize } else { r.init.count }
     }
 }
 
@@ -191,7 +205,7 @@ pub(crate) fn keyframes(plan: &Plan) -> Vec<f64> {
 /// Chooses initial points as the recipe says. `points`: the capture's own.
 pub fn seeds(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>, moving: bool) -> Result<Seeds> {
     let r = &plan.recipe;
-    let rng = Rng::new(r.run.seed, "init", 0);
+    let (rng, count) = (Rng::new(r.run.seed, "init", 0), InitSettings::number(r));
     let volume = volume::common(frames);
     let times = if moving { keyframes(plan) } else { vec![0.5 * (plan.clip[0] + plan.clip[1])] };
     let have_points = points.as_ref().is_some_and(|p| !p.is_empty());
@@ -214,7 +228,7 @@ pub fn seeds(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>, moving: bo
     let use_hull =
         frames.has_masks() && matches!(r.init.source, Source::Auto | Source::Hull) && (moving || !have_points);
     let seen = match r.init.source {
-        Source::Auto if frames.has_depth() => depth::points(frames, r.init.count, moving, rng.fork(4))?,
+        Source::Auto if frames.has_depth() => depth::points(frames, count, moving, rng.fork(4))?,
         _ => Seeds::default(),
     };
     let have_depth = !seen.is_empty();
@@ -222,21 +236,21 @@ pub fn seeds(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>, moving: bo
     if have_points && !matches!(r.init.source, Source::Random | Source::Hull) {
         out.append(points.expect("just seen"));
         let filled = matches!(r.init.source, Source::Auto | Source::Pictures);
-        if filled && !have_depth && out.len() < r.init.count {
+        if filled && !have_depth && out.len() < count {
             // Surfaces that move are elsewhere at other times.
             let still = (0..out.len()).filter(|&i| out.times[i].is_none());
             let known: Vec<[f64; 3]> = still.map(|i| out.points[i]).collect();
-            out.append(fill::between(frames, &known, r.init.count - out.len())?);
+            out.append(fill::between(frames, &known, count - out.len())?);
         }
     }
     if have_depth {
         // What a map shows no hull knows better.
     } else if use_hull {
-        out.append(hull::carve(frames, &volume, &times, r.init.count, moving, rng.fork(1))?);
+        out.append(hull::carve(frames, &volume, &times, count, moving, rng.fork(1))?);
     } else if r.init.source == Source::Auto && have_points && moving {
-        out.append(hull::carve_moving(frames, &volume, &times, r.init.count, rng.fork(1))?);
+        out.append(hull::carve_moving(frames, &volume, &times, count, rng.fork(1))?);
     } else if r.init.source == Source::Random || !have_points {
-        out.append(volume::random(frames, &volume, r.init.count, moving.then_some(plan.clip), rng.fork(2)));
+        out.append(volume::random(frames, &volume, count, moving.then_some(plan.clip), rng.fork(2)));
     }
     out.truncate_evenly(r.densify.max_cap, rng.fork(3));
     Ok(out)
@@ -348,6 +362,15 @@ mod tests {
     use splat4d::scene::{Rows, Space, Time};
 
     /// What is far is as wide as its neighbours are apart, as seen from the cameras, and not a speck.
+    #[test]
+    fn static_scenes_of_many_gaussians_begin_with_a_third_of_them() {
+        let of = |words: &[&str]| InitSettings::number(&Recipe::of(words).unwrap().resolve());
+        assert_eq!(of(&["motion=still", "max_cap=150000"]), 50_000);
+        assert_eq!(of(&["motion=still"]), COUNT, "small captures are tuned for as many");
+        assert_eq!(of(&["motion=spacetime", "max_cap=150000"]), COUNT);
+        assert_eq!(of(&["motion=still", "max_cap=150000", "init.count=700"]), 700);
+    }
+
     #[test]
     fn first_sizes_are_bounded_by_the_distance_from_the_cameras() {
         let plan = Plan { extent: 2.0, center: [0.0, 0.0, -1.0], ..Plan::default() };

@@ -7,7 +7,7 @@ use super::open::{OpenCapture, training_frames};
 use crate::Result;
 use crate::capture::{Capture, PointCloud, read_points};
 use crate::event::{Event, Progress};
-use crate::init::{self, Source};
+use crate::init::{self, InitSettings, Source};
 use crate::methods::{Plan, program_of};
 use crate::recipe::Recipe;
 use crate::vision;
@@ -41,7 +41,7 @@ pub(super) fn complete(
         return Ok(opened);
     }
     let moments = moments(&plan)?;
-    let count = (WANTED * recipe.init.count as f64) as usize;
+    let count = (WANTED * InitSettings::number(recipe) as f64) as usize;
     let mark = format!("comment of {} {} {count} {moments:?}", fingerprint(capture), env!("CARGO_PKG_VERSION"));
     let kept =
         crate::files::read(&run.join(FILE)).is_ok_and(|bytes| bytes.windows(mark.len()).any(|w| w == mark.as_bytes()));
@@ -77,7 +77,7 @@ fn wanted(capture: &Capture, recipe: &Recipe) -> bool {
         Source::Pictures => true,
         // Objects that are cut out of their background are carved from their masks; depth maps show all that there is.
         Source::Auto if capture.background.is_some() => false,
-        Source::Auto if (own.len() as f64) < FEW * recipe.init.count as f64 => true,
+        Source::Auto if (own.len() as f64) < FEW * InitSettings::number(recipe) as f64 => true,
         Source::Auto => !capture.frames.iter().any(|f| f.depth.is_some()) && bare(capture, own) > BARE,
         _ => false,
     }

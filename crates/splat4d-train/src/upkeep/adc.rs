@@ -43,8 +43,9 @@ settings! {
         retime_clones: bool = false;
         /// Mean 2D gradient above which a Gaussian is cloned or split (NDC units).
         grad_threshold: f64 = 2e-4;
-        /// Gaussians larger than this share of the extent are split, smaller ones cloned.
-        percent_dense: f64 = 0.01 => any().unit("extents");
+        /// Gaussians larger than this share of the extent are split, smaller ones cloned; 0: 0.01, and less in proportion
+        /// for static scenes of more than 30,000 Gaussians.
+        percent_dense: f64 = 0.0 => any().unit("extents");
         /// Share of densification after which the cap may be reached: the number of Gaussians grows along a parabola
         /// (Mallick et al. 2024), largest gradients first; 0: no limit before the cap.
         full_at: f64 = 0.5 => share();
@@ -52,6 +53,12 @@ settings! {
         split_in_time: f64 = 1.0 => any().unit("own sizes");
     }
 }
+
+/// [`AdcSettings::percent_dense`] where it is 0, for few Gaussians (Kerbl et al. 2023).
+const DENSE: f64 = 0.01;
+/// The lowest that it becomes with many (Ren et al. 2026, FastGS). More Gaussians are smaller, and one that is large among them
+/// blurs what a copy in its place blurs as well (studies/records/2026-11-27-real-size.md).
+const FINEST: f64 = 1e-3;
 
 /// Adaptive density control (Kerbl et al. 2023).
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -107,7 +114,11 @@ impl Adc {
 
     /// As a recipe has it; `None`: another strategy.
     pub(crate) fn of(r: &Recipe) -> Option<Self> {
-        let some = || Self { settings: r.adc, steps: r.densify.steps() };
+        let percent_dense = match r.adc.percent_dense {
+            0.0 => (DENSE / r.crowd()).max(FINEST),
+            stated => stated,
+        };
+        let some = || Self { settings: AdcSettings { percent_dense, ..r.adc }, steps: r.densify.steps() };
         (r.densify.strategy == Strategy::Adc).then(some)
     }
 }
@@ -228,6 +239,17 @@ mod tests {
         let mut adc = Adc { settings, steps: Every::NEVER };
         let change = adc.run(&mut learner, &context(limits, 1, 0)).unwrap();
         (change, learner.into_scene())
+    }
+
+    #[test]
+    fn the_size_that_splits_falls_with_the_number_of_gaussians() {
+        let of = |words: &[&str]| Adc::of(&Recipe::of(words).unwrap().resolve()).unwrap().settings.percent_dense;
+        let near = |a: f64, b: f64| (a - b).abs() < 1e-12;
+        assert!(near(of(&["motion=still"]), 0.01) && near(of(&["motion=still", "max_cap=100"]), 0.01));
+        assert!(near(of(&["motion=still", "max_cap=150000"]), 0.002));
+        assert!(near(of(&["motion=still", "max_cap=5000000"]), 0.001), "not without end");
+        assert!(near(of(&["motion=spacetime", "max_cap=150000"]), 0.01));
+        assert!(near(of(&["motion=still", "max_cap=150000", "adc.percent_dense=0.03"]), 0.03));
     }
 
     #[test]
