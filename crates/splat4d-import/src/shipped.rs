@@ -5,6 +5,7 @@ use crate::video::{self, Info, Selection, Source};
 use crate::write::{self, Clip, Format};
 use splat4d::format::npy::Npy;
 use splat4d::{Error, ErrorKind, Result};
+use splat4d_train::capture::{about_rows, rows_of};
 use splat4d_train::event::Progress;
 use std::path::{Path, PathBuf};
 
@@ -27,8 +28,6 @@ pub struct Extracted {
     pub frames: usize,
     /// Pixels across and down.
     pub size: [usize; 2],
-    /// Frames a second of the first video, where its file states them.
-    pub rate: Option<f64>,
     /// What was odd, a sentence or two each.
     pub warnings: Vec<String>,
 }
@@ -72,6 +71,8 @@ pub fn extract(root: &Path, progress: &mut Progress<'_>, stop: &dyn Fn() -> bool
     check_poses(&root.join(POSES), &videos)?;
     // Poses state no frame rate; folders are not among the videos.
     let sources = videos.iter().map(|path| video::open(path, 1.0)).collect::<Result<Vec<Box<dyn Source>>>>()?;
+    let infos: Vec<&Info> = sources.iter().map(|s| s.info()).collect();
+    check_rates(&videos, &infos)?;
     let clips: Vec<Clip<'_>> = videos
         .iter()
         .zip(&sources)
@@ -94,7 +95,6 @@ pub fn extract(root: &Path, progress: &mut Progress<'_>, stop: &dyn Fn() -> bool
         cameras: pictures.len(),
         frames: pictures.iter().map(|p| p.shots.len()).sum(),
         size: pictures[0].size,
-        rate: sources[0].info().average_rate,
         warnings,
     }))
 }
@@ -105,17 +105,106 @@ fn side(info: &Info) -> usize {
     own / own.div_ceil(SIDE).max(1)
 }
 
-/// Extraction takes minutes: poses of another number of cameras are told before.
-fn check_poses(path: &Path, videos: &[PathBuf]) -> Result<()> {
+/// Extraction takes minutes: poses of another number of cameras are told before. Returns how many there are.
+fn check_poses(path: &Path, videos: &[PathBuf]) -> Result<usize> {
     let bytes = splat4d_train::files::read(path)?;
     let rows = Npy::read(&bytes).map_err(|e| e.at(path.display()))?.shape.first().copied().unwrap_or(0);
-    if rows == videos.len() {
-        return Ok(());
+    let names: Vec<String> = videos.iter().map(|v| stem(v)).collect();
+    if rows_of(&names, rows).is_some() {
+        return Ok(rows);
     }
     let what = format!("it has {rows} cameras, but there are {} videos", videos.len());
     Err(Error::input(what).at(path.display()).remedy(
-        "Keep exactly the videos that the poses are of, in the order of their names (cam00.mp4, cam01.mp4, …).",
+        "Keep exactly the videos that the poses are of, in the order of their names (cam00.mp4, cam01.mp4, …); where some are \
+         missing, names that number the rows from 0.",
     ))
+}
+
+/// Of a frame: videos whose rates differ by more over their length show other times under one frame number.
+const DRIFT: f64 = 0.5;
+
+/// Errors: videos of different rates, whose frames with one number are not of one time.
+fn check_rates(videos: &[PathBuf], infos: &[&Info]) -> Result<()> {
+    let rates: Vec<Option<f64>> = infos.iter().map(|i| i.average_rate.or(i.nominal_rate)).collect();
+    let Some((first, of_first)) = rates.iter().zip(videos).find_map(|(r, v)| Some(((*r)?, v))) else { return Ok(()) };
+    for ((rate, video), info) in rates.iter().zip(videos).zip(infos) {
+        let Some(rate) = *rate else { continue };
+        let frames = frames_of(info).unwrap_or(1) as f64;
+        if (rate / first - 1.0).abs() * frames > DRIFT {
+            let what = format!(
+                "the videos have different frame rates ({first:.3} frames a second of {}, {rate:.3} of this one), and poses_bounds.npy \
+                 states no clocks",
+                stem(of_first)
+            );
+            let remedy = format!(
+                "Convert it to the rate of the others, for example with `ffmpeg -i {0}.mp4 -r {first:.3} {0}-new.mp4`.",
+                stem(video)
+            );
+            return Err(Error::input(what).at(video.display()).remedy(remedy));
+        }
+    }
+    Ok(())
+}
+
+/// Frames of a video, as its file states them or by its length.
+fn frames_of(info: &Info) -> Option<usize> {
+    info.frames.or_else(|| Some((info.duration? * info.average_rate.or(info.nominal_rate)?).round() as usize))
+}
+
+/// What such a capture holds before its frames are extracted.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Contents {
+    /// Names of the cameras, and frames of each, where its file states them.
+    pub cameras: Vec<(String, Option<usize>)>,
+    /// Pixels across and down, of each size.
+    pub sizes: Vec<[usize; 2]>,
+    /// Pixels across and down of the frames that are extracted from the first video.
+    pub extracted: [usize; 2],
+    /// Frames a second, where files state them.
+    pub rate: Option<f64>,
+    /// Seconds of the longest, where files state them.
+    pub seconds: Option<f64>,
+    /// What is odd, a sentence or two each; those that spoil the result first.
+    pub warnings: Vec<String>,
+}
+
+/// What such a capture holds; `None`: it is no such capture. Errors: as [`extract`], but of space.
+pub fn contents(root: &Path) -> Result<Option<Contents>> {
+    let videos = videos(root);
+    if videos.is_empty() {
+        return Ok(None);
+    }
+    let rows = check_poses(&root.join(POSES), &videos)?;
+    let sources = videos.iter().map(|path| video::open(path, 1.0)).collect::<Result<Vec<Box<dyn Source>>>>()?;
+    let infos: Vec<&Info> = sources.iter().map(|s| s.info()).collect();
+    check_rates(&videos, &infos)?;
+    let names: Vec<String> = videos.iter().map(|v| stem(v)).collect();
+    let which = rows_of(&names, rows).unwrap_or_default();
+    let mut out = Contents {
+        cameras: names.iter().cloned().zip(infos.iter().map(|i| frames_of(i))).collect(),
+        rate: infos[0].average_rate.or(infos[0].nominal_rate),
+        seconds: infos.iter().filter_map(|i| i.duration).max_by(f64::total_cmp),
+        warnings: about_rows(&names, &which, rows).into_iter().map(|(_, what)| what).collect(),
+        extracted: Selection { size: Some(side(infos[0])), ..Selection::default() }.scaled(infos[0].size),
+        ..Contents::default()
+    };
+    for info in &infos {
+        if !out.sizes.contains(&info.size) {
+            out.sizes.push(info.size);
+        }
+        out.warnings.extend(info.warnings.iter().map(|w| format!("{}: {w}", info.name)));
+    }
+    let longest = out.cameras.iter().filter_map(|(_, n)| *n).max().unwrap_or(0);
+    let short = |(name, n): &(String, Option<usize>)| n.filter(|n| *n < longest).map(|n| format!("{name} ({n})"));
+    let short: Vec<String> = out.cameras.iter().filter_map(short).collect();
+    if !short.is_empty() {
+        out.warnings.push(format!(
+            "Videos are not equally long ({longest} frames at most): {}. Frames are counted from the beginning of each: if these did \
+             not begin with the others, cut the others.",
+            short.join(", ")
+        ));
+    }
+    Ok(Some(out))
 }
 
 #[cfg(test)]
@@ -143,18 +232,61 @@ mod tests {
         let few = extract(root, &mut progress, &|| false).unwrap_err().to_string();
         assert!(few.contains("2 cameras") && few.contains("1 videos"), "{few}");
         assert!(make("cam01.mp4"));
+        let seen = contents(root).unwrap().unwrap();
+        assert_eq!(seen.cameras, [("cam00".to_owned(), Some(5)), ("cam01".to_owned(), Some(5))]);
+        assert_eq!(
+            (seen.sizes, seen.extracted, seen.rate, seen.warnings.len()),
+            (vec![[64, 48]], [64, 48], Some(10.0), 0)
+        );
         let stopped = extract(root, &mut progress, &|| true);
         assert!(stopped.is_err_and(|e| e.kind() == ErrorKind::Interrupted));
         let found = extract(root, &mut progress, &|| false).unwrap().unwrap();
-        assert_eq!((found.cameras, found.frames, found.size, found.rate), (2, 10, [64, 48], Some(10.0)));
+        assert_eq!((found.cameras, found.frames, found.size), (2, 10, [64, 48]));
         let frame = root.join("images/cam01/000004.jpg");
         let written = std::fs::metadata(&frame).unwrap().modified().unwrap();
         std::fs::remove_file(root.join("images/cam00/000002.jpg")).unwrap();
         assert_eq!(extract(root, &mut progress, &|| false).unwrap().unwrap(), found);
         assert!(root.join("images/cam00/000002.jpg").is_file());
         assert_eq!(std::fs::metadata(&frame).unwrap().modified().unwrap(), written, "what was there is left");
+        let note: serde_json::Value =
+            serde_json::from_slice(&std::fs::read(root.join("import/cam00.json")).unwrap()).unwrap();
+        assert!((note["interval"].as_f64().unwrap() - 0.1).abs() < 1e-6, "the capture's reader finds its rate there");
         // Frames of another program are the capture's own.
         std::fs::remove_dir_all(root.join(NOTES)).unwrap();
         assert!(extract(root, &mut progress, &|| false).unwrap().is_none());
+    }
+
+    #[test]
+    fn videos_of_other_rates_and_lengths_are_named() {
+        let video = |rate: f64, frames: usize| Info {
+            name: "x".into(),
+            size: [64, 48],
+            stored: [64, 48],
+            rotation: 0,
+            nominal_rate: Some(rate),
+            average_rate: Some(rate),
+            time_base: None,
+            duration: Some(frames as f64 / rate),
+            frames: Some(frames),
+            codec: "mpeg4".into(),
+            pixels: "yuv420p".into(),
+            interlaced: false,
+            color: video::Color {
+                matrix: None,
+                tagged: false,
+                range: video::Range::Full,
+                transfer: video::Transfer::Standard,
+            },
+            sound: false,
+            alpha: false,
+            warnings: Vec::new(),
+        };
+        let videos = ["cam00.mp4", "cam01.mp4"].map(PathBuf::from);
+        let check = |a: f64, b: f64| check_rates(&videos, &[&video(a, 300), &video(b, 300)]);
+        assert!(check(30.0, 30.0).is_ok() && check(29.97, 29.9701).is_ok());
+        let message = check(30.0, 15.0).unwrap_err().to_string();
+        assert!(message.contains("different frame rates") && message.contains("cam01"), "{message}");
+        assert!(check(30.0, 29.97).is_ok(), "a third of a frame after 10 s");
+        assert!(check(30.0, 29.9).is_err(), "a frame after 10 s");
     }
 }

@@ -17,6 +17,7 @@ use splat4d::math::sh::degree_of;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, SH};
 use splat4d::text::in_line;
+use splat4d_import::shipped;
 use splat4d_train::capture::{self, Aspect, Capture, Finding, Frame, Reach, Severity, Timing};
 use splat4d_train::event::Event;
 use splat4d_train::output::check_apart;
@@ -157,6 +158,9 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
     for assignment in &args.set {
         recipe.set(assignment).map_err(|e| e.at("--set"))?;
     }
+    if let Some(found) = shipped::contents(path)? {
+        return Ok(of_shipped(path, &found));
+    }
     // What lies beside pictures is told also where this recipe would not look at it.
     let all = recipe.clone().with(|r| (r.loss.depth, r.loss.flow, r.loss.tracks) = (1.0, 1.0, 1.0));
     let mut capture = open_capture(path, &all)?;
@@ -183,6 +187,7 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
     let written_as = checked.written_as.map(|p| p.to_string());
     let mut findings = capture.preflight();
     findings.push(checked.finding);
+    findings.extend(checked.more);
     let fixed = capture.cameras.iter().filter(|c| c.fixed).count();
     let moving = capture.cameras.len() - fixed;
     let held: Vec<String> = held_cameras(&capture);
@@ -263,6 +268,59 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
             "about": f.aspect.map(Aspect::name), "what": f.what, "remedy": f.remedy})).collect::<Vec<_>>(),
     });
     Ok(Told { json, text, troubles, listed })
+}
+
+/// A capture that is shipped as a video per camera with poses, whose frames are not extracted yet.
+fn of_shipped(path: &Path, found: &shipped::Contents) -> Told {
+    let name = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
+    let name = name.file_name().map_or_else(|| "capture".into(), |n| n.to_string_lossy().into_owned());
+    let frames: Option<usize> = found.cameras.iter().map(|(_, n)| *n).sum();
+    let mut text = String::new();
+    line(
+        &mut text,
+        "capture",
+        &format!("{name} (Neural 3D Video as shipped: a video per camera, and poses_bounds.npy)"),
+    );
+    let names: Vec<&str> = found.cameras.iter().map(|(name, _)| name.as_str()).collect();
+    line(&mut text, "cameras", &format!("{} fixed ({})", names.len(), in_short(&names)));
+    let sizes: Vec<String> = found.sizes.iter().map(|[w, h]| format!("{w}x{h}")).collect();
+    line(&mut text, "size", &sizes.join(", "));
+    let rate = found.rate.map_or("unknown".into(), |r| format!("{:.3}", r));
+    let seconds = found.seconds.map_or(String::new(), |s| format!("{s:.3} s, "));
+    line(&mut text, "time", &format!("{seconds}{rate} frames a second"));
+    line(&mut text, "frames", &frames.map_or("the files do not state how many".into(), grouped));
+    let [width, height] = found.extracted;
+    let extracts = format!(
+        "Frames are still in the videos: `splat4d train {}` extracts them to {} ({width}x{height}) and trains.",
+        in_command(path),
+        path.join("images").display()
+    );
+    line(&mut text, "note", &extracts);
+    let unchecked = "Poses and images: frames are not extracted yet; run info again after that.";
+    line(&mut text, Aspect::NotChecked.name(), unchecked);
+    let findings =
+        found.warnings.iter().map(|what| json!({"severity": "warning", "about": null, "what": what, "remedy": ""}));
+    let notes = [
+        json!({"severity": "note", "about": null, "what": extracts, "remedy": ""}),
+        json!({"severity": "note", "about": Aspect::NotChecked.name(), "what": unchecked, "remedy": ""}),
+    ];
+    let json = json!({
+        "type": "capture", "name": name, "layout": "N3dv", "extracted": false,
+        "fixed_cameras": names.len(), "moving_cameras": 0, "pictures": frames, "sizes": found.sizes,
+        "moments": found.cameras.iter().filter_map(|(_, n)| *n).max(), "fps": found.rate, "cameras": names,
+        "findings": findings.chain(notes).collect::<Vec<_>>(),
+    });
+    Told { json, text, troubles: found.warnings.clone(), listed: Vec::new() }
+}
+
+/// The first and the last name of a list, and those between where there are few.
+fn in_short(names: &[&str]) -> String {
+    /// Names that are listed.
+    const LISTED: usize = 6;
+    match names {
+        [first, .., last] if names.len() > LISTED => format!("{first} to {last}"),
+        _ => names.join(", "),
+    }
 }
 
 /// What lies beside the pictures, in words.

@@ -9,10 +9,9 @@ use crate::run_folder::{self, Asked, Run, cameras_json};
 use crate::serving::{self, Place, Watch};
 use crate::{finish, interrupt, labelling};
 use serde_json::json;
-use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::{Error, ErrorKind};
 use splat4d_import::shipped;
-use splat4d_train::capture::{Capture, Severity, Timing};
+use splat4d_train::capture::{Capture, Lenses, Severity, Timing};
 use splat4d_train::event::{Event, Progress};
 use splat4d_train::output::{Found, OutputFolder, Owner};
 use splat4d_train::path_text::in_command;
@@ -36,8 +35,6 @@ const TRAIN: &str = "train";
 const JOIN: &str = "join";
 /// What the first Ctrl-C is answered with in training.
 const SAVING: &str = "stopping: a checkpoint is being saved";
-/// Frame rates that differ by less are one: 29.97 and 30.
-const SAME_RATE: f64 = 0.01;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -230,11 +227,11 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         let typed = args.set.iter().filter_map(|a| Some(a.split_once('=')?.0));
         recipe.refuse_idle(typed).map_err(|e| e.at("--set"))?;
         if again.is_none() {
-            extract(&source, &recipe, &stop, console)?;
+            extract(&source, &stop, console)?;
         }
         console.phase("reading the capture", 0, 0);
         // Of a long take no more is listed than tells that it is one.
-        let capture = Arc::new(open_frames(&source, &recipe, look_ahead(&recipe))?);
+        let capture = Arc::new(open_frames(&source, &recipe, look_ahead(&recipe), &Lenses::default())?);
         let output = again.as_ref().map(|(run, _)| run).or(args.output.as_ref());
         let asked = Asked::of(&capture, &recipe, minutes, predict);
         let place = || place(args, output, &capture, &asked, console);
@@ -456,7 +453,7 @@ fn recipe(args: &Args) -> anyhow::Result<Recipe> {
 }
 
 /// Extracts the frames of a capture that is shipped as videos with poses.
-fn extract(source: &Path, recipe: &Recipe, stop: &AtomicBool, console: &Console) -> anyhow::Result<()> {
+fn extract(source: &Path, stop: &AtomicBool, console: &Console) -> anyhow::Result<()> {
     let root = if source.is_file() { source.parent().unwrap_or(Path::new(".")) } else { source };
     if shipped::videos(root).is_empty() {
         return Ok(());
@@ -466,10 +463,6 @@ fn extract(source: &Path, recipe: &Recipe, stop: &AtomicBool, console: &Console)
     console.clear();
     let Some(found) = found else { return Ok(()) };
     found.warnings.iter().for_each(|w| console.warn(w));
-    let told = recipe.capture.fps > 0.0;
-    if let Some(rate) = found.rate.filter(|r| !told && (r / DEFAULT_FPS - 1.0).abs() > SAME_RATE) {
-        console.warn(&format!("the videos have {rate:.2} frames per second: use --set capture.fps={rate:.2}."));
-    }
     console.say(&format!(
         "frames of {} videos are in {}: {} of {}x{}",
         found.cameras,
@@ -542,8 +535,8 @@ fn describe(capture: &Capture, memory: u64, console: &Console) {
         }
     ));
     console.detail(&format!("memory estimate: {}", human_bytes(memory)));
-    let poses = capture.check_poses().finding;
-    for finding in capture.preflight().into_iter().chain([poses]) {
+    let poses = capture.check_poses();
+    for finding in capture.preflight().into_iter().chain([poses.finding]).chain(poses.more) {
         let text = format!("{} {}", finding.what, finding.remedy).trim_end().to_owned();
         match finding.severity {
             Severity::Warning => console.warn(&text),

@@ -172,7 +172,9 @@ pub fn examine(capture: &Capture, options: &Options, progress: &mut Progress<'_>
     let poses = capture.check_poses();
     let misread = poses.written_as.is_some();
     let checked = |f: &splat4d_train::capture::Finding| f.severity == Severity::Warning;
-    for finding in capture.preflight().into_iter().chain([poses.finding].into_iter().filter(checked)) {
+    for finding in
+        capture.preflight().into_iter().chain(std::iter::once(poses.finding).chain(poses.more).filter(checked))
+    {
         let grade = if finding.severity == Severity::Warning { Grade::Warning } else { Grade::Note };
         report.findings.push(Finding {
             grade,

@@ -57,6 +57,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
     let (train, held, validation) = split(&mut take, &cameras, options).map_err(located)?;
     let up = take.up.map(normalize).filter(|u| norm(*u) > 0.0).unwrap_or_else(|| estimate_up(&take.frames));
     let flows = flows(&mut take.frames);
+    let firsts = std::mem::take(&mut take.firsts);
     let frames = take.frames.into_iter().zip(flows);
     let frames: Vec<Frame> = frames
         .zip(turned)
@@ -91,12 +92,13 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         downscale: options.downscale,
         convention: take.convention,
         poses: options.poses,
+        lenses: borders::Lenses::default(),
         account: take.account.remarks,
         warnings: take.warnings,
         notes: take.notes,
     };
     settle_orientation(&mut capture, &unsure);
-    borders::find(&mut capture, options);
+    borders::find(&mut capture, options, &firsts);
     for remark in &capture.account {
         let list = if remark.severity == Severity::Warning { &mut capture.warnings } else { &mut capture.notes };
         list.push(remark.what.clone());

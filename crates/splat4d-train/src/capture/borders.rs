@@ -6,6 +6,9 @@
 //! pixels. That alone would also find the black background of a photographed object. The content next to a border is what
 //! is anywhere in the scene, next to the object's outline it is the background again: so a border counts only if the
 //! images are mostly bright a few pixels further inside.
+//!
+//! What is looked at is the same for every part of a take: the first image of each fixed camera, and images of moving ones
+//! evenly. The parts of one run get what the first of them found ([`Lenses`]).
 
 use super::account::Severity;
 use super::account::{Aspect, Remark};
@@ -13,11 +16,14 @@ use super::options::Borders;
 use super::{Capture, CaptureOptions, Frame, panorama, picture};
 use rayon::prelude::*;
 use splat4d::scene::Lens;
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 /// Images of a lens that are looked at: content that is black by chance is black in all of them hardly ever.
 const LOOKED_AT: usize = 16;
+/// Pixels that are decoded of one lens at most, where that leaves [`FEWEST`] images: half a second of one core.
+const PIXELS: usize = 30_000_000;
 /// With fewer views of different places, what is black in all of them may be an object.
 const FEWEST: usize = 6;
 /// Lenses that are looked at, those with the most images first: it bounds the time.
@@ -38,18 +44,33 @@ const OF_AN_EDGE: f64 = 0.5;
 /// black.
 const LARGEST: f64 = 0.6;
 
-/// Finds the borders of a capture's images and gives them to its frames; says so in the account.
-pub(super) fn find(capture: &mut Capture, options: &CaptureOptions) {
+/// Images that are decoded at a time after the first: most lenses have no border, and one image says so.
+const AT_ONCE: usize = 4;
+
+/// A lens: size, orientation and intrinsics of its images, in hundredths of a pixel.
+type Lens100 = Vec<i64>;
+
+/// What the lenses of a take recorded, as far as they were looked at.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Lenses(BTreeMap<Lens100, Option<Arc<Vec<u8>>>>);
+
+/// Finds the borders of a capture's images and gives them to its frames; says so in the account. `firsts`: the first image of
+/// cameras of which only a part of the frames is listed.
+pub(super) fn find(capture: &mut Capture, options: &CaptureOptions, firsts: &BTreeMap<usize, PathBuf>) {
     if options.borders == Borders::Keep {
         return;
     }
     let (mut images, mut share) = (0, 0.0);
-    for frames in by_lens(capture).into_iter().take(LENSES) {
-        let Some(recorded) = recorded(capture, &views(capture, &frames)) else { continue };
+    for (lens, frames) in by_lens(capture).into_iter().take(LENSES) {
+        let found = match options.lenses.0.get(&lens) {
+            Some(known) => known.clone(),
+            None => recorded(&views(capture, &frames, firsts)).map(Arc::new),
+        };
+        capture.lenses.0.insert(lens, found.clone());
+        let Some(recorded) = found else { continue };
         let black = recorded.iter().filter(|p| **p == 0).count() as f64 / recorded.len() as f64;
         images += frames.len();
         share += black * frames.len() as f64;
-        let recorded = Arc::new(recorded);
         frames.iter().for_each(|&i| capture.frames[i].recorded = Some(Arc::clone(&recorded)));
     }
     if images > 0 {
@@ -62,9 +83,9 @@ pub(super) fn find(capture: &mut Capture, options: &CaptureOptions) {
     }
 }
 
-/// The frames of every lens, the most first. Intrinsics count in hundredths of a pixel.
-fn by_lens(capture: &Capture) -> Vec<Vec<usize>> {
-    let mut lenses: BTreeMap<Vec<i64>, Vec<usize>> = BTreeMap::new();
+/// The frames of every lens, the most first.
+fn by_lens(capture: &Capture) -> Vec<(Lens100, Vec<usize>)> {
+    let mut lenses: BTreeMap<Lens100, Vec<usize>> = BTreeMap::new();
     for (i, frame) in capture.frames.iter().enumerate() {
         let (source, k) = (&frame.source, &frame.source.intrinsics);
         if matches!(source.lens, Lens::Equirectangular { .. }) {
@@ -74,35 +95,57 @@ fn by_lens(capture: &Capture) -> Vec<Vec<usize>> {
         key.extend([k.fx, k.fy, k.cx, k.cy].map(|x| (100.0 * x).round() as i64));
         lenses.entry(key).or_default().push(i);
     }
-    let mut lenses: Vec<Vec<usize>> = lenses.into_values().collect();
-    lenses.sort_by_key(|frames| (std::cmp::Reverse(frames.len()), frames[0]));
+    let mut lenses: Vec<(Lens100, Vec<usize>)> = lenses.into_iter().collect();
+    lenses.sort_by_key(|(_, frames)| (std::cmp::Reverse(frames.len()), frames[0]));
     lenses
 }
 
-/// A few frames from different places: one of each fixed camera, and those of moving ones, evenly.
-fn views(capture: &Capture, frames: &[usize]) -> Vec<usize> {
-    let mut seen = std::collections::BTreeSet::new();
+/// A few frames from different places: the first of each fixed camera, and those of moving ones, evenly.
+fn views(capture: &Capture, frames: &[usize], firsts: &BTreeMap<usize, PathBuf>) -> Vec<Frame> {
+    let mut seen = BTreeSet::new();
     let rig = |i: usize| capture.frames[i].camera;
     let mut views: Vec<usize> =
         frames.iter().copied().filter(|&i| !capture.cameras[rig(i)].fixed || seen.insert(rig(i))).collect();
-    if views.len() > LOOKED_AT {
-        views = (0..LOOKED_AT).map(|k| views[k * views.len() / LOOKED_AT]).collect();
+    let size = frames.first().map_or(1, |&i| capture.frames[i].source.width * capture.frames[i].source.height);
+    let most = (PIXELS / size.max(1)).clamp(FEWEST, LOOKED_AT);
+    if views.len() > most {
+        views = (0..most).map(|k| views[k * views.len() / most]).collect();
     }
-    views
+    let first = |i: usize| {
+        let frame = capture.frames[i].clone();
+        let image = firsts.get(&frame.camera).filter(|_| capture.cameras[frame.camera].fixed).cloned();
+        Frame { image: image.unwrap_or_else(|| frame.image.clone()), ..frame }
+    };
+    views.into_iter().map(first).collect()
 }
 
-/// [height · width] what the lens of these frames recorded, 1 or 0; `None`: everything, or it cannot be told.
-fn recorded(capture: &Capture, views: &[usize]) -> Option<Vec<u8>> {
+/// [height · width] what the lens of these frames recorded, 1 or 0; `None`: everything, or it cannot be told. Decodes no more
+/// images than it takes.
+fn recorded(views: &[Frame]) -> Option<Vec<u8>> {
     if views.len() < FEWEST {
         return None;
     }
-    // A damaged file is refused when it is trained on.
-    let bright: Vec<Vec<bool>> = views.par_iter().filter_map(|&i| not_black(&capture.frames[i])).collect();
+    let (width, height) = (views[0].source.width, views[0].source.height);
+    let mut bright: Vec<Vec<bool>> = Vec::new();
+    let mut black = vec![true; width * height];
+    let mut next = 0;
+    while next < views.len() {
+        let end = if next == 0 { 1 } else { views.len().min(next + AT_ONCE) };
+        // A damaged file is refused when it is trained on.
+        let some: Vec<Vec<bool>> = views[next..end].par_iter().filter_map(not_black).collect();
+        for image in &some {
+            black.iter_mut().zip(image).for_each(|(black, bright)| *black &= !bright);
+        }
+        bright.extend(some);
+        if !has_edges(&black, width, height) {
+            return None;
+        }
+        next = end;
+    }
     if bright.len() < FEWEST {
         return None;
     }
-    let source = &capture.frames[views[0]].source;
-    border(&bright, source.width, source.height)
+    border(&bright, width, height)
 }
 
 /// Where a picture is not black; `None`: it cannot be read or is transparent in places, so that its colours there mean
@@ -124,18 +167,10 @@ fn border(bright: &[Vec<bool>], width: usize, height: usize) -> Option<Vec<u8>> 
     for image in bright {
         black.iter_mut().zip(image).for_each(|(black, bright)| *black &= !bright);
     }
-    let outer = from_edges(&black, width, height);
-    let share = |edge: &mut dyn Iterator<Item = usize>| {
-        let (mut all, mut of) = (0, 0);
-        edge.for_each(|p| (all, of) = (all + 1, of + usize::from(outer[p])));
-        f64::from(of as u32) / f64::from(all as u32)
-    };
-    let across = [share(&mut (0..width)), share(&mut (width * (height - 1)..width * height))];
-    let down = [share(&mut (0..height).map(|y| y * width)), share(&mut (0..height).map(|y| (y + 1) * width - 1))];
-    let both = |[a, b]: [f64; 2]| a.min(b) >= OF_AN_EDGE;
-    if !both(across) && !both(down) {
+    if !has_edges(&black, width, height) {
         return None;
     }
+    let outer = from_edges(&black, width, height);
     let mixed = grown(&outer, width, height, MIXED);
     let inside = grown(&outer, width, height, INSIDE);
     let behind: Vec<usize> = (0..width * height).filter(|&p| inside[p] && !mixed[p]).collect();
@@ -145,6 +180,18 @@ fn border(bright: &[Vec<bool>], width: usize, height: usize) -> Option<Vec<u8>> 
         && !behind.is_empty()
         && covered as f64 <= LARGEST * (width * height) as f64;
     counts.then(|| mixed.iter().map(|&m| u8::from(!m)).collect())
+}
+
+/// Whether two opposite edges are mostly of this set, as borders are.
+fn has_edges(black: &[bool], width: usize, height: usize) -> bool {
+    let share = |edge: &mut dyn Iterator<Item = usize>| {
+        let (mut all, mut of) = (0, 0);
+        edge.for_each(|p| (all, of) = (all + 1, of + usize::from(black[p])));
+        f64::from(of as u32) / f64::from(all as u32)
+    };
+    let across = [share(&mut (0..width)), share(&mut (width * (height - 1)..width * height))];
+    let down = [share(&mut (0..height).map(|y| y * width)), share(&mut (0..height).map(|y| (y + 1) * width - 1))];
+    [across, down].iter().any(|[a, b]| a.min(*b) >= OF_AN_EDGE)
 }
 
 /// The pixels that are connected to an edge of the image by pixels of the set.

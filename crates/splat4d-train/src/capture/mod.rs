@@ -51,11 +51,13 @@ mod tracks;
 mod transforms;
 
 pub use account::{Aspect, Remark, Severity};
+pub use borders::Lenses;
 pub use convention::{Convention, Poses};
 pub use depth::{DepthFile, DepthKind};
 pub use evidence::{Agreement, PoseCheck};
 pub(crate) use flow::{FlowFile, to_picture as flow_picture};
 pub use lens::Distortion;
+pub use n3dv::{about_rows, rows_of};
 pub use options::{
     Borders, CaptureOptions, CaptureSettings, Exif, FlowSource, HoldOut, MAX_POINTS, Sequence, Text, Times,
     Unregistered,
@@ -73,7 +75,7 @@ use splat4d::Result;
 use splat4d::math::se3::{norm, sub};
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, Time};
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -238,6 +240,8 @@ pub struct Capture {
     pub convention: Convention,
     /// What they were read as instead.
     pub poses: Poses,
+    /// What its lenses recorded: black borders, or none.
+    pub lenses: Lenses,
     /// What was not found, not read or assumed.
     pub account: Vec<Remark>,
     /// The reader's warnings, a sentence or two each.
@@ -258,6 +262,8 @@ struct Take {
     frames: Vec<RawFrame>,
     /// The whole take, where the reader listed a part of it; empty: all is listed.
     take: Extent,
+    /// The first image of each camera, where the reader listed a part of the take.
+    firsts: BTreeMap<usize, PathBuf>,
     /// The data set's convention, where it is not told by the frames' splits.
     hold_out: Option<HoldOut>,
     fps: f64,
@@ -286,6 +292,7 @@ impl Take {
             timing: Timing::Told,
             frames: Vec::new(),
             take: Extent::default(),
+            firsts: BTreeMap::new(),
             hold_out: None,
             fps: DEFAULT_FPS,
             points: None,

@@ -22,6 +22,11 @@ const MAX_ASPECT_CHANGE: f64 = 0.01;
 /// Names under which prepared data sets keep their cloud.
 const POINTS: &[&str] = &["points.ply", "points3D.ply", "points3D_downsample2.ply"];
 
+/// Folder of the notes of extracted frames (`splat4d_import::shipped`).
+const NOTES: &str = "import";
+/// Rates are stated in steps of this, frames a second: intervals in files are rounded.
+const WHOLE_RATE: f64 = 0.01;
+
 /// A folder of frames: its camera's name and the pictures.
 struct Folder {
     name: String,
@@ -53,23 +58,29 @@ pub(super) fn points(root: &Path) -> Result<Option<PointCloud>> {
 
 /// Reads poses and frame folders; the first camera is held out.
 pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
-    let fps = options.fps.unwrap_or(DEFAULT_FPS);
     let place = |e: Error| e.at(marker.display());
     let rows = rows(marker)?;
     let folders = folders(root);
     let films = videos(root);
-    if folders.len() != rows.len() {
+    let fps = options.fps.or_else(|| extracted_rate(root, &folders.first()?.name)).unwrap_or(DEFAULT_FPS);
+    let names: Vec<String> = folders.iter().map(|f| f.name.clone()).collect();
+    let Some(which) = rows_of(&names, rows.len()) else {
         return Err(place(mismatch(rows.len(), &folders, &films)));
-    }
+    };
     let mut account = Account::default();
+    for (severity, what) in about_rows(&names, &which, rows.len()) {
+        let aspect = if which.len() < rows.len() { Aspect::NotFound } else { Aspect::Assumed };
+        account.add(aspect, severity, what);
+    }
     let numbers = numbers(&folders, &mut account);
     let mut frames = Vec::new();
-    for (camera, (folder, row)) in folders.iter().zip(&rows).enumerate() {
-        let in_row = |e: Error| e.at(format!("{} row {camera} (camera {})", marker.display(), folder.name));
+    for (camera, folder) in folders.iter().enumerate() {
+        let row = &rows[which[camera]];
+        let in_row = |e: Error| e.at(format!("{} row {} (camera {})", marker.display(), which[camera], folder.name));
         let header = picture::header(&folder.images[0])?;
         let source = camera_of(row, header.stored, options.poses).map_err(in_row)?;
         for (&index, image) in numbers[camera].iter().zip(&folder.images) {
-            let split = if camera == 0 && rows.len() > 1 { Split::Held } else { Split::Train };
+            let split = if camera == 0 && folders.len() > 1 { Split::Held } else { Split::Train };
             let place = (camera, index, index as f64 / fps);
             frames.push(RawFrame { split, ..RawFrame::new(place, source.clone(), image.clone()) });
         }
@@ -83,6 +94,54 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         account,
         ..Take::new(root, CaptureKind::N3dv, Convention::NERF)
     })
+}
+
+/// Frames a second of a camera whose frames `train` extracted, by the notes that it keeps of that.
+fn extracted_rate(root: &Path, camera: &str) -> Option<f64> {
+    let note = std::fs::read(root.join(NOTES).join(format!("{camera}.json"))).ok()?;
+    let note: serde_json::Value = serde_json::from_slice(&note).ok()?;
+    let rate = 1.0 / note.get("interval")?.as_f64()?;
+    let whole = (rate / WHOLE_RATE).round() * WHOLE_RATE;
+    let rate = if (rate - whole).abs() < WHOLE_RATE { whole } else { rate };
+    super::options::check_rate("frame rate", rate).ok().map(|()| rate)
+}
+
+/// The row of poses that each camera has, of so many: in the order of names; or, where cameras are missing, by the number in the
+/// name, which counts from 0. `None`: they do not fit.
+pub fn rows_of(names: &[String], rows: usize) -> Option<Vec<usize>> {
+    if names.len() == rows {
+        return Some((0..rows).collect());
+    }
+    let numbers: Vec<usize> = names.iter().map(|name| rig::trailing_number(name)).collect::<Option<_>>()?;
+    let distinct: BTreeSet<usize> = numbers.iter().copied().collect();
+    let fit = distinct.len() == names.len() && distinct.first() == Some(&0) && numbers.iter().all(|n| *n < rows);
+    (fit && names.len() < rows).then_some(numbers)
+}
+
+/// What there is to say about the rows that cameras have.
+pub fn about_rows(names: &[String], which: &[usize], rows: usize) -> Vec<(Severity, String)> {
+    let mut out = Vec::new();
+    if which.len() < rows {
+        let gone: Vec<String> = (0..rows).filter(|row| !which.contains(row)).map(|row| row.to_string()).collect();
+        let what = format!(
+            "{} of {rows} cameras of poses_bounds.npy are missing: rows {} (counted from 0). Rows are taken by the numbers in names.",
+            gone.len(),
+            first_names(&gone)
+        );
+        out.push((Severity::Warning, what));
+    } else {
+        let numbers: Vec<Option<usize>> = names.iter().map(|name| rig::trailing_number(name)).collect();
+        if let Some(k) = numbers.windows(2).position(|w| w[0].zip(w[1]).is_some_and(|(a, b)| a > b)) {
+            let what = format!(
+                "Rows of poses_bounds.npy are given to cameras in the order of the letters of their names, as LLFF's scripts sort \
+                 them: {} comes before {}. Otherwise pad the numbers with zeros.",
+                names[k],
+                names[k + 1]
+            );
+            out.push((Severity::Warning, what));
+        }
+    }
+    out
 }
 
 /// The frame numbers of every folder's images: as named, counted from the smallest of all, so that a lost frame does not
@@ -189,4 +248,28 @@ pub(super) fn camera_of(row: &[f64], (width, height): (usize, usize), poses: Pos
     let focal = focal * width as f64 / stated_width;
     let intrinsics = Intrinsics { fx: focal, fy: focal, cx: 0.5 * width as f64, cy: 0.5 * height as f64 };
     Ok(Camera { cam_from_world, intrinsics, lens: Lens::Pinhole, width, height, near: Camera::NEAR })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rows_are_those_of_the_order_or_where_cameras_are_missing_of_the_numbers() {
+        let names = |list: &[&str]| list.iter().map(|n| (*n).to_owned()).collect::<Vec<String>>();
+        let said = |names: &[String], rows: usize| about_rows(names, &rows_of(names, rows).unwrap(), rows);
+        // Captures are shipped with gaps in their numbers.
+        let all = names(&["cam00", "cam01", "cam04"]);
+        assert_eq!((rows_of(&all, 3), said(&all, 3).len()), (Some(vec![0, 1, 2]), 0));
+        let lost = names(&["cam00", "cam01", "cam03"]);
+        assert_eq!(rows_of(&lost, 4), Some(vec![0, 1, 3]));
+        assert!(said(&lost, 4)[0].1.contains("1 of 4 cameras"), "{:?}", said(&lost, 4));
+        // Numbers that cannot be rows, or do not count from 0, say nothing.
+        assert_eq!(rows_of(&all, 4), None);
+        assert_eq!(rows_of(&names(&["cam01", "cam02"]), 3), None);
+        assert_eq!(rows_of(&names(&["left", "right"]), 3), None);
+        assert_eq!(rows_of(&all, 2), None);
+        let unpadded = names(&["cam_0", "cam_1", "cam_10", "cam_2"]);
+        assert!(said(&unpadded, 4)[0].1.contains("cam_10 comes before cam_2"));
+    }
 }

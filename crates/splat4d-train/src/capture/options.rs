@@ -1,5 +1,6 @@
 //! Options of a capture besides where it lies.
 
+use super::borders::Lenses;
 use super::convention::Poses;
 use crate::settings::{Value, choices, settings};
 use splat4d::{Error, Result};
@@ -225,6 +226,8 @@ pub struct CaptureOptions {
     /// Only pictures with these frame numbers are listed, so that memory does not grow with the take; empty: all. What they
     /// are for (training, held out) is what it is in the whole take.
     pub frames: Vec<Range<usize>>,
+    /// What is known of the lenses already, from another part of the take; else images are looked at.
+    pub lenses: Lenses,
 }
 
 /// Share of the images that may be missing by default: a few were deleted; more is probably another folder.
@@ -266,6 +269,7 @@ impl Default for CaptureOptions {
             unregistered: Unregistered::Auto,
             max_missing: MAX_MISSING,
             frames: Vec::new(),
+            lenses: Lenses::default(),
         }
     }
 }

@@ -10,6 +10,7 @@ use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, Intrinsics, Lens};
 use splat4d::{Error, ErrorKind, Result};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -94,6 +95,7 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<T
     super::options::check_rate("frame rate", fps)?;
     let mut cameras: Vec<String> = Vec::new();
     let (mut frames, mut take) = (Vec::new(), Extent::default());
+    let mut firsts = BTreeMap::new();
     let hold_out = top.opt("hold_out")?.map(|n| read_hold_out(&n)).transpose()?;
     let labels = top.opt("labels")?.map(|n| read_labels(&n)).transpose()?.unwrap_or_default();
     let nodes = top.get("cameras")?.list()?;
@@ -108,6 +110,9 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<T
         let context = Context { root, top, opengl, fps, camera: cameras.len(), options, in_part, lookup: &lookup };
         let count = read_camera(&context, &node, &mut frames).map_err(|e| e.at(format!("camera {name:.80}")))?;
         take.add(0..count);
+        if in_part && let Some(first) = context.first_image(&node)? {
+            firsts.insert(cameras.len(), first);
+        }
         cameras.push(name);
     }
     let mut account = Account::default();
@@ -119,6 +124,7 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<T
         cameras,
         frames,
         take: if in_part { take } else { Extent::default() },
+        firsts,
         named: true,
         hold_out,
         fps,
@@ -204,6 +210,14 @@ impl Context<'_> {
     fn shared(&self, camera: &Node<'_>, key: &str) -> Result<Option<usize>> {
         let own = camera.opt(key)?;
         own.or(self.top.opt(key)?).map(|n| n.count()).transpose()
+    }
+
+    /// The first image of a camera that is there, whatever part of its frames is listed.
+    fn first_image(&self, camera: &Node<'_>) -> Result<Option<PathBuf>> {
+        let (images, start) = (Files::read(&camera.get("images")?)?, self.shared(camera, "start")?.unwrap_or(0));
+        let bases = self.lookup.bases();
+        let found = |index: usize| self.lookup.image(&bases, &images.text(start, index)?).ok()?;
+        Ok((0..=MOST_MISSING).find_map(found))
     }
 
     fn pose(&self, node: &Node<'_>, inverted: bool) -> Result<Se3> {

@@ -79,10 +79,12 @@ fn is_jpeg(bytes: &[u8]) -> bool {
 /// Bytes at the start of a file that tell its format.
 const HEAD: usize = 64;
 
+/// What to do with images of other formats.
+const CONVERT: &str = "Convert the images to JPEG or PNG under the same names (for instance with ffmpeg or ImageMagick): \
+                       another ending is found.";
+
 /// What a file is instead of an image that can be read, by its first bytes, and what to do. `None`: that is not known.
 fn foreign(head: &[u8]) -> Option<(&'static str, &'static str)> {
-    const CONVERT: &str = "Convert the images to JPEG or PNG under the same names (for instance with ffmpeg or ImageMagick): \
-                           another ending is found.";
     let format = match head {
         [] => return Some(("the file is empty (0 bytes)", "Copy or extract it again, or delete it.")),
         _ if head.starts_with(b"version https://git-lfs") => {
@@ -110,6 +112,16 @@ fn foreign(head: &[u8]) -> Option<(&'static str, &'static str)> {
     Some((format, CONVERT))
 }
 
+/// Formats that begin with no mark of their own, by the ending of their files.
+const BY_ENDING: [(&str, &str); 5] =
+    [("tga", "TGA"), ("pcx", "PCX"), ("hdr", "Radiance HDR"), ("heic", "HEIC"), ("jxl", "JPEG XL")];
+
+/// The format that a file's ending names.
+fn by_ending(path: &Path) -> Option<&'static str> {
+    let ending = path.extension()?;
+    BY_ENDING.iter().find(|(e, _)| ending.eq_ignore_ascii_case(e)).map(|(_, format)| *format)
+}
+
 /// The first bytes of a file.
 fn head(path: &Path) -> Vec<u8> {
     let mut head = Vec::with_capacity(HEAD);
@@ -119,7 +131,7 @@ fn head(path: &Path) -> Vec<u8> {
 }
 
 fn broken(path: &Path, detail: impl std::fmt::Display) -> Error {
-    if let Some((what, remedy)) = foreign(&head(path)) {
+    if let Some((what, remedy)) = foreign(&head(path)).or_else(|| Some((by_ending(path)?, CONVERT))) {
         let what =
             if what.starts_with("the file") { what.into() } else { format!("the image is {what}, which is not read") };
         return Error::input(what).at(path.display()).remedy(remedy);

@@ -80,6 +80,7 @@ impl Recipe {
     /// The recipe's part of a plan, resolved; the capture's part (extent, clip, times, cameras) is still empty.
     pub fn plan(&self) -> Plan {
         let r = self.resolve();
+        let percent_dense = r.percent_dense();
         Plan {
             seed: r.run.seed,
             iterations: r.run.iterations,
@@ -92,7 +93,7 @@ impl Recipe {
                 life: r.life,
                 loss: r.loss,
                 densify: r.densify,
-                adc: AdcSettings { percent_dense: r.percent_dense(), ..r.adc },
+                adc: AdcSettings { percent_dense, ..r.adc },
                 opacity_reset: r.opacity_reset,
                 mcmc: r.mcmc,
                 relocate: r.relocate,

@@ -3,7 +3,7 @@
 
 use super::dataset::Dataset;
 use crate::capture::frames::{Frames, Picture};
-use crate::capture::{Capture, CaptureOptions, FlowSource, ImageStore, frames};
+use crate::capture::{Capture, CaptureOptions, FlowSource, ImageStore, Lenses, frames};
 use crate::event::Event;
 use crate::init::{self, Seeds, Source};
 use crate::learner::{Corrections, Exposure, Origin, RefineSettings, Scale};
@@ -50,12 +50,14 @@ pub fn capture_options(recipe: &Recipe) -> Result<CaptureOptions> {
 
 /// Opens a capture as a recipe wants it: scale, split, and the part of the take that is used.
 pub fn open_capture(path: &Path, recipe: &Recipe) -> Result<Capture> {
-    open_frames(path, recipe, Vec::new())
+    open_frames(path, recipe, Vec::new(), &Lenses::default())
 }
 
-/// The same for a part of a long take: only pictures with these frame numbers are listed ([`CaptureOptions::frames`]).
-pub fn open_frames(path: &Path, recipe: &Recipe, frames: Vec<Range<usize>>) -> Result<Capture> {
-    let mut capture = Capture::open(path, &CaptureOptions { frames, ..capture_options(recipe)? })?;
+/// The same for a part of a long take: only images with these frame numbers are listed ([`CaptureOptions::frames`]). `lenses`:
+/// what another part of it found ([`Capture::lenses`]).
+pub fn open_frames(path: &Path, recipe: &Recipe, frames: Vec<Range<usize>>, lenses: &Lenses) -> Result<Capture> {
+    let options = CaptureOptions { frames, lenses: lenses.clone(), ..capture_options(recipe)? };
+    let mut capture = Capture::open(path, &options)?;
     if recipe.loss.flow == 0.0 {
         // Nobody looks at it: it need not be decoded.
         capture.frames.iter_mut().for_each(|f| f.flow = None);

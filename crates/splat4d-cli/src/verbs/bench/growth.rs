@@ -21,7 +21,7 @@ use splat4d::scene::life::{CENTER, LOG_WIDTH};
 use splat4d::scene::params::{LOG_SCALE, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LIFE, LifeKind, Params, Planes, SH, Table, Time};
 use splat4d::{Error, Result};
-use splat4d_train::capture::{Capture, CaptureKind, Convention, Extent, Frame, ImageStore, Poses, Rig, Timing};
+use splat4d_train::capture::{Capture, CaptureKind, Convention, Extent, Frame, ImageStore, Lenses, Poses, Rig, Timing};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::dataset::Dataset;
 use splat4d_train::run::peak_memory;
@@ -202,6 +202,7 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
         downscale: 1,
         convention: Convention::OPENCV,
         poses: Poses::STATED,
+        lenses: Lenses::default(),
         account: Vec::new(),
         warnings: Vec::new(),
         notes: Vec::new(),

@@ -33,6 +33,16 @@ pub(super) struct Mark {
     pub(super) ray: [f64; 2],
 }
 
+/// What a mask or alpha shows of an image.
+pub(super) struct Shown {
+    /// [height · width] of the small image, from 0 to 1.
+    pub(super) weights: Vec<f32>,
+    /// Share of the image.
+    pub(super) share: f64,
+    /// Share of the pixels along its edge.
+    pub(super) of_edge: f64,
+}
+
 /// A small image.
 pub(super) struct Look {
     /// Its frame of the capture.
@@ -45,6 +55,10 @@ pub(super) struct Look {
     factor: usize,
     /// The ray to the middle of its foreground, where it has one.
     pub(super) foreground: Option<[f64; 2]>,
+    /// The same of what its mask or alpha hides.
+    pub(super) hidden: Option<[f64; 2]>,
+    /// How much of it is shown, by its mask or alpha; `None`: it has none.
+    pub(super) shown: Option<Shown>,
     pub(super) marks: Vec<Mark>,
 }
 
@@ -60,6 +74,11 @@ pub(super) fn one(capture: &Capture, frame: usize, upright: bool) -> Option<Look
 
 /// Finds the features of all.
 pub(super) fn describe(looks: &mut [Look], detail: Detail) {
+    describe_each(&mut looks.iter_mut().collect::<Vec<_>>(), detail);
+}
+
+/// [`describe`] of some.
+pub(super) fn describe_each(looks: &mut [&mut Look], detail: Detail) {
     looks.par_iter_mut().for_each(|look| {
         let limits = Limits { contrast: CONTRAST, most: detail.features };
         let found = find(&grey(&look.color), limits, &|_, _| true);
@@ -100,16 +119,37 @@ impl Look {
                 *v = plane[p] * a + under[c] * (1.0 - a);
             }
         }
+        // Masks may be smaller or larger than their images.
         let mask = || {
             let mask = picture::decode_as(frame.mask.as_deref()?, None, frame.upright).ok()?;
-            let same = (mask.width, mask.height) == (raster.width, raster.height);
-            same.then(|| reduced(&mask, 0, factor))
+            let values = picture::mask_values(&mask, false);
+            let at = |p: usize| {
+                let (x, y) = ((p % width * 2 + 1) * mask.width, (p / width * 2 + 1) * mask.height);
+                values[y / (2 * height) * mask.width + x / (2 * width)]
+            };
+            Some((0..width * height).map(at).collect::<Vec<f32>>())
         };
-        let shown = alpha.or_else(mask);
+        let weights = alpha.or_else(mask);
         let lens = Distortion::new(frame.source.lens);
         let camera = frame.source.clone();
-        let mut look = Self { frame: number, camera, lens, color, factor, foreground: None, marks: Vec::new() };
-        look.foreground = shown.and_then(|weights| look.middle(&weights));
+        let (foreground, hidden, shown) = (None, None, None);
+        let mut look =
+            Self { frame: number, camera, lens, color, factor, foreground, hidden, shown, marks: Vec::new() };
+        if let Some(weights) = weights {
+            look.foreground = look.middle(&weights);
+            let rest: Vec<f32> = weights.iter().map(|w| 1.0 - w).collect();
+            look.hidden = look.middle(&rest);
+            let share = |w: &mut dyn Iterator<Item = f32>| {
+                let (sum, count) = w.fold((0.0, 0), |(sum, count), w| (sum + f64::from(w), count + 1));
+                sum / f64::from(count.max(1))
+            };
+            let on_edge = |p: &usize| {
+                let (x, y) = (p % width, p / width);
+                x == 0 || y == 0 || x + 1 == width || y + 1 == height
+            };
+            let of_edge = share(&mut (0..width * height).filter(on_edge).map(|p| weights[p]));
+            look.shown = Some(Shown { share: share(&mut weights.iter().copied()), of_edge, weights });
+        }
         Some(look)
     }
 

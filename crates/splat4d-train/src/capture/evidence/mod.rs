@@ -4,8 +4,10 @@
 //! Each is measured for the poses as read, and as they would be in other conventions of the layout. A finding needs a
 //! convention that fits clearly better; nothing else raises a warning.
 
+mod focal;
 mod look;
 mod motion;
+mod outliers;
 mod pairs;
 mod points;
 mod silhouettes;
@@ -43,12 +45,27 @@ pub struct PoseCheck {
     pub written_as: Option<Poses>,
     /// What was found, or why nothing could be.
     pub finding: Finding,
+    /// What else images say: of single poses, focal lengths and masks.
+    pub more: Vec<Finding>,
+    /// Whether the finding is another convention.
+    misread: bool,
 }
 
 impl Capture {
     /// Compares poses with points and images. Opens a few images; images that cannot be read are passed over.
     pub fn check_poses(&self) -> PoseCheck {
-        self.judge(&mut look::take(self, &self.looked_at(), look::COARSE), &mut None)
+        let mut looks = look::take(self, &self.looked_at(), look::COARSE);
+        let mut matches = None;
+        let mut check = self.judge(&mut looks, &mut matches);
+        if !check.misread {
+            let poses: Vec<Se3> = looks.iter().map(|l| self.frames[l.frame].source.cam_from_world).collect();
+            // Without matches points have shown that focal lengths are right.
+            check.more.extend(matches.and_then(|m| focal::check(&m, &looks, &poses)));
+            check.more.extend(check_masks(&looks, &poses));
+            let pixels: usize = looks.iter().map(|l| l.camera.width * l.camera.height).sum();
+            check.more.extend(outliers::check(self, looks, PIXELS.saturating_sub(pixels)));
+        }
+        check
     }
 
     /// Cameras that see none of the initial points where others see many, and metric depth maps in another unit than the
@@ -71,9 +88,12 @@ impl Capture {
             );
             findings.push(warn(what, "Correct their poses, or take these images out."));
         }
-        if let Some((ratio, file)) = points::depth_unit(self) {
+        if let Some(error) = points::unreadable_depth(self) {
+            let what = format!("A depth map cannot be used, and training with depth stops there: {error}");
+            findings.push(warn(what, "Without depth: --set loss.depth=0."));
+        } else if let Some((ratio, by, file)) = points::depth_unit(self) {
             let what = format!(
-                "Depth maps and initial points do not fit: points are {ratio:.3} times as far away as depth maps say (such as {}). A \
+                "Depth maps and {by} do not fit: these are {ratio:.3e} times as far away as depth maps say (such as {}). A \
                  stored number is probably {:.3e} scene units, and is read as {:.3e}.",
                 file.path.display(),
                 ratio * file.scale,
@@ -166,7 +186,7 @@ impl Capture {
             .max_by(|&a, &b| measures[a].score().total_cmp(&measures[b].score()));
         let Some(best) = found.filter(|&k| measures[k].score() > stated.score()) else {
             let finding = stated.points.doubt(&stated.pairs).unwrap_or_else(|| stated.agrees());
-            return PoseCheck { written_as: None, finding };
+            return PoseCheck { written_as: None, finding, more: Vec::new(), misread: false };
         };
         let (m, poses) = (&measures[best], conventions[best]);
         let mut parts = Vec::new();
@@ -207,8 +227,41 @@ impl Capture {
         PoseCheck {
             written_as,
             finding: Finding { severity: Severity::Warning, aspect: Some(Aspect::Assumed), what, remedy },
+            more: Vec::new(),
+            misread: true,
         }
     }
+}
+
+/// What masks and alpha say of themselves: white counts.
+fn check_masks(looks: &[Look], poses: &[Se3]) -> Option<Finding> {
+    let percent = |x: f64| 100.0 * x;
+    let (severity, aspect, what, remedy) = match silhouettes::masks(looks, poses) {
+        silhouettes::Masks::Fine => return None,
+        silhouettes::Masks::Inverted(part, share, of_edge) => (
+            Severity::Warning,
+            Aspect::Assumed,
+            format!(
+                "Masks are probably inverted (white counts): what they hide is at one place, which the cameras look at, in {:.0} % of \
+                 the images; they show {:.0} % of the images and {:.0} % of their edges.",
+                percent(part),
+                percent(share),
+                percent(of_edge)
+            ),
+            "Invert them, unless what they hide is not wanted.",
+        ),
+        silhouettes::Masks::Unsure(images, share) => (
+            Severity::Note,
+            Aspect::NotChecked,
+            format!(
+                "Whether masks are inverted (white counts): they show {:.0} % of {images} images, and neither that nor the rest is \
+                 at one place.",
+                percent(share)
+            ),
+            "",
+        ),
+    };
+    Some(Finding { severity, aspect: Some(aspect), what, remedy: remedy.into() })
 }
 
 /// Whether poses describe upright images (with their EXIF orientation applied), by colours of points and by matches between

@@ -112,8 +112,7 @@ pub(super) fn measure(matches: &[Match], looks: &[Look], poses: &[Option<Vec<Se3
         .map(|poses| match poses {
             Some(poses) => {
                 let centers: Vec<[f64; 3]> = poses.iter().map(|p| p.inverse().translation).collect();
-                let spread = centers.iter().map(|&c| norm(sub(c, centers[0]))).fold(0.0, f64::max);
-                let least = ONE_PLACE * (spread + norm(centers.first().copied().unwrap_or_default()));
+                let least = least(&centers);
                 matches.iter().map(|m| fits(m, looks, poses, least)).collect()
             }
             None => vec![false; matches.len()],
@@ -128,6 +127,30 @@ pub(super) fn measure(matches: &[Match], looks: &[Look], poses: &[Option<Vec<Se3
             lost: count(&|k| !own[k] && fits[0][k]),
         })
         .collect()
+}
+
+/// How many of the matches of two looks their poses fit.
+pub(super) fn fitting(matches: &[Match], looks: &[Look], poses: &[Se3]) -> usize {
+    let centers: Vec<[f64; 3]> = poses.iter().map(|p| p.inverse().translation).collect();
+    let least = least(&centers);
+    matches.iter().filter(|m| fits(m, looks, poses, least)).count()
+}
+
+/// Baselines from which cameras stand in two places.
+fn least(centers: &[[f64; 3]]) -> f64 {
+    let spread = centers.iter().map(|&c| norm(sub(c, centers[0]))).fold(0.0, f64::max);
+    ONE_PLACE * (spread + norm(centers.first().copied().unwrap_or_default()))
+}
+
+/// Matches that fit if focal lengths are `times` as long, of each of the factors.
+pub(super) fn by_focal(matches: &[Match], looks: &[Look], poses: &[Se3], factors: &[f64]) -> Vec<usize> {
+    let centers: Vec<[f64; 3]> = poses.iter().map(|p| p.inverse().translation).collect();
+    let least = least(&centers);
+    let with = |times: f64| {
+        let scaled = |m: &Match| Match { looks: m.looks, rays: m.rays.map(|ray| ray.map(|x| x / times)) };
+        matches.iter().filter(|m| fits_within(&scaled(m), looks, poses, least, NEAR / times)).count()
+    };
+    factors.iter().map(|&times| with(times)).collect()
 }
 
 /// The distance of a match from the place or line where a static scene has it, pixels of the small image.
@@ -159,9 +182,14 @@ fn offset(m: &Match, motion: &Se3, in_one_place: bool) -> f64 {
 
 /// Whether two rays meet in front of both cameras.
 fn fits(m: &Match, looks: &[Look], poses: &[Se3], least: f64) -> bool {
+    fits_within(m, looks, poses, least, NEAR)
+}
+
+/// [`fits`] within so many pixels of the small image.
+fn fits_within(m: &Match, looks: &[Look], poses: &[Se3], least: f64, near: f64) -> bool {
     let [a, b] = m.looks;
     let motion = poses[b].after(&poses[a].inverse());
-    let tolerance = NEAR * 2.0 / (looks[a].focal() + looks[b].focal());
+    let tolerance = near * 2.0 / (looks[a].focal() + looks[b].focal());
     let in_one_place = norm(motion.translation) <= least;
     let near = offset(m, &motion, in_one_place) <= tolerance;
     if !near || in_one_place {

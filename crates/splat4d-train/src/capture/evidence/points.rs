@@ -7,8 +7,10 @@ use super::super::{Aspect, Capture, DepthFile, DepthKind, Frame, PointCloud, dep
 use super::look::{Look, pixel_of};
 use super::pairs;
 use rayon::prelude::*;
+use splat4d::Error;
 use splat4d::math::Se3;
-use std::collections::BTreeSet;
+use splat4d::math::se3::{norm, sub};
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Cameras and points that are asked, at most, evenly chosen.
 const CAMERAS: usize = 24;
@@ -173,17 +175,21 @@ const SAME_UNIT: f64 = 2.0;
 /// Between the quarters of the ratios: where they are farther apart than this factor, they tell no unit.
 const STEADY: f64 = 3.0;
 
-/// How many times as far away points are as metric depth maps say, and a map's file. `None`: about as far, or it cannot be told.
-pub(super) fn depth_unit(capture: &Capture) -> Option<(f64, &DepthFile)> {
-    let cloud = capture.points.as_ref()?;
+/// Views with metric depth that are compared, evenly chosen.
+fn with_depth(capture: &Capture) -> Vec<&Frame> {
     let metric = |f: &&Frame| f.depth.as_ref().is_some_and(|d| d.kind == DepthKind::Metric);
     let frames: Vec<&Frame> = capture.train.iter().map(|&i| &capture.frames[i]).filter(metric).collect();
-    let chosen: Vec<&Frame> = frames.iter().step_by(frames.len().div_ceil(MAPS).max(1)).copied().collect();
+    frames.iter().step_by(frames.len().div_ceil(MAPS).max(1)).copied().collect()
+}
+
+/// How many times as far away points are as metric depth maps say, and a map's file. `None`: it cannot be told.
+fn by_points(capture: &Capture) -> Option<f64> {
+    let cloud = capture.points.as_ref()?;
     let mut ratios = Vec::new();
-    for frame in &chosen {
+    for frame in with_depth(capture) {
         let seen = in_image(frame, cloud.points.iter().step_by(step(cloud)));
         let pixels: Vec<[f64; 2]> = seen.iter().map(|(pixel, _)| *pixel).collect();
-        // A map that cannot be read has an error of its own when it is needed.
+        // A map that cannot be read has an error of its own.
         let Ok(depths) = depth::at(frame.depth.as_ref()?, &frame.source, &pixels) else { continue };
         let known = seen.iter().zip(depths).filter(|(_, d)| *d > 0.0);
         ratios.extend(known.map(|((_, z), d)| z / f64::from(d)));
@@ -193,10 +199,101 @@ pub(super) fn depth_unit(capture: &Capture) -> Option<(f64, &DepthFile)> {
     }
     ratios.sort_by(f64::total_cmp);
     let quarter = |k: usize| ratios[k * ratios.len() / 4];
-    let steady = quarter(3) <= STEADY * quarter(1);
-    let ratio = quarter(2);
-    let off = ratio.max(1.0 / ratio) > SAME_UNIT;
-    Some((ratio, chosen.first()?.depth.as_ref()?)).filter(|_| steady && off)
+    (quarter(3) <= STEADY * quarter(1)).then(|| quarter(2))
+}
+
+/// What a stored number of depth may have to be multiplied by: powers of two and ten over this range.
+const FACTORS: [f64; 2] = [1e-5, 1e5];
+/// Pixels of a map that another map is compared with, along each side.
+const GRID: usize = 24;
+/// Two maps agree at a pixel within this share of the depth; and how many pixels agree in one unit, of those that both show, and how
+/// many times as many as in another.
+const AGREE: f64 = 0.03;
+const UNIT: (f64, f64) = (0.4, 1.5);
+
+/// The factor at which metric depth maps of neighbouring views agree with each other; `None`: with none, or with several.
+fn by_views(capture: &Capture) -> Option<f64> {
+    let metric = |i: &&usize| capture.frames[**i].depth.as_ref().is_some_and(|d| d.kind == DepthKind::Metric);
+    let all: Vec<usize> = capture.train.iter().filter(metric).copied().collect();
+    let mut samples = Vec::new();
+    for &i in all.iter().step_by(all.len().div_ceil(MAPS).max(1)) {
+        let frame = &capture.frames[i];
+        // The nearest camera of the same time sees most of the same.
+        let other = (all.iter().map(|&k| &capture.frames[k]))
+            .filter(|f| f.time == frame.time && f.image != frame.image)
+            .map(|f| (norm(sub(f.source.center(), frame.source.center())), f))
+            .filter(|(apart, _)| *apart > 0.0)
+            .min_by(|a, b| a.0.total_cmp(&b.0));
+        let Some((_, other)) = other else { continue };
+        let (camera, file) = (&frame.source, frame.depth.as_ref()?);
+        let pixels: Vec<[f64; 2]> = (0..GRID * GRID)
+            .map(|k| {
+                let [x, y] = [k % GRID, k / GRID].map(|v| (v as f64 + 0.5) / GRID as f64);
+                [x * camera.width as f64, y * camera.height as f64]
+            })
+            .collect();
+        let Ok(depths) = depth::at(file, camera, &pixels) else { continue };
+        let lens = Distortion::new(camera.lens);
+        let k = &camera.intrinsics;
+        for ([u, v], d) in pixels.into_iter().zip(depths).filter(|(_, d)| *d > 0.0) {
+            if let Some([x, y]) = lens.undistort([(u - k.cx) / k.fx, (v - k.cy) / k.fy]) {
+                samples.push((frame, other, [x, y, 1.0].map(|v| v * f64::from(d))));
+            }
+        }
+    }
+    let share = |factor: f64| {
+        let mut by_map = BTreeMap::<*const Frame, (&Frame, Vec<[f64; 2]>, Vec<f64>)>::new();
+        for (frame, other, ray) in &samples {
+            let world = frame.source.cam_from_world.inverse().apply(ray.map(|v| v * factor));
+            let (camera, pose) = (&other.source, &other.source.cam_from_world);
+            if let Some(pixel) = pixel_of(camera, &Distortion::new(camera.lens), pose, world) {
+                let at = by_map.entry(std::ptr::from_ref(*other)).or_insert((other, Vec::new(), Vec::new()));
+                at.1.push(pixel);
+                at.2.push(pose.apply(world)[2] / factor);
+            }
+        }
+        let (mut agree, mut seen) = (0, 0);
+        for (other, pixels, z) in by_map.into_values() {
+            let Some(Ok(depths)) = other.depth.as_ref().map(|d| depth::at(d, &other.source, &pixels)) else { continue };
+            let known = depths.iter().zip(&z).filter(|(d, _)| **d > 0.0);
+            for (d, z) in known {
+                seen += 1;
+                agree += usize::from((z / f64::from(*d) - 1.0).abs() <= AGREE);
+            }
+        }
+        if seen < IN_MAP { 0.0 } else { f64::from(agree as u32) / f64::from(seen as u32) }
+    };
+    let mut best = (1.0, share(1.0));
+    let stated = best.1;
+    let mut power = FACTORS[0];
+    while power <= FACTORS[1] * 1.001 {
+        for factor in [power, 2.0 * power, 5.0 * power].into_iter().filter(|f| (f - 1.0).abs() > 1e-6) {
+            let found = share(factor);
+            if found > best.1 {
+                best = (factor, found);
+            }
+        }
+        power *= 10.0;
+    }
+    (best.0 != 1.0 && best.1 >= UNIT.0 && best.1 >= UNIT.1 * stated).then_some(best.0)
+}
+
+/// How many times as far away things are as metric depth maps say, what tells it, and a map's file. `None`: about as far, or it
+/// cannot be told.
+pub(super) fn depth_unit(capture: &Capture) -> Option<(f64, &'static str, &DepthFile)> {
+    let file = with_depth(capture).first()?.depth.as_ref()?;
+    let (ratio, by) = match by_points(capture) {
+        Some(ratio) => (ratio, "initial points"),
+        None => (by_views(capture)?, "depth maps of other views"),
+    };
+    (ratio.max(1.0 / ratio) > SAME_UNIT).then_some((ratio, by, file))
+}
+
+/// Why a depth map cannot be read: the first of some.
+pub(super) fn unreadable_depth(capture: &Capture) -> Option<Error> {
+    let frames: Vec<&Frame> = capture.train.iter().map(|&i| &capture.frames[i]).filter(|f| f.depth.is_some()).collect();
+    let some = frames.iter().step_by(frames.len().div_ceil(MAPS).max(1));
+    some.filter_map(|f| depth::at(f.depth.as_ref()?, &f.source, &[]).err()).next()
 }
 
 /// How much nearer colours of some points are to the images there than to those at other points.

@@ -318,7 +318,106 @@ fn depth_maps_in_another_unit_are_named() {
         frame.depth.as_mut().into_iter().for_each(|d| d.scale = 1.0);
     }
     let found = capture.check_points();
-    assert!(found.len() == 1 && found[0].what.contains("points are 0.001 times"), "{found:?}");
+    assert!(found.len() == 1 && found[0].what.contains("initial points do not fit: these are 1.000e-3"), "{found:?}");
+    // Without points, maps of other views say the same.
+    let points = capture.points.take();
+    let found = capture.check_points();
+    assert!(found.len() == 1 && found[0].what.contains("depth maps of other views do not fit"), "{found:?}");
+    assert!(found[0].what.contains("probably 1.000e-3 scene units"), "{found:?}");
+    capture.frames.iter_mut().filter_map(|f| f.depth.as_mut()).for_each(|d| d.scale = 1e-3);
+    assert!(capture.check_points().is_empty(), "millimetres");
+    // Lengths in 255 steps are refused by training.
+    capture.points = points;
+    let path = capture.frames[capture.train[0]].depth.as_ref().unwrap().path.clone();
+    ImageBuffer::from_fn(WIDTH, HEIGHT, |x, _| image::Luma([x as u8])).save(path).unwrap();
+    let found = capture.check_points();
+    assert!(found.len() == 1 && found[0].what.contains("8 bits"), "{found:?}");
+}
+
+/// What images say of single poses, focal lengths and masks: warnings.
+fn warned(capture: &Capture) -> Vec<String> {
+    let check = capture.check_poses();
+    let all = check.more.into_iter().chain([check.finding]);
+    all.filter(|f| f.severity == Severity::Warning).map(|f| f.what).collect()
+}
+
+#[test]
+fn one_wrong_pose_among_right_ones_is_named() {
+    let axes = [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]];
+    let identity = Se3 { rotation: axes, translation: [0.0; 3] };
+    let away = Se3::look_at([1.0, 3.5, 1.0], [9.0, 9.0, 2.0], [0.0, 0.0, 1.0]);
+    for (wrong, sign) in [(identity, "is the identity"), (pose(9), "exactly this pose"), (away, "")] {
+        for points in [true, false] {
+            let mut capture = photos(points);
+            assert_eq!(warned(&capture), [""; 0]);
+            let frame = capture.train[3];
+            capture.frames[frame].source.cam_from_world = wrong;
+            let found = warned(&capture);
+            let name = capture.frames[frame].image.display().to_string();
+            let said = found
+                .iter()
+                .any(|w| w.contains("pose of 1 image is probably wrong") && w.contains(&name) && w.contains(sign));
+            assert!(said, "{sign} {points}: {found:?}");
+        }
+    }
+}
+
+#[test]
+fn an_identity_pose_that_cannot_be_compared_is_not_checked() {
+    let mut capture = photos(false);
+    // Two images far apart have no features in common.
+    capture.held = Vec::new();
+    capture.frames = vec![capture.frames[0].clone(), capture.frames[11].clone()];
+    capture.train = vec![0, 1];
+    capture.cameras.truncate(2);
+    capture.frames[1].camera = capture.frames[1].camera.min(1);
+    capture.frames[1].source.cam_from_world = Se3::IDENTITY;
+    let check = capture.check_poses();
+    let said = |f: &Finding| f.aspect == Some(Aspect::NotChecked) && f.what.contains("identity is the pose of 1 of 2");
+    assert!(check.more.iter().any(said), "{check:?}");
+}
+
+#[test]
+fn wrong_focal_lengths_are_named_without_points() {
+    for factor in [0.5, 0.7, 1.5, 2.0, 3.0] {
+        let mut capture = photos(false);
+        for frame in &mut capture.frames {
+            let k = &mut frame.source.intrinsics;
+            (k.fx, k.fy) = (k.fx * factor, k.fy * factor);
+        }
+        let found = warned(&capture);
+        let named = found.iter().find(|w| w.contains("Focal lengths are probably wrong")).cloned().unwrap_or_default();
+        let times: f64 = named.split("they are ").nth(1).and_then(|s| s.split(' ').next()?.parse().ok()).unwrap_or(0.0);
+        assert!((times * factor - 1.0).abs() < 0.2, "{factor}: {found:?}");
+    }
+}
+
+#[test]
+fn inverted_masks_are_named_and_right_ones_are_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let masked = |inverted: bool| {
+        let mut capture = photos(true);
+        for (i, frame) in capture.frames.iter_mut().enumerate() {
+            let white = |x: u32, y: u32| shown(i, x, y).is_some_and(|(_, ball)| ball) != inverted;
+            let path = folder.path().join(format!("{i}.png"));
+            // At half the size of the images.
+            let map =
+                ImageBuffer::from_fn(WIDTH / 2, HEIGHT / 2, |x, y| image::Luma([255 * u8::from(white(2 * x, 2 * y))]));
+            map.save(&path).unwrap();
+            frame.mask = Some(path);
+        }
+        capture
+    };
+    assert_eq!(warned(&masked(false)), [""; 0]);
+    let found = warned(&masked(true));
+    assert!(found.len() == 1 && found[0].contains("Masks are probably inverted"), "{found:?}");
+    // Masks of the camera's own mount are the same in all images.
+    let mut capture = masked(true);
+    let first = capture.frames[0].mask.clone();
+    capture.frames.iter_mut().for_each(|f| f.mask.clone_from(&first));
+    assert_eq!(warned(&capture), [""; 0]);
+    let said = |f: &Finding| f.aspect == Some(Aspect::NotChecked) && f.what.contains("Whether masks are inverted");
+    assert!(capture.check_poses().more.iter().any(said));
 }
 
 #[test]

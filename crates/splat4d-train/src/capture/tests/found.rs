@@ -194,6 +194,20 @@ fn names_with_codes_and_folders_of_elsewhere_are_found() {
 }
 
 #[test]
+fn images_without_a_mark_of_their_format_are_named_by_their_ending() {
+    let sample = Sample::new(&["transforms.json"]);
+    let frames: Vec<_> = (0..3)
+        .map(|c| {
+            sample.write(&format!("images/{c}.tga"), &[0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0, 24, 0, 16, 0, 24, 0]);
+            json!({"file_path": format!("images/{c}.tga"), "transform_matrix": samples::opengl(c)})
+        })
+        .collect();
+    let top = json!({"w": 24, "h": 16, "fl_x": 20, "fl_y": 20, "cx": 12, "cy": 8, "frames": frames});
+    sample.write("transforms.json", top.to_string().as_bytes());
+    assert_has(&refuse(sample.root()), &["TGA", "Convert"]);
+}
+
+#[test]
 fn unreadable_images_are_named_by_their_format() {
     let heads: [(&[u8], &[&str]); 8] = [
         (b"\0\0\0\x18ftypheic\0\0\0\0", &["HEIC", "Convert"]),

@@ -210,3 +210,46 @@ fn black_borders_are_neither_trained_nor_scored() {
     let kept = Arc::new(Capture::open(sample.root(), &keep).unwrap());
     assert!(load(&kept, 0).valid.is_none() && kept.notes.iter().all(|n| !n.contains("borders")));
 }
+
+#[test]
+fn every_part_of_a_take_has_the_borders_of_the_whole() {
+    // Six fixed cameras whose first frame has a letterbox; a bright flash fills the second.
+    let sample = samples::own();
+    sample.edit("capture.json", |v| {
+        let cameras: Vec<_> = (0..6)
+            .map(|c| {
+                let mut camera = v["cameras"][c % 3].clone();
+                camera["name"] = format!("cam{c:02}").into();
+                camera["images"] = format!("images/cam{c:02}/%04d.png").into();
+                camera["world_to_camera"] = samples::rows(&samples::pose(c));
+                camera.as_object_mut().unwrap().remove("masks");
+                camera
+            })
+            .collect();
+        v["cameras"] = cameras.into();
+    });
+    for c in 0..6u32 {
+        for t in 0..2 {
+            let pixel = |x: u32, y: u32| {
+                let black = t == 0 && (y == 0 || y == HEIGHT as u32 - 1);
+                image::Rgb(if black { [0, 0, 0] } else { [90 + 6 * x as u8, 60 + 7 * (y + c) as u8, 50] })
+            };
+            let image = ImageBuffer::from_fn(WIDTH as u32, HEIGHT as u32, pixel);
+            sample.save(&format!("images/cam{c:02}/{:04}.png", 5 + t), image);
+        }
+    }
+    let part = |frames: Range<usize>, lenses: &Lenses| {
+        let options = CaptureOptions { frames: vec![frames], lenses: lenses.clone(), ..CaptureOptions::default() };
+        Capture::open(sample.root(), &options).unwrap()
+    };
+    let whole = open(sample.root(), 1);
+    assert!(whole.frames.iter().all(|f| f.recorded.is_some()));
+    let second = part(1..2, &Lenses::default());
+    assert_eq!((second.frames.len(), &second.lenses), (6, &whole.lenses));
+    assert_eq!(second.frames[0].recorded, whole.frames[0].recorded);
+    // What is known is not looked for again.
+    let flash = ImageBuffer::from_pixel(WIDTH as u32, HEIGHT as u32, image::Rgb([200u8; 3]));
+    (0..6).for_each(|c| sample.save(&format!("images/cam{c:02}/0005.png"), flash.clone()));
+    assert!(part(1..2, &Lenses::default()).frames[0].recorded.is_none());
+    assert_eq!(part(1..2, &whole.lenses).frames[0].recorded, whole.frames[0].recorded);
+}

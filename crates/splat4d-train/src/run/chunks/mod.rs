@@ -24,7 +24,7 @@ use super::identity;
 use super::info::{read_info, read_text};
 use super::open::{OpenCapture, learnable, open_frames};
 use super::session::{Outcome, TrainOptions};
-use crate::capture::Capture;
+use crate::capture::{Capture, Lenses};
 use crate::event::Event;
 use crate::output::Owner;
 use crate::path_text::{of_text, to_text};
@@ -83,6 +83,8 @@ pub struct Chunked {
     source: PathBuf,
     recipe: Recipe,
     plan: ChunkPlan,
+    /// What the lenses of the take recorded, from the part that was opened first: it is the same for all.
+    lenses: Lenses,
     /// Keeps what this worker does to its minutes.
     pacing: Option<Pacing>,
 }
@@ -114,12 +116,13 @@ impl Chunked {
         if Self::is(run) {
             let begun = Self::open(run)?;
             begun.plan.check_same(&stated).map_err(|e| e.at(run.display()))?;
-            return Ok(Some(begun));
+            return Ok(Some(Self { lenses: capture.lenses.clone(), ..begun }));
         }
         let source = std::fs::canonicalize(&capture.root).unwrap_or_else(|_| capture.root.clone());
-        let plan = stated.at_rest(&|frames| open_frames(&source, &recipe, vec![frames]), listen)?;
+        let plan = stated.at_rest(&|frames| open_frames(&source, &recipe, vec![frames], &capture.lenses), listen)?;
         write_atomically(&run.join("recipe.toml"), recipe.to_toml().as_bytes())?;
-        let begun = Self { run: run.to_owned(), source, recipe, plan, pacing: None };
+        let lenses = capture.lenses.clone();
+        let begun = Self { run: run.to_owned(), source, recipe, plan, lenses, pacing: None };
         begun.write_info(&capture.name, None)?;
         // Last: whoever finds it finds the others.
         let text = serde_json::to_string_pretty(&begun.plan).expect("a plan is plain data");
@@ -150,7 +153,7 @@ impl Chunked {
         let source = info["capture"].as_str().map(of_text).ok_or_else(|| {
             Error::input("it does not name its capture").at(run.join("run.json").display()).remedy("Train again")
         })?;
-        Ok(Self { run: run.to_owned(), source, recipe, plan, pacing: None })
+        Ok(Self { run: run.to_owned(), source, recipe, plan, lenses: Lenses::default(), pacing: None })
     }
 
     /// The same, with parts that are re-planned during training, so that training ends on time.
@@ -345,7 +348,7 @@ impl Chunked {
 
     /// The pictures of some frames of the take, as the recipe opens them.
     fn capture(&self, frames: Vec<Range<usize>>) -> Result<Capture> {
-        open_frames(&self.source, &self.recipe, frames)
+        open_frames(&self.source, &self.recipe, frames, &self.lenses)
             .map_err(|e| e.remedy("The run needs its capture where it was when it was begun"))
     }
 

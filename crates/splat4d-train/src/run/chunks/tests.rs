@@ -141,7 +141,7 @@ fn a_take_that_fits_is_not_cut_and_others_are_cut_where_they_rest() {
         let picture = |k: usize| capture.root.join(format!("images/{camera}/{k:04}.png"));
         std::fs::copy(picture(10), picture(11)).unwrap();
     }
-    let open = |frames| open_frames(&capture.root, &recipe, vec![frames]);
+    let open = |frames| open_frames(&capture.root, &recipe, vec![frames], &Lenses::default());
     assert_eq!(even.at_rest(&open, &mut |_| {}).unwrap().cuts, [11]);
 }
 

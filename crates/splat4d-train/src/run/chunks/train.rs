@@ -43,7 +43,7 @@ pub(super) fn train(
     let pace = chunked.pace(Part::Chunk(chunk), options);
     let folder = chunked.folder(Part::Chunk(chunk));
     let recipe = of_frames(&chunked.recipe, chunked.plan.frames(chunk));
-    let capture = Arc::new(open_frames(&chunked.source, &recipe, vec![chunked.plan.frames(chunk)])?);
+    let capture = Arc::new(open_frames(&chunked.source, &recipe, vec![chunked.plan.frames(chunk)], &chunked.lenses)?);
     let opened = OpenCapture::new(capture, &recipe)?.on(options.device);
     check_flow(&opened.capture, &recipe)?;
     let program = recipe.program()?;
