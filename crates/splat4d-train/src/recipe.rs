@@ -21,7 +21,7 @@ use crate::learner::RefineSettings;
 use crate::loss::{LossSettings, TransportSettings};
 use crate::methods::{
     AppearanceSettings, ControlSettings, DeformSettings, FilterSettings, HexplaneSettings, LifeSettings,
-    Native4dSettings, RateSettings, SpacetimeSettings, SsmSettings, TrackedSettings,
+    Native4dSettings, RateSettings, SpacetimeSettings, SsmSettings, TrackedSettings, still,
 };
 use crate::settings::Table;
 use crate::step::replans::Replans;
@@ -100,7 +100,7 @@ impl Recipe {
     /// The largest number of Gaussians, of the least that small captures have: what grows or shrinks with many Gaussians
     /// goes by it. At least 1, and 1 for scenes that move, for which nothing else was measured.
     pub(crate) fn crowd(&self) -> f64 {
-        let many = self.run.motion == "still" && self.densify.max_cap > LEAST;
+        let many = self.run.motion == still::NAME && self.densify.max_cap > LEAST;
         if many { self.densify.max_cap as f64 / LEAST as f64 } else { 1.0 }
     }
 

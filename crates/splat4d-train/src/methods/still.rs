@@ -12,6 +12,9 @@ use crate::upkeep::Strategy;
 use splat4d::motion::Spec;
 use splat4d::scene::LifeKind;
 
+/// Its name in recipes.
+pub(crate) const NAME: &str = "still";
+
 /// The higher SH degrees learn this much slower than the base colour (Kerbl et al. 2023).
 const SH_REST_SLOWDOWN: f64 = 20.0;
 

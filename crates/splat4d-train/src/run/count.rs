@@ -9,6 +9,7 @@ use super::open::OpenCapture;
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};
 use crate::event::Event;
+use crate::methods::still;
 use crate::recipe::Recipe;
 use crate::upkeep::LEAST;
 use std::collections::BTreeSet;
@@ -126,7 +127,7 @@ pub(super) fn settled(most: usize, scale: f64, steps: impl Fn(usize) -> Result<u
 
 /// Pixels of distinct views for one Gaussian.
 fn each(recipe: &Recipe) -> f64 {
-    if recipe.run.motion == "still" { PIXELS_STATIC } else { PIXELS }
+    if recipe.run.motion == still::NAME { PIXELS_STATIC } else { PIXELS }
 }
 
 /// The number of Gaussians for those that distinct views need, and steps.
