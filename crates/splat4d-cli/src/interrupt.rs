@@ -3,13 +3,14 @@
 //! Work that does not ask whether it should stop ([`ends`]) is ended after a moment: all files are written under temporary names,
 //! and locks of dead processes are taken over, so that the same command goes on.
 
-use crate::FAILED;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 /// Exit code that shells expect of a program ended by Ctrl-C: 128 + SIGINT.
 const ENDED_BY_INTERRUPT: i32 = 130;
+/// Exit code of interrupted work (docs/exit-codes.md).
+const INTERRUPTED: i32 = 1;
 /// Time for work that asks; people wait two seconds.
 const PATIENCE: Duration = Duration::from_millis(1200);
 
@@ -99,7 +100,7 @@ pub(crate) fn embedded() {
 
 fn end(last: &str) -> ! {
     eprintln!("\nstopped: {last}");
-    std::process::exit(i32::from(FAILED));
+    std::process::exit(INTERRUPTED);
 }
 
 #[cfg(test)]

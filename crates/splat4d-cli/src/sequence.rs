@@ -135,8 +135,8 @@ pub(crate) fn take(
         inputs.push(Input { may_hold: read.run.is_some(), ..Input::new(read.path, "what is read,") });
     } else {
         let own = [Input::new(read.path, "what is read,")];
-        let frames = patterns.iter().flat_map(|p| (0..count).map(|i| p.file(i)));
-        frames.into_iter().try_for_each(|frame| check_file(&frame, &own))?;
+        let mut frames = patterns.iter().flat_map(|p| (0..count).map(|i| p.file(i)));
+        frames.try_for_each(|frame| check_file(&frame, &own))?;
     }
     let is = |name: &OsStr| patterns.iter().any(|p| p.takes(name));
     let written = |name: &OsStr| patterns.iter().any(|p| p.writes(name, count));

@@ -44,21 +44,21 @@ pub(crate) const READERS: &[Reader] = &[
     Reader {
         name: "colmap_cameras_txt",
         seeds: || vec![CAMERAS_TXT.into()],
-        read: |b| open("colmap_txt", "sparse/cameras.txt", b),
+        read: |b| open("colmap_txt", "sparse/0/cameras.txt", b),
     },
     Reader {
         name: "colmap_images_txt",
         seeds: || vec![IMAGES_TXT.into()],
-        read: |b| open("colmap_txt", "sparse/images.txt", b),
+        read: |b| open("colmap_txt", "sparse/0/images.txt", b),
     },
     Reader {
         name: "colmap_points_txt",
         seeds: || vec![POINTS_TXT.into()],
-        read: |b| open("colmap_txt", "sparse/points3D.txt", b),
+        read: |b| open("colmap_txt", "sparse/0/points3D.txt", b),
     },
     Reader { name: "image_file", seeds: image_files, read: |b| open("own", "images/0.png", b) },
-    Reader { name: "mask_png", seeds: || vec![grey()], read: |b| open("beside", "mask.png", b) },
-    Reader { name: "labels_png", seeds: || vec![grey()], read: |b| open("beside", "labels.png", b) },
+    Reader { name: "mask_png", seeds: || vec![grey(255)], read: |b| open("beside", "mask.png", b) },
+    Reader { name: "labels_png", seeds: || vec![grey(1)], read: |b| open("beside", "labels.png", b) },
     Reader { name: "features_npy", seeds: || vec![floats(&[6, 8, 2])], read: |b| open("beside", "features.npy", b) },
     Reader { name: "tracks_npz", seeds: tracks_npz, read: |b| open("tracks_npz", "tracks.npz", b) },
     Reader { name: "tracks_csv", seeds: || vec![TRACKS.into()], read: |b| open("beside", "tracks.csv", b) },
@@ -115,9 +115,9 @@ fn made(layout: &str) -> TempDir {
             put("sparse/0/points3D.bin", &points());
         }
         "colmap_txt" => {
-            put("sparse/cameras.txt", CAMERAS_TXT.as_bytes());
-            put("sparse/images.txt", IMAGES_TXT.as_bytes());
-            put("sparse/points3D.txt", POINTS_TXT.as_bytes());
+            put("sparse/0/cameras.txt", CAMERAS_TXT.as_bytes());
+            put("sparse/0/images.txt", IMAGES_TXT.as_bytes());
+            put("sparse/0/points3D.txt", POINTS_TXT.as_bytes());
         }
         "nerfies" => {
             put("dataset.json", DATASET.as_bytes());
@@ -128,8 +128,13 @@ fn made(layout: &str) -> TempDir {
                 put(&format!("rgb/1x/{i}.png"), &png());
             }
         }
-        "metashape" => put("cameras.xml", metashape().as_bytes()),
-        "realityscan" => put("cameras.csv", &realityscan()[0]),
+        "metashape" | "realityscan" => {
+            (0..2).for_each(|i| put(&format!("images/p{i}.png"), &png()));
+            match layout {
+                "metashape" => put("cameras.xml", metashape().as_bytes()),
+                _ => put("cameras.csv", &realityscan()[0]),
+            }
+        }
         "polycam" => {
             for i in 0..2 {
                 put(&format!("keyframes/cameras/{i}.json"), polycam().as_bytes());
@@ -141,8 +146,8 @@ fn made(layout: &str) -> TempDir {
             (0..2).for_each(|i| put(&format!("rgb/{i}.png"), &png()));
         }
         "beside" => {
-            put("mask.png", &grey());
-            put("labels.png", &grey());
+            put("mask.png", &grey(255));
+            put("labels.png", &grey(1));
             put("features.npy", &floats(&[6, 8, 2]));
             put("tracks.csv", TRACKS.as_bytes());
             put("capture.json", beside().as_bytes());
@@ -288,7 +293,7 @@ fn nerfies() -> String {
 fn metashape() -> String {
     let camera = |i: u32| {
         format!(
-            "<camera id=\"{i}\" sensor_id=\"0\" label=\"{i}\"><transform>1 0 0 0 0 1 0 0 0 0 1 -4 0 0 0 1</transform></camera>"
+            "<camera id=\"{i}\" sensor_id=\"0\" label=\"p{i}\"><transform>1 0 0 0 0 1 0 0 0 0 1 -4 0 0 0 1</transform></camera>"
         )
     };
     format!(
@@ -305,7 +310,8 @@ fn metashape() -> String {
 /// With commas, and as a spreadsheet with decimal commas.
 fn realityscan() -> Vec<Vec<u8>> {
     let head = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n";
-    let rows = "0.png,1,2,3,10,20,30,36,0.75,-0.3,0.01,0,0,0,0,0\n1.png,1.5,2,3,11,20,30,36,0.75,-0.3,0.01,0,0,0,0,0\n";
+    let rows =
+        "p0.png,1,2,3,10,20,30,36,0.75,-0.3,0.01,0,0,0,0,0\np1.png,1.5,2,3,11,20,30,36,0.75,-0.3,0.01,0,0,0,0,0\n";
     let text = format!("{head}{rows}");
     let other = text.replace(',', ";").replace('.', ",").replace(",png", ".png");
     vec![text.into(), other.into()]
@@ -339,8 +345,9 @@ fn tracks_npz() -> Vec<Vec<u8>> {
     [false, true].map(|deflate| zip(&[("tracks.npy", &tracks), ("visibility.npy", &seen)], deflate)).into()
 }
 
-fn grey() -> Vec<u8> {
-    encoded(&ImageBuffer::from_fn(WIDTH, HEIGHT, |x, _| Luma([(x % 2) as u8])), ImageFormat::Png)
+/// Columns of 0 and of this value in turn.
+fn grey(value: u8) -> Vec<u8> {
+    encoded(&ImageBuffer::from_fn(WIDTH, HEIGHT, |x, _| Luma([value * (x % 2) as u8])), ImageFormat::Png)
 }
 
 fn flow_png() -> Vec<u8> {

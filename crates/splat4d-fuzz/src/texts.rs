@@ -233,7 +233,7 @@ mod tests {
         for (i, rig) in rigs().iter().enumerate() {
             in_folder("rig", rig, |folder| {
                 let read = calibration::read(&folder.join("rig"));
-                assert!(read.is_ok(), "{i}: {}", read.unwrap_err());
+                assert!(read.is_ok(), "{i}: {:?}", read.err().map(|e| e.to_string()));
             });
         }
         in_folder("film.avi", &films()[0], |folder| {
@@ -243,9 +243,14 @@ mod tests {
         });
         in_folder("x", b"", |folder| {
             let page = Page::new(crate::formats::moving(), &folder.join("list.toml")).unwrap();
-            // What is pulled must have been bent before.
-            for request in &requests()[..7] {
-                page.ask(&text(request)).unwrap_or_else(|e| panic!("{}: {e}", text(request)));
+            for request in requests() {
+                // All are understood, though not every one has something to do.
+                let error = page.ask(&text(&request)).err().map(|e| e.to_string()).unwrap_or_default();
+                assert!(
+                    !error.contains("unknown request") && !error.contains("invalid JSON"),
+                    "{}: {error}",
+                    text(&request)
+                );
             }
         });
     }

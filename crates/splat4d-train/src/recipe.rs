@@ -26,7 +26,7 @@ use crate::methods::{
 use crate::settings::Table;
 use crate::step::replans::Replans;
 use crate::upkeep::{
-    AdcSettings, DensifySettings, FloaterSettings, GuidedSettings, McmcSettings, MergeSettings, NodeSettings,
+    AdcSettings, DensifySettings, FloaterSettings, GuidedSettings, LEAST, McmcSettings, MergeSettings, NodeSettings,
     OpacityResetSettings, PruneSettings, RelocateSettings, SplitSettings,
 };
 pub use chunks::ChunkSettings;
@@ -95,6 +95,13 @@ impl Recipe {
     pub fn with(mut self, change: impl FnOnce(&mut Self)) -> Self {
         change(&mut self);
         self
+    }
+
+    /// The largest number of Gaussians, of the least that small captures have: what grows or shrinks with many Gaussians
+    /// goes by it. At least 1, and 1 for scenes that move, for which nothing else was measured.
+    pub(crate) fn crowd(&self) -> f64 {
+        let many = self.run.motion == "still" && self.densify.max_cap > LEAST;
+        if many { self.densify.max_cap as f64 / LEAST as f64 } else { 1.0 }
     }
 
     /// Lets schedules that stand as they follow from the length follow from another one: what a run saved of them is set

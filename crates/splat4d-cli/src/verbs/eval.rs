@@ -230,6 +230,7 @@ fn baseline(out: &OutputFolder, run: &Run, measure: &finish::Measure, console: &
                 .remedy("Run `splat4d eval --baseline` again; it trains again.")
                 .into());
         }
+        crate::interrupt::ends("the still scene is kept, and the same command makes what is missing");
     }
     let scene = read_scene(&Run::open(&folder)?.scene_file()?)?;
     let evaluation = finish::scores(&folder, &scene, measure, console)?;

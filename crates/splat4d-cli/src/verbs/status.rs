@@ -37,7 +37,7 @@ pub(crate) enum State {
     Training,
     /// It begins where other parts end that are not done.
     Waiting,
-    /// It was begun, and nobody has it.
+    /// It was begun, and no worker has it.
     Stopped,
     /// It can be begun.
     Open,
@@ -79,7 +79,7 @@ pub(crate) struct Status {
     /// With as many workers as there are now, at least one.
     seconds_left: Option<f64>,
     parts: Vec<PartStatus>,
-    /// Parts that were begun and that nobody works on.
+    /// Parts that were begun and that no worker has.
     failures: Vec<String>,
     /// What to type next.
     next: Option<String>,

@@ -99,9 +99,10 @@ settings! {
         /// Source of initial Gaussians: `auto`, `points`, `pictures` (found in the images), `hull`, `random`, or a .ply
         /// file.
         source: Source = Source::Auto;
-        /// Number of initial Gaussians. If a capture has fewer points, more are placed between them along surfaces;
-        /// hulls of masks and of dynamic regions, and random points, add as many.
-        count: usize = 10_000 => any().when(IsNot("init.source", &["points"]));
+        /// Number of initial Gaussians; 0: 10,000, and more in proportion for static scenes of more than 30,000 Gaussians. If
+        /// a capture has fewer points, more are placed between them along surfaces; hulls of masks and of dynamic regions,
+        /// and random points, add as many.
+        count: usize = 0 => any().when(IsNot("init.source", &["points"]));
         /// Initial opacity.
         opacity: f64 = 0.1 => inside_share();
         /// Number of times at which initial points are placed over the clip; 0: about every 5 frames.
@@ -112,6 +113,11 @@ settings! {
             => any().unit("clips").when(Any(&[Is("run.motion", &["spacetime", "native4d"]), Is("life.kind", &["gauss-half", "gauss-one", "interval"])]));
     }
 }
+
+/// Initial Gaussians where [`InitSettings::count`] is 0: what small captures are tuned for (docs/suite.md). A static scene
+/// of many Gaussians has a third of them at once: a real room at half size gains 0.3 dB by half of them in the same steps, at an
+/// eighth more time (studies/records/2026-11-27-real-size.md).
+pub(crate) const COUNT: usize = 10_000;
 
 /// Where the first Gaussians are.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -198,6 +204,7 @@ pub fn seeds(
     moving: bool,
 ) -> Result<Seeds> {
     let rng = Rng::new(plan.seed, "init", 0);
+    let count = if settings.count == 0 { COUNT } else { settings.count };
     let volume = volume::common(frames);
     let times = if moving { keyframes(plan, settings) } else { vec![0.5 * (plan.clip[0] + plan.clip[1])] };
     let have_points = points.as_ref().is_some_and(|p| !p.is_empty());
@@ -220,7 +227,7 @@ pub fn seeds(
     let use_hull =
         frames.has_masks() && matches!(settings.source, Source::Auto | Source::Hull) && (moving || !have_points);
     let seen = match settings.source {
-        Source::Auto if frames.has_depth() => depth::points(frames, settings.count, moving, rng.fork(4))?,
+        Source::Auto if frames.has_depth() => depth::points(frames, count, moving, rng.fork(4))?,
         _ => Seeds::default(),
     };
     let have_depth = !seen.is_empty();
@@ -228,21 +235,21 @@ pub fn seeds(
     if have_points && !matches!(settings.source, Source::Random | Source::Hull) {
         out.append(points.expect("just seen"));
         let filled = matches!(settings.source, Source::Auto | Source::Pictures);
-        if filled && !have_depth && out.len() < settings.count {
+        if filled && !have_depth && out.len() < count {
             // Surfaces that move are elsewhere at other times.
             let still = (0..out.len()).filter(|&i| out.times[i].is_none());
             let known: Vec<[f64; 3]> = still.map(|i| out.points[i]).collect();
-            out.append(fill::between(frames, &known, settings.count - out.len())?);
+            out.append(fill::between(frames, &known, count - out.len())?);
         }
     }
     if have_depth {
         // What a map shows no hull knows better.
     } else if use_hull {
-        out.append(hull::carve(frames, &volume, &times, settings.count, moving, rng.fork(1))?);
+        out.append(hull::carve(frames, &volume, &times, count, moving, rng.fork(1))?);
     } else if settings.source == Source::Auto && have_points && moving {
-        out.append(hull::carve_moving(frames, &volume, &times, settings.count, rng.fork(1))?);
+        out.append(hull::carve_moving(frames, &volume, &times, count, rng.fork(1))?);
     } else if settings.source == Source::Random || !have_points {
-        out.append(volume::random(frames, &volume, settings.count, moving.then_some(plan.clip), rng.fork(2)));
+        out.append(volume::random(frames, &volume, count, moving.then_some(plan.clip), rng.fork(2)));
     }
     out.truncate_evenly(plan.common.densify.max_cap, rng.fork(3));
     Ok(out)

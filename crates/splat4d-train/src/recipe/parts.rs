@@ -1,9 +1,11 @@
 //! The parts of a run, built from the recipe's tables: the method of a motion model, and the plan that methods read.
 
 use super::Recipe;
+use crate::init::{self, InitSettings};
 use crate::methods::{
     CommonSettings, Plan, Program, control, deform, filtered, hexplane, native4d, own, spacetime, ssm, still, tracked,
 };
+use crate::upkeep::{AdcSettings, DENSE, FINEST};
 use crate::{Error, Result};
 use splat4d::motion::{BUILT_IN, MODELS};
 
@@ -57,6 +59,24 @@ impl Recipe {
         PROGRAMS.into_iter().map(|(name, make)| (name, make(self)))
     }
 
+    /// Settings of the initial Gaussians, with their number.
+    pub(crate) fn initial(&self) -> InitSettings {
+        InitSettings { count: self.initial_count(), ..self.init.clone() }
+    }
+
+    /// The number of initial Gaussians; without its largest number of Gaussians, the least that it becomes.
+    pub(crate) fn initial_count(&self) -> usize {
+        if self.init.count == 0 { (self.crowd() * init::COUNT as f64) as usize } else { self.init.count }
+    }
+
+    /// The size above which a Gaussian is split, extents.
+    fn percent_dense(&self) -> f64 {
+        match self.adc.percent_dense {
+            0.0 => (DENSE / self.crowd()).max(FINEST),
+            stated => stated,
+        }
+    }
+
     /// The recipe's part of a plan, resolved; the capture's part (extent, clip, times, cameras) is still empty.
     pub fn plan(&self) -> Plan {
         let r = self.resolve();
@@ -72,7 +92,7 @@ impl Recipe {
                 life: r.life,
                 loss: r.loss,
                 densify: r.densify,
-                adc: r.adc,
+                adc: AdcSettings { percent_dense: r.percent_dense(), ..r.adc },
                 opacity_reset: r.opacity_reset,
                 mcmc: r.mcmc,
                 relocate: r.relocate,
@@ -83,5 +103,30 @@ impl Recipe {
             },
             ..Plan::default()
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn static_scenes_of_many_gaussians_begin_with_a_third_of_them() {
+        let of = |words: &[&str]| Recipe::of(words).unwrap().resolve().initial_count();
+        assert_eq!(of(&["motion=still", "max_cap=150000"]), 50_000);
+        assert_eq!(of(&["motion=still"]), init::COUNT, "small captures are tuned for as many");
+        assert_eq!(of(&["motion=spacetime", "max_cap=150000"]), init::COUNT);
+        assert_eq!(of(&["motion=still", "max_cap=150000", "init.count=700"]), 700);
+    }
+
+    #[test]
+    fn the_size_that_splits_falls_with_the_number_of_gaussians() {
+        let of = |words: &[&str]| Recipe::of(words).unwrap().plan().common.adc.percent_dense;
+        let near = |a: f64, b: f64| (a - b).abs() < 1e-12;
+        assert!(near(of(&["motion=still"]), 0.01) && near(of(&["motion=still", "max_cap=100"]), 0.01));
+        assert!(near(of(&["motion=still", "max_cap=150000"]), 0.002));
+        assert!(near(of(&["motion=still", "max_cap=5000000"]), 0.001), "not without end");
+        assert!(near(of(&["motion=spacetime", "max_cap=150000"]), 0.01));
+        assert!(near(of(&["motion=still", "max_cap=150000", "adc.percent_dense=0.03"]), 0.03));
     }
 }

@@ -7,10 +7,10 @@ const FLAT_DEFAULTS: &str = include_str!("tests/flat-defaults.toml");
 /// A resolved one with many knobs changed.
 const FLAT_CHANGED: &str = include_str!("tests/flat-changed.toml");
 
-/// The default recipe of then: its number of Gaussians did not follow from the capture, nor the rates of positions from it.
+/// The default recipe of then: its number of Gaussians did not follow from the capture, nor anything else from that.
 fn default_of_then() -> Recipe {
     Recipe::default().with(|r| {
-        r.densify.max_cap = 30_000;
+        (r.densify.max_cap, r.init.count, r.adc.percent_dense) = (30_000, 10_000, 0.01);
         (r.rates.position_init, r.rates.position_final) = (2e-3, 5e-5);
     })
 }

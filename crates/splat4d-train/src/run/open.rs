@@ -257,8 +257,8 @@ impl OpenCapture {
         };
         let (first, frames) = (program.first(plan), self.frames.as_ref());
         match moving && program.one_moment(plan) {
-            true => init::one_moment(&first, &recipe.init, frames, points),
-            false => init::seeds(&first, &recipe.init, frames, points, moving),
+            true => init::one_moment(&first, &recipe.initial(), frames, points),
+            false => init::seeds(&first, &recipe.initial(), frames, points, moving),
         }
     }
 

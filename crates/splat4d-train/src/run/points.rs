@@ -41,7 +41,7 @@ pub(super) fn complete(
         return Ok(opened);
     }
     let moments = moments(recipe, &plan)?;
-    let count = (WANTED * recipe.init.count as f64) as usize;
+    let count = (WANTED * recipe.initial_count() as f64) as usize;
     let mark = format!("comment of {} {} {count} {moments:?}", fingerprint(capture), env!("CARGO_PKG_VERSION"));
     let kept =
         crate::files::read(&run.join(FILE)).is_ok_and(|bytes| bytes.windows(mark.len()).any(|w| w == mark.as_bytes()));
@@ -77,7 +77,7 @@ fn wanted(capture: &Capture, recipe: &Recipe) -> bool {
         Source::Pictures => true,
         // Objects that are cut out of their background are carved from their masks; depth maps show all that there is.
         Source::Auto if capture.background.is_some() => false,
-        Source::Auto if (own.len() as f64) < FEW * recipe.init.count as f64 => true,
+        Source::Auto if (own.len() as f64) < FEW * recipe.initial_count() as f64 => true,
         Source::Auto => !capture.frames.iter().any(|f| f.depth.is_some()) && bare(capture, own) > BARE,
         _ => false,
     }

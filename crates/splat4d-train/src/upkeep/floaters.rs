@@ -33,6 +33,9 @@ const FEWEST: usize = 8;
 /// Moments, evenly over the clip, at which Gaussians are looked at; each counts where it is most visible.
 const MOMENTS: usize = 5;
 
+/// Rows in a task.
+const NEIGHBOURS: usize = 1024;
+
 /// See the module's documentation.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Floaters {
@@ -133,10 +136,14 @@ impl<'a> Places<'a> {
         }
         let points: Vec<[f64; 3]> = most.into_iter().map(|(_, x)| x).collect();
         let Some(depth) = self.depth(&points) else { return vec![true; rows] };
-        let stays = |&x: &[f64; 3]| {
+        let stays = |hint: &mut [usize; 2], x: [f64; 3]| {
+            if hint[0] != hint[1] && hint.iter().all(|&k| seen(self.cameras[k].0, x).is_some()) {
+                return true;
+            }
             let (mut views, mut veils) = (0, false);
-            for (camera, place) in &self.cameras {
+            for (k, (camera, place)) in self.cameras.iter().enumerate() {
                 if seen(camera, x).is_some() {
+                    hint[views] = k;
                     views += 1;
                     if views > 1 {
                         return true;
@@ -147,7 +154,12 @@ impl<'a> Places<'a> {
             }
             !veils
         };
-        points.par_iter().map(stays).collect()
+        // Rows are neighbours: two cameras that see one of them mostly see the next one, and the others are not asked.
+        let rows = points.par_chunks(NEIGHBOURS).flat_map_iter(|points| {
+            let mut hint = [0; 2];
+            points.iter().map(move |&x| stays(&mut hint, x))
+        });
+        rows.collect()
     }
 }
 

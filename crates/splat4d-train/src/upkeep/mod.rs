@@ -22,7 +22,7 @@ pub(crate) mod split;
 pub(crate) mod tests;
 pub mod worth;
 
-pub(crate) use adc::{Adc, AdcSettings};
+pub(crate) use adc::{Adc, AdcSettings, DENSE, FINEST};
 pub(crate) use densify::LEAST;
 pub use densify::{DensifySettings, Strategy};
 pub(crate) use floaters::{FloaterSettings, Floaters};
