@@ -1,5 +1,5 @@
 //! Tidy: what the compiler does not check. Imports (`tidy/imports.rs`), file sizes, `unsafe`, printing, and that the documents tell the
-//! truth about paths and flags. Reads files only: no network, well under a second.
+//! truth about paths and flags. Reads files only: no network, a second or two.
 
 #[path = "tidy/imports.rs"]
 mod imports;

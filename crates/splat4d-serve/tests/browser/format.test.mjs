@@ -256,7 +256,7 @@ test('hostile and foreign files are refused in words', async () => {
     ['no palette', layout(base, [PAGE({ palette: 77 })])],
     ['refers to no page', layout(base, [PAGE(), MASK({ page: 1 })])],
     ['refers to no page', layout(base, [PAGE(), MASK({ page: 99 })])],
-    ['of 2 Gaussians, its page', layout(base, [PAGE(), MASK({ count: 2 })])],
+    ['for 2 Gaussians, its page', layout(base, [PAGE(), MASK({ count: 2 })])],
     ['two masks', layout(base, [PAGE(), MASK(), MASK()])],
     ['entries', layout(base, [PAGE(), MASK({ count: 0 })])],
     ['key times', layout(base, [PAGE(), MASK({ data: Buffer.alloc(8) })])],
