@@ -16,6 +16,7 @@ const TUTORIALS = [
   ['docs/own-videos', 'Your own videos'],
   ['docs/own-page', 'A player on your page'],
   ['docs/own-motion-model', 'Your own motion model'],
+  ['docs/own-motion-python', 'Your own motion model in Python'],
   ['docs/own-loss', 'Your own loss'],
   ['docs/from-scratch', '4D Gaussians from scratch'],
 ];
@@ -74,12 +75,13 @@ const REFERENCE = [
 const EXPLANATION = [
   ['docs/models', 'Motion models'],
   ['docs/method-motion', 'Equations of motion models'],
-  ['docs/method-rendering', 'Rendering'],
-  ['docs/method-training', 'Training'],
-  ['docs/method-playback', 'Baking and compression'],
+  ['docs/method-rendering', 'How rendering works'],
+  ['docs/method-training', 'How training works'],
+  ['docs/method-playback', 'How baking works'],
   ['docs/determinism', 'Determinism'],
   ['ARCHITECTURE', 'Architecture'],
   ['CONVENTIONS', 'Conventions'],
+  ['docs/limits', 'What splat4d does not do'],
   ['docs/comparison', 'Other programs'],
   ['SECURITY', 'Security'],
 ];

@@ -230,7 +230,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_cell_is_there_once_and_can_be_told_apart() {
+    fn every_cell_exists_once_and_is_distinct() {
         let grid = Grid::full(1000);
         let cells = grid.cells();
         assert!(cells[0].is_source() && cells[1..].iter().all(|c| !c.is_source()));

@@ -104,10 +104,10 @@ fn markdown(args: &Args, clean: &[Findings], noisy: &Findings) -> String {
     );
     let _ = write!(
         out,
-        "\nNoise of {} px a flow vector: following it is {:.1} times better than frame 0; with both depths what remains \
-         is a random walk, {:.0} times better. A cubic curve a point, fitted to what every frame shows by itself (as motion \
-         models are fitted to pictures), has no walk: {:.0} times better.\n\n## Smoothing\n\n\
-         | passes of a moving average over 3 frames | error of one step's flow, RMSE | position after step 1, RMSE | \
+        "\nNoise of {} px a flow vector: following it is {:.1} times better than frame 0; with both depths what \
+         remains is a random walk, {:.0} times better. A cubic curve a point, fitted to what every frame shows by \
+         itself (as motion models are fitted to images), has no walk: {:.0} times better.\n\n## Smoothing\n\n| \
+         passes of a moving average over 3 frames | error of one step's flow, RMSE | position after step 1, RMSE | \
          position at the end, MSE |\n|---:|---:|---:|---:|\n",
         args.noise,
         noisy.ratio(),

@@ -32,15 +32,21 @@ const QUICK_SHARE: f64 = 1.0 / 30.0;
 /// Width and height of the pictures that speed is measured on with `--quick`.
 const QUICK_SIZE: [usize; 2] = [200, 200];
 
-const EXAMPLES: &str = "\
-Examples:
-  studies e03 runs/knight                       all of it: about 45 cells, each a fine-tuning
-  studies e03 runs/knight --quick               a glance: fewer points, shorter fine-tuning
-  studies e03 runs/a runs/b -o studies/pruning  two scenes; every run has its own tables and pictures
+const EXAMPLES: &str = "Examples:
+  studies e03 runs/knight                       all of it: about 45 cells, each a \
+                        fine-tuning
+  studies e03 runs/knight --quick               a glance: fewer points, shorter \
+                        fine-tuning
+  studies e03 runs/a runs/b -o studies/pruning  two scenes; every run has its own \
+                        tables and images
 
-Every cell prunes a share of the run's Gaussians and measures what is left on the held-out views, on the CPU and in
-32-bit floats: shares from 0 to 95 %, the temporal filter, fine-tuning, the scores of 4DGS-1K, frames between key times,
-rounds. What was found is in DIR/e03.json (after every cell: the same command goes on where it was stopped), DIR/e03.md and
+Every cell prunes a share of the run's Gaussians and measures what is left \
+                        on the held-out views, on the CPU and in
+32-bit floats: shares from 0 to 95 %, the temporal \
+                        filter, fine-tuning, the scores of 4DGS-1K, frames between key times,
+rounds. What was found \
+                        is in DIR/e03.json (after every cell: the same command goes on where it was stopped), \
+                        DIR/e03.md and
 DIR/e03-*.svg. With --json every cell is a line.";
 
 /// Measure pruning and the temporal filter of 4DGS-1K on trained runs

@@ -39,7 +39,7 @@ Examples:
   studies e03 runs/knight --quick
   studies models examples/knight       every motion model, three minutes each
   studies suite --data sets            the recipe on captures of every kind
-  studies make one-wall runs/one-wall  a made-up capture that is hard for one reason
+  studies make one-wall runs/one-wall  a synthetic capture that is hard for one reason
 
 A study can be stopped at any time and goes on where it was.";
 
@@ -61,7 +61,7 @@ enum Study {
     E03(e03::Args),
     Models(models::Args),
     Suite(suite::Args),
-    /// Draw a made-up capture that is hard for one reason
+    /// Draw a synthetic capture that is hard for one reason
     Make(made::Args),
     /// `splat4d train`, for `models`: a cell is a process, so that its peak of memory is its own.
     #[command(hide = true)]

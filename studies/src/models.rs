@@ -25,15 +25,20 @@ const GLANCE: Duration = Duration::from_millis(100);
 /// Cost of a cell besides its minutes (probes, evaluation, baking, playing), minutes; for the time that is left.
 const OVERHEAD: f64 = 0.6;
 
-const EXAMPLES: &str = "\
-Examples:
-  studies models examples/knight                         every model for three minutes each
-  studies models a-take b-take --only control,hexplane   some models on two captures
+const EXAMPLES: &str = "Examples:
+  studies models examples/knight                         every model for three \
+                        minutes each
+  studies models a-take b-take --only control,hexplane   some models on two \
+                        captures
   studies models examples/knight --minutes 1 -o quick
 
-Every cell is a run of its own (DIR/CAPTURE-MODEL), trained by `splat4d train` on pictures of half size, measured on the
-held-out views and played on the CPU at 800x800. A run that is there is not trained again: the same command goes on where
-it was stopped. The table is printed and written to DIR/models.md, the numbers to DIR/models.json.";
+Every cell is a run of its \
+                        own (DIR/CAPTURE-MODEL), trained by `splat4d train` on images of half size, measured on \
+                        the
+held-out views and played on the CPU at 800x800. A run that is there is not trained \
+                        again: the same command goes on where
+it was stopped. The table is printed and written to \
+                        DIR/models.md, the numbers to DIR/models.json.";
 
 /// Train every motion model on the same captures, and compare them
 #[derive(Debug, clap::Args)]
@@ -205,10 +210,10 @@ fn judge(folder: &Path, capture: &str, model: &str, console: &Console) -> anyhow
 
 fn markdown(cells: &[Cell], args: &Args) -> String {
     let mut out = format!(
-        "Trained for {} minutes a cell on pictures reduced by {}, on this machine's CPU. PSNR, SSIM and flicker (mean \
-         difference between the change from frame to frame and the truth's, in 1/255) are means over the held-out views, \
-         `moving` is PSNR of dynamic regions. `scene` is the learnt state in 32-bit floats, `file` the playback file. \
-         Frames a second: the learnt state, end to end, 800x800.\n",
+        "Trained for {} minutes a cell on images reduced by {}, on this machine's CPU. PSNR, SSIM and flicker (mean \
+         difference between the change from frame to frame and the truth's, in 1/255) are means over the held-out \
+         views, `moving` is PSNR of dynamic regions. `scene` is the learnt state in 32-bit floats, `file` the \
+         playback file. Frames a second: the learnt state, end to end, 800x800.\n",
         args.minutes, args.downscale
     );
     let mut captures: Vec<&str> = Vec::new();

@@ -174,7 +174,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn tables_and_curves_tell_what_is_there() {
+    fn tables_and_curves_show_what_exists() {
         let grid = Grid::full(1000);
         let empty = Findings { name: "knight".into(), ..Findings::default() };
         let page = markdown(&empty, &grid);

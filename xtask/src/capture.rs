@@ -1,4 +1,4 @@
-//! `capture`: draws the bundled capture with its poses, masks and ground truth; the same bits every time.
+//! Renders the bundled capture with its poses, masks and ground truth; the same bits every time.
 
 use crate::camera::Camera;
 use crate::files::{png, write_file};
@@ -8,7 +8,7 @@ use crate::raster::{Visibility, rasterize};
 use crate::scene::{FPS, FRAMES, Frame, Stage};
 use crate::truth;
 use crate::vector::{V3, sin_cos, v3};
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Result, ensure};
 use image::ExtendedColorType;
 use jpeg_encoder::QuantizationTableType;
 use rayon::prelude::*;
@@ -33,37 +33,6 @@ const JPEG_QUALITY: u8 = 60;
 /// Views that come with depth and flow.
 const TRUTH_CAMERAS: [usize; 4] = [2, 8, 11, 17];
 const TRUTH_FRAMES: [usize; 4] = [3, 10, 17, 24];
-
-/// `capture [FOLDER]`, `capture --truth FOLDER`, `capture --check [N]`, `capture --still CHARACTER.glb FOLDER ...`, `capture --videos FOLDER`,
-/// `capture --world NAME FOLDER` and `capture --long SECONDS FOLDER`.
-pub(crate) fn command(arguments: &[String]) -> Result<()> {
-    let home = bundled_folder();
-    match arguments {
-        [flag, rest @ ..] if flag == "--check" => {
-            let count = match rest {
-                [] => 3,
-                [n] => n.parse().with_context(|| format!("{n} is not a number of pictures"))?,
-                _ => bail!("capture --check takes one number"),
-            };
-            let clock = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH)?.subsec_nanos();
-            let picks = (0..count).map(|i| (u64::from(clock) + 7919 * i) as usize % (CAMERAS * FRAMES));
-            check(&home, &picks.map(|p| (p % CAMERAS, p / CAMERAS)).collect::<Vec<_>>())
-        }
-        [flag, rest @ ..] if flag == "--still" => crate::still::command(rest),
-        [flag, name, folder] if flag == "--world" => crate::world::command(name, Path::new(folder), false),
-        [flag, name, truth, folder] if flag == "--world" && truth == "--truth" => {
-            crate::world::command(name, Path::new(folder), true)
-        }
-        [flag, folder] if flag == "--truth" && !folder.starts_with('-') => write(&home, Path::new(folder), true),
-        [flag, seconds, folder] if flag == "--long" => crate::long::command(seconds, Path::new(folder)),
-        [flag, folder] if flag == "--videos" => crate::videos::command(Path::new(folder)),
-        [] => write(&home, &home, false),
-        [folder] if !folder.starts_with('-') => write(&home, Path::new(folder), false),
-        _ => bail!(
-            "capture takes a folder, --truth with a folder, --check with a number, --still with a character and a folder, --videos with a folder, --world with a name, --truth if it is wanted, and a folder, or --long with seconds and a folder"
-        ),
-    }
-}
 
 /// examples/knight of this checkout.
 pub(crate) fn bundled_folder() -> PathBuf {
@@ -93,7 +62,7 @@ struct View {
 }
 
 /// Draws the capture; `maps`: with depth, flow and labels of every picture.
-fn write(home: &Path, folder: &Path, maps: bool) -> Result<()> {
+pub(crate) fn write(home: &Path, folder: &Path, maps: bool) -> Result<()> {
     let start = std::time::Instant::now();
     let stage = Stage::load(&home.join("characters"))?;
     let cameras = rig();
@@ -138,7 +107,7 @@ fn write(home: &Path, folder: &Path, maps: bool) -> Result<()> {
 }
 
 /// Draws the given (camera, frame) pairs again and compares them with the files in `folder`.
-fn check(folder: &Path, picks: &[(usize, usize)]) -> Result<()> {
+pub(crate) fn check(folder: &Path, picks: &[(usize, usize)]) -> Result<()> {
     let stage = Stage::load(&folder.join("characters"))?;
     let cameras = rig();
     for &(c, t) in picks {
@@ -254,7 +223,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_committed_pictures_are_what_this_code_draws() {
+    fn the_committed_images_are_what_this_code_draws() {
         check(&bundled_folder(), &[(8, 14)]).expect("same bytes");
     }
 

@@ -32,7 +32,7 @@ const BOUNCE: f64 = 0.67;
 
 /// `--long SECONDS FOLDER`.
 pub(crate) fn command(seconds: &str, folder: &Path) -> Result<()> {
-    let length: f64 = seconds.parse().with_context(|| format!("{seconds} is no number of seconds"))?;
+    let length: f64 = seconds.parse().with_context(|| format!("invalid seconds `{seconds}`"))?;
     ensure!(length * FPS >= 1.0 && length <= MAX_SECONDS, "give seconds from {:.3} to {MAX_SECONDS:.0}", 1.0 / FPS);
     let frames = (length * FPS).round() as usize;
     let stage = Stage::load(&bundled_folder().join("characters"))?;

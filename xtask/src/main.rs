@@ -9,6 +9,7 @@
 
 mod camera;
 mod capture;
+mod captures;
 mod chaos;
 mod count;
 mod files;
@@ -35,31 +36,52 @@ use anyhow::{Context, Result, bail, ensure};
 use std::path::Path;
 use std::process::ExitCode;
 
-const USAGE: &str = "\
-usage: cargo run --release -p xtask -- CHORE
+const USAGE: &str = "usage: cargo run --release -p xtask -- CHORE
 
 chores:
-  capture [FOLDER]           draws the bundled capture into FOLDER (default: examples/knight)
-  capture --truth FOLDER     the same with depth, flow and labels (integer PNG) of every picture: some 80 MB
-  capture --check [N]        draws N random pictures (default 3) and compares them with examples/knight byte for byte
-  capture --still CHARACTER.glb FOLDER [--views N] [--size PIXELS] [--pose CLIP SECONDS] [--drop NODE...]
-                             draws a character frozen in one pose, cut out, from N (default 100) cameras on a
-                             hemisphere, PIXELS (default 400) wide and high; every 8th is held out
-  capture --videos FOLDER    draws the scene as eight unsynchronised, uncalibrated, differently exposed videos with sound,
-                             for `splat4d import`, and truth.json beside them
+  capture [FOLDER]           draws the \
+                     bundled capture into FOLDER (default: examples/knight)
+  capture --truth FOLDER     the same \
+                     with depth, flow and labels (integer PNG) of every image: some 80 MB
+  capture --check [N]       \
+                      draws N random images (default 3) and compares them with examples/knight byte for byte
+  \
+                     capture --still CHARACTER.glb FOLDER [--views N] [--size PIXELS] [--pose CLIP SECONDS] [--drop \
+                     NODE...]
+                             draws a character frozen in one pose, cut out, from N \
+                     (default 100) cameras on a
+                             hemisphere, PIXELS (default 400) wide \
+                     and high; every 8th is held out
+  capture --videos FOLDER    draws the scene as eight \
+                     unsynchronised, uncalibrated, differently exposed videos with sound,
+                            \
+                      for `splat4d import`, and truth.json next to them
   capture --world NAME [--truth] FOLDER
-                             draws a world of known physics for `splat4d predict`: pendulum, circle, pushed-block, bounce,
-                             rolling, collision or cloth; true paths of its nodes and actions beside it, with --truth also depth, flow and labels
-  capture --long SECONDS FOLDER
-                             draws a take of any length: twenty cameras, 30 frames a second, 200x150, a frame in memory at a time
-  strip-character IN.glb OUT.glb CLIP... [--drop NODE...]
-                             keeps the named animation clips of a character, drops the named nodes' meshes
+       \
+                                           draws a world of known physics for `splat4d predict`: pendulum, circle, \
+                     pushed-block, bounce,
+                             rolling, collision or cloth; true paths of \
+                     its nodes and actions next to it, with --truth also depth, flow and labels
+  capture --long \
+                     SECONDS FOLDER
+                             draws a take of any length: twenty cameras, 30 \
+                     frames a second, 200x150, a frame in memory at a time
+  strip-character IN.glb OUT.glb CLIP... \
+                     [--drop NODE...]
+                             keeps the named animation clips of a character, \
+                     drops the named nodes' meshes
   fuzz [--minutes N] [--seed S] [--reader NAME]
-                             mutates sound inputs of every reader and prints how many were read (default: 2 minutes)
+                   \
+                               mutates sound inputs of every reader and prints how many were read (default: 2 \
+                     minutes)
   chaos [--trials N] [--seed N] [--verb NAME] [--program FILE]
-                             disturbs every verb that writes (kill -9, full disk, two owners, clock jumps, read-only
-                             folders) and compares its result with the undisturbed one; wants the release build
-  count [FOLDER]             counts lines of code, without tests, comments and blank lines, of the repository FOLDER";
+                         \
+                         disturbs every verb that writes (kill -9, full disk, two owners, clock jumps, read-only
+     \
+                                             folders) and compares its result with the undisturbed one; wants the \
+                     release build
+  count [FOLDER]             counts lines of code, without tests, comments and \
+                     blank lines, of the repository FOLDER";
 
 fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
@@ -75,7 +97,7 @@ fn main() -> ExitCode {
 fn run(arguments: &[String]) -> Result<()> {
     let (chore, rest) = arguments.split_first().context(USAGE)?;
     match chore.as_str() {
-        "capture" => capture::command(rest),
+        "capture" => captures::command(rest),
         "chaos" => chaos::command(rest),
         "count" => count::command(rest),
         "fuzz" => fuzz::command(rest),

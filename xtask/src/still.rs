@@ -202,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn the_whole_character_is_in_every_picture_and_cut_out() {
+    fn the_whole_character_is_in_every_image_and_cut_out() {
         let wish = wish(&format!("{} out --size 48 --views 12 --pose Spellcast_Long 1", mage())).expect("reads");
         let (frame, texture) = posed(&wish).expect("the character loads");
         let cameras = hemisphere(&frame.mesh, wish.views, wish.size);
@@ -221,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn the_description_is_a_capture_of_still_pictures() {
+    fn the_description_is_a_capture_of_still_images() {
         let wish = wish(&format!("{} out --views 9 --size 32", mage())).expect("reads");
         let (frame, _) = posed(&wish).expect("the character loads");
         let text = description(&wish, &hemisphere(&frame.mesh, 9, 32)).expect("plain data");

@@ -1,175 +1,14 @@
-//! Tidy: what the compiler does not check. Import order, file sizes, `unsafe`, printing, and that the documents tell the
-//! truth about paths and flags. Reads files only: no network, well under a second.
+//! Tidy: what the compiler does not check. Imports (`tidy/imports.rs`), file sizes, `unsafe`, printing, and that the documents tell the
+//! truth about paths and flags. Reads files only: no network, a second or two.
+
+#[path = "tidy/imports.rs"]
+mod imports;
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// The allowed order of a crate's top modules: a module may import those before it. Names that do not exist yet
-/// hold a place for what the design foresees.
-const ORDER: [(&str, &[&str]); 8] = [
-    (
-        "crates/splat4d",
-        &[
-            "error", "text", "wgsl", "simd", "math", "scene", "nn", "motion", "layers", "render", "gpu", "device",
-            "flow", "channels", "format", "bake", "play", "edit",
-        ],
-    ),
-    (
-        "crates/splat4d-train",
-        // The recipe stands first because everything is told by it; losses and upkeep before
-        // `methods`, which choose among them; `init` needs a model's plan; `eval` writes as safely as `run` does.
-        &[
-            "path_text",
-            "settings",
-            "recipe",
-            "event",
-            "text",
-            "files",
-            "output",
-            "keypoints",
-            "capture",
-            "vision",
-            "sampler",
-            "optim",
-            "loss",
-            "learner",
-            "upkeep",
-            "methods",
-            "step",
-            "init",
-            "run",
-            "blended",
-            "labels",
-            "features",
-            "eval",
-            "training",
-            "compress",
-            "dist",
-        ],
-    ),
-    (
-        "crates/splat4d-dynamics",
-        &[
-            "actions",
-            "paths",
-            "worlds",
-            "smooth",
-            "optimise",
-            "ballistic",
-            "koopman",
-            "learnt",
-            "causal",
-            "graph",
-            "models",
-            "score",
-            "nodes",
-            "future",
-            "assimilate",
-        ],
-    ),
-    (
-        "crates/splat4d-import",
-        &["board", "calibration", "video", "sync", "sfm", "corrections", "write", "shipped", "take", "doctor"],
-    ),
-    (
-        "crates/splat4d-serve",
-        &[
-            "write_timeout",
-            "body",
-            "range",
-            "reply",
-            "guard",
-            "scene",
-            "edit",
-            "assets",
-            "page",
-            "events",
-            "answer",
-            "server",
-        ],
-    ),
-    (
-        "crates/splat4d-cli",
-        &[
-            "files",
-            "interrupt",
-            "deadline",
-            "camera_file",
-            "console",
-            "video",
-            "device",
-            "paths",
-            "run_folder",
-            "sequence",
-            "source",
-            "draw",
-            "raw",
-            "asked",
-            "measure",
-            "baking",
-            "playable",
-            "serving",
-            "report",
-            "finish",
-            "film",
-            "labelling",
-            "chunked",
-            "compressing",
-            "predicting",
-            "editing",
-            "editor",
-            "texts",
-            "verbs",
-            "main",
-            "bin",
-        ],
-    ),
-    (
-        "crates/splat4d-py",
-        &[
-            "errors",
-            "arrays",
-            "plain",
-            "settings",
-            "camera",
-            "gaussians",
-            "from_arrays",
-            "metrics",
-            "loss",
-            "scene",
-            "run",
-            "capture",
-            "train",
-        ],
-    ),
-    (
-        "studies",
-        &[
-            "cells",
-            "study",
-            "tables",
-            "deformation",
-            "lifting",
-            "made",
-            "e00",
-            "e01",
-            "e02",
-            "e03",
-            "models",
-            "suite",
-            "main",
-        ],
-    ),
-];
-
-/// Module that puts together what others declare: of modules that stand above it it may import names with this ending.
-const COMPOSES: (&str, &str, &str) = ("crates/splat4d-train", "recipe", "Settings");
-
-/// Modules that a module must not import although they stand before it: the design's first invariant.
-const NEVER: [(&str, &str, &[&str]); 1] = [
-    // The renderer knows no time: it sees splats, not the models and layers that make them.
-    ("crates/splat4d", "render", &["motion", "layers"]),
-];
+#[path = "tidy/words.rs"]
+mod words;
 
 /// Files longer than `MAX_LINES`, each with its reason; none at present.
 const LONG_FILES: [(&str, &str); 0] = [];
@@ -197,31 +36,6 @@ const ROOT_DOCS: [&str; 6] =
 /// Longest pages, in lines: a longer one covers two subjects.
 const PAGE_LINES: usize = 250;
 const README_LINES: usize = 150;
-
-/// Phrases that documents do not use, because readers have to translate them into the field's terms; outside of code. A phrase
-/// begins a word: `picture` also finds `pictures`. CONTRIBUTING.md, "Language", says what to write.
-const FORBIDDEN: [&str; 20] = [
-    "anew",
-    "are no numbers",
-    "are told",
-    "at last",
-    "beside",
-    "everybody",
-    "goes back",
-    "is no number",
-    "is told",
-    "is worth",
-    "knob",
-    "made up",
-    "made-up",
-    "nobody",
-    "of before",
-    "picture",
-    "tells",
-    "the way back",
-    "upkeep",
-    "whoever",
-];
 
 /// Folders of the repository that a path in a document begins with.
 const ROOTS: [&str; 6] = ["crates/", "docs/", "examples/", "studies/", "xtask/", ".ci/"];
@@ -307,103 +121,6 @@ fn is_word(c: char) -> bool {
     c.is_alphanumeric() || c == '_'
 }
 
-/// First names behind `prefix` in a statement: `crate::a::b` gives a, `crate::{a, b::{c, d}}` gives a and b.
-fn names_behind(statement: &str, prefix: &str) -> Vec<String> {
-    let mut out = Vec::new();
-    for (at, _) in statement.match_indices(prefix) {
-        if statement[..at].chars().next_back().is_some_and(|c| is_word(c) || c == ':') {
-            continue;
-        }
-        let rest = &statement[at + prefix.len()..];
-        let Some(list) = rest.strip_prefix('{') else {
-            out.push(rest.chars().take_while(|&c| is_word(c)).collect());
-            continue;
-        };
-        let (mut depth, mut word, mut fresh) = (0, String::new(), true);
-        for c in list.chars() {
-            match c {
-                '{' => depth += 1,
-                '}' if depth == 0 => break,
-                '}' => depth -= 1,
-                ',' if depth == 0 => {
-                    out.push(std::mem::take(&mut word));
-                    fresh = true;
-                }
-                c if depth == 0 && fresh && is_word(c) => word.push(c),
-                c if c.is_whitespace() => {}
-                _ => fresh = false,
-            }
-        }
-        out.push(word);
-    }
-    out.retain(|name| !name.is_empty());
-    out
-}
-
-/// The text without statements `use crate::…` that import nothing but names with this ending.
-fn without_imports(text: &str, ending: &str) -> String {
-    let all_end = |statement: &str| {
-        let names = statement.rsplit("::").next().unwrap_or("").trim_matches(|c: char| !is_word(c));
-        names.split(',').map(str::trim).filter(|n| !n.is_empty()).all(|n| n.ends_with(ending))
-    };
-    let keep = |s: &&str| !(s.trim_start().starts_with("use crate::") && all_end(s));
-    text.split_inclusive(';').filter(keep).collect()
-}
-
-#[test]
-fn imports_of_one_ending_are_found() {
-    let text = "use crate::a::{BSettings, CSettings};\nuse crate::d::E;\nuse crate::f::GSettings;\nfn h() {}";
-    assert_eq!(names_behind(&without_imports(text, "Settings"), "crate::"), ["d"]);
-}
-
-#[test]
-fn names_behind_a_prefix_are_found() {
-    assert_eq!(names_behind("use crate::a::b;", "crate::"), ["a"]);
-    assert_eq!(names_behind("use crate::{Error, a, b::{c, d}, e};", "crate::"), ["Error", "a", "b", "e"]);
-    assert_eq!(names_behind("x = crate::a::f(super::super::b)", "super::super::"), ["b"]);
-}
-
-#[test]
-fn modules_import_downwards() {
-    let mut troubles = Vec::new();
-    for (place, order) in ORDER {
-        let src = format!("{place}/src/");
-        let exists = |name: &str| {
-            root().join(format!("{src}{name}.rs")).is_file() || root().join(format!("{src}{name}/mod.rs")).is_file()
-        };
-        let rank = |name: &str| order.iter().position(|n| *n == name);
-        for path in files(&src, "rs").into_iter().filter(|p| !is_test(p)) {
-            let inside = path.strip_prefix(&src).expect("it lies below").trim_end_matches(".rs");
-            let module = inside.split('/').next().expect("a path has a first part");
-            if module == "lib" {
-                continue;
-            }
-            let Some(own) = rank(module) else {
-                troubles.push(format!("{path}: module `{module}` has no place in ORDER"));
-                continue;
-            };
-            // `super::` as often as the module lies deep is another way to say `crate::`.
-            let depth = inside.trim_end_matches("/mod").split('/').count();
-            let above = "super::".repeat(depth);
-            let lines = code(&read(&path));
-            let text: String = lines.iter().map(|(_, l)| l.as_str().to_owned() + "\n").collect();
-            let composes = (place, module) == (COMPOSES.0, COMPOSES.1);
-            let text = if composes { without_imports(&text, COMPOSES.2) } else { text };
-            let mut named = names_behind(&text, "crate::");
-            named.extend(names_behind(&text, &above));
-            for name in named.into_iter().filter(|n| exists(n) && n != module).collect::<BTreeSet<_>>() {
-                if rank(&name).is_some_and(|r| r > own) {
-                    troubles.push(format!("{path}: `{module}` imports `{name}`, which stands above it"));
-                }
-                if NEVER.iter().any(|(c, m, n)| *c == place && *m == module && n.contains(&name.as_str())) {
-                    troubles.push(format!("{path}: `{module}` must not know `{name}`"));
-                }
-            }
-        }
-    }
-    report(troubles, "Move what both need into the lower module; see ARCHITECTURE.md and ORDER in this test.");
-}
-
 #[test]
 fn files_are_short() {
     let mut troubles = Vec::new();
@@ -462,82 +179,6 @@ fn libraries_do_not_print_and_splat4d_opens_no_file() {
 /// Every document that is checked, in order.
 fn documents() -> Vec<String> {
     ROOT_DOCS.map(str::to_owned).into_iter().chain(files("docs", "md")).collect()
-}
-
-/// A document's prose: fenced blocks, code spans and the targets of links are blank; lines stay where they are.
-fn prose(text: &str) -> String {
-    let mut out = String::new();
-    let mut fenced = false;
-    for line in text.lines() {
-        let fence = line.trim_start().starts_with("```");
-        fenced ^= fence;
-        if !fenced && !fence {
-            // Odd parts are code spans; a span ends on its line.
-            let spoken: Vec<&str> = line.split('`').step_by(2).collect();
-            let spoken = spoken.join(" ");
-            let mut parts = spoken.split("](");
-            out += parts.next().unwrap_or("");
-            for part in parts {
-                out += part.split_once(')').map_or("", |(_, rest)| rest);
-            }
-        }
-        out.push('\n');
-    }
-    out
-}
-
-/// Where prose has one of the phrases: line and phrase.
-fn forbidden(text: &str) -> Vec<(usize, &'static str)> {
-    let mut found = Vec::new();
-    for (at, line) in prose(text).lines().enumerate() {
-        let line = line.to_lowercase();
-        for phrase in FORBIDDEN {
-            let begins =
-                |(at, _): (usize, &str)| !line[..at].ends_with(|c: char| c.is_alphanumeric() || c == '-' || c == '_');
-            if line.match_indices(phrase).any(begins) {
-                found.push((at + 1, phrase));
-            }
-        }
-    }
-    found
-}
-
-#[test]
-fn documents_use_the_terms_of_the_field() {
-    let sample = "A picture.\n`picture`, [a](knob.md)\n```\nknob\n```\nTells, retells.\n";
-    assert_eq!(forbidden(sample), [(1, "picture"), (6, "tells")], "phrases are found in prose and only there");
-    let mut troubles = Vec::new();
-    for doc in documents() {
-        let found = forbidden(&read(&doc));
-        troubles.extend(found.into_iter().map(|(line, phrase)| format!("{doc}:{line}: \"{phrase}\"")));
-    }
-    for path in sources() {
-        let text = read(&path);
-        let found = forbidden(&spoken(&path, &text));
-        troubles.extend(found.into_iter().map(|(line, phrase)| format!("{path}:{line}: \"{phrase}\"")));
-    }
-    report(troubles, "Use the term of the field: CONTRIBUTING.md, \"Language\".");
-}
-
-/// What outsiders read of a source file, at its lines: documentation of crates and modules, and the command's help.
-fn spoken(path: &str, text: &str) -> String {
-    let module = ["/lib.rs", "/mod.rs", "/main.rs"].iter().any(|name| path.ends_with(name));
-    let command = path.starts_with("crates/splat4d-cli/src/");
-    let lines: Vec<&str> = text.lines().collect();
-    let mut help = false;
-    let mut out = String::new();
-    for (at, line) in lines.iter().enumerate() {
-        help |= command && line.starts_with("const EXAMPLES");
-        // A comment of an argument stands above its attribute.
-        let below = lines[at..].iter().find(|l| !l.trim().starts_with("///"));
-        let argument = command && below.is_some_and(|l| ["#[arg", "#[command"].iter().any(|a| l.trim().starts_with(a)));
-        if module && line.starts_with("//!") || argument && line.trim().starts_with("///") || help {
-            out += line;
-        }
-        help &= !line.ends_with("\";");
-        out.push('\n');
-    }
-    out
 }
 
 /// What a heading is linked by, as GitHub and the site (`site/.vitepress/markdown.mjs`) have it.
@@ -720,7 +361,7 @@ fn flags_in_documents_exist() {
 
 /// Where a motion model may be told by its name or its spec: the list and the models' own files, and how each is learnt.
 const MODEL_ROOMS: [&str; 2] = ["crates/splat4d/src/motion/", "crates/splat4d-train/src/methods/"];
-/// Besides these, each with its reason.
+/// In addition to these, each with its reason.
 const MODEL_NAMES: [(&str, &str); 1] = [("crates/splat4d/src/layers/convert.rs", "turns one model into another")];
 
 /// Names and variants of the list of motion models: lines like `Still = "still" => ...`.

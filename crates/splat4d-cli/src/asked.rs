@@ -28,8 +28,8 @@ enum Column {
 }
 
 fn remedy() -> String {
-    "The first line names the columns: camera,x,y,time of pixels, or time,x,y,z of places, with camera where a camera's sight \
-     of them is wanted."
+    "The first line names the columns: camera,x,y,time for pixels, or time,x,y,z for points, with camera where its \
+     visibility is wanted."
         .into()
 }
 
@@ -49,20 +49,18 @@ pub(crate) fn read(text: &str, views: &[View], clip: [f64; 2]) -> Result<Vec<Ask
             "y" => Column::Y,
             "z" => Column::Z,
             _ => {
-                return Err(Error::input(format!("the column `{name:.40}` is not known"))
-                    .at("line 1")
-                    .remedy(remedy()));
+                return Err(Error::input(format!("unknown column `{name:.40}`")).at("line 1").remedy(remedy()));
             }
         };
         if columns.contains(&column) {
-            return Err(Error::input(format!("the column `{name}` is there twice")).at("line 1").remedy(remedy()));
+            return Err(Error::input(format!("duplicate column `{name}`")).at("line 1").remedy(remedy()));
         }
         columns.push(column);
     }
     let has = |c: Column| columns.contains(&c);
     let pixels = !has(Column::Z);
     if !(has(Column::Time) && has(Column::X) && has(Column::Y)) || pixels && !has(Column::Camera) {
-        return Err(Error::input(format!("the columns `{header:.80}` are neither of pixels nor of places"))
+        return Err(Error::input(format!("invalid columns `{header:.80}`: neither pixels nor points"))
             .at("line 1")
             .remedy(remedy()));
     }
@@ -75,7 +73,9 @@ pub(crate) fn read(text: &str, views: &[View], clip: [f64; 2]) -> Result<Vec<Ask
             return Err(place(Error::input(what).remedy(remedy())));
         }
         if out.len() == MOST_POINTS {
-            return Err(place(Error::input(format!("more than {MOST_POINTS} points")).remedy("Ask in several files.")));
+            return Err(place(
+                Error::input(format!("more than {MOST_POINTS} points")).remedy("Split them into several files."),
+            ));
         }
         let field = |c: Column| columns.iter().position(|k| *k == c).map(|i| fields[i]);
         let value = |c: Column| {
@@ -87,8 +87,8 @@ pub(crate) fn read(text: &str, views: &[View], clip: [f64; 2]) -> Result<Vec<Ask
         let (time, x, y) = (value(Column::Time)?, value(Column::X)?, value(Column::Y)?);
         if time < clip[0] - 1e-9 || time > clip[1] + 1e-9 {
             return Err(place(
-                Error::input(format!("{time} s is not in the scene's clip"))
-                    .remedy(format!("It goes from {} to {} s.", clip[0], clip[1])),
+                Error::input(format!("{time} s is outside the scene's clip"))
+                    .remedy(format!("The clip lasts from {} to {} s.", clip[0], clip[1])),
             ));
         }
         let camera = field(Column::Camera).filter(|name| !name.is_empty()).map(str::to_owned);
@@ -98,10 +98,10 @@ pub(crate) fn read(text: &str, views: &[View], clip: [f64; 2]) -> Result<Vec<Ask
             Some(camera) => {
                 let inside = (0.0..camera.width as f64).contains(&x) && (0.0..camera.height as f64).contains(&y);
                 if !inside {
-                    let what = format!("pixel ({x}, {y}) is not in a picture of {}x{}", camera.width, camera.height);
-                    return Err(place(Error::input(what).remedy(
-                        "Pixels are those of the pictures as the run has them (divided by its --downscale).",
-                    )));
+                    let what = format!("pixel ({x}, {y}) is outside the image of {}x{}", camera.width, camera.height);
+                    return Err(place(
+                        Error::input(what).remedy("Pixels are those of the run's images (divided by its --downscale)."),
+                    ));
                 }
                 Place::Pixel(Box::new(camera.clone()), [x, y])
             }
@@ -110,7 +110,7 @@ pub(crate) fn read(text: &str, views: &[View], clip: [f64; 2]) -> Result<Vec<Ask
         out.push(Asked { query: Query { time, place }, camera });
     }
     if out.is_empty() {
-        return Err(Error::input("the file of points names none").remedy(remedy()));
+        return Err(Error::input("the file contains no points").remedy(remedy()));
     }
     Ok(out)
 }
@@ -124,7 +124,7 @@ fn at<'a>(views: &'a [View], name: &str, t: f64) -> Result<&'a Camera> {
         names.sort_unstable();
         names.dedup();
         let remedy = match names.len() {
-            0 => "The file brings no cameras; ask of a run, or for places without a camera.".to_owned(),
+            0 => "The file contains no cameras. Use a run, or give points without a camera.".to_owned(),
             n => format!("There are {n}: {}.", names[..n.min(24)].join(", ")),
         };
         Error::input(format!("there is no camera `{name:.80}`")).remedy(remedy)
@@ -249,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_said_with_its_line() {
+    fn mistakes_are_reported_with_their_line() {
         for (text, words) in [
             ("", "empty"),
             ("camera,x,y,time\n", "names none"),

@@ -274,8 +274,8 @@ pub(crate) fn bake_into(
     }
     if antialias {
         console.warn(
-            "the run was trained with antialias = true, which playback files cannot hold: thin things look stronger \
-             in the player.",
+            "the run was trained with antialias = true, which playback files cannot store: thin structures look \
+             stronger in the player.",
         );
     }
     console.emit(&value);
@@ -373,7 +373,7 @@ pub(crate) fn bake_like(source: &Source, title: &str, baking: &Baking, console: 
 
 fn say(report: &bake::Report, likeness: Option<&bake::Likeness>, bytes: u64, seconds: f64, console: &Console) {
     let mut words = format!(
-        "{} Gaussians became {} primitives in {} spans of time, {} in {seconds:.1} s",
+        "{} Gaussians became {} primitives in {} time segments, {} in {seconds:.1} s",
         grouped(report.gaussians),
         grouped(report.primitives),
         grouped(report.nodes),
@@ -391,9 +391,9 @@ fn say(report: &bake::Report, likeness: Option<&bake::Likeness>, bytes: u64, sec
     console.say(&words);
     let e = &report.errors;
     if e.worst > 0.0 {
-        let tolerance = report.tolerance.map(|t| format!(" (tolerance {t} px)")).unwrap_or_default();
+        let tolerance = report.tolerance.map(|t| format!(" (tolerance {t:.3} px)")).unwrap_or_default();
         console.say(&format!(
-            "error a Gaussian: median {:.3} px, 99 of 100 below {:.3} px, worst {:.3} px{tolerance}",
+            "error per Gaussian: median {:.3} px, 99 of 100 below {:.3} px, worst {:.3} px{tolerance}",
             e.median, e.p99, e.worst
         ));
     }
@@ -416,7 +416,7 @@ fn compare(
     console: &Console,
 ) -> anyhow::Result<Option<bake::Likeness>> {
     if deadline.left() <= 0.0 {
-        console.say("the file is not compared with its model: nothing is left of --minutes");
+        console.say("the file is not compared with its model: no time is left of --minutes");
         return Ok(None);
     }
     likeness(scene, &playback::read(bytes)?, &shots(scene, stage, views), antialias, &mut |done, total| {

@@ -40,9 +40,7 @@ pub(crate) fn parse(text: &str) -> Result<(Camera, Option<[f32; 3]>)> {
     for key in object.keys().filter(|k| !KEYS.contains(&k.as_str())) {
         // Notes of other tools do no harm; a misspelt key would silently be left out.
         if let Some(near) = nearest(key, &KEYS).filter(|n| n.len() > 2) {
-            return Err(
-                Error::input(format!("the key \"{key}\" is not known")).remedy(format!("Did you mean \"{near}\"?"))
-            );
+            return Err(Error::input(format!("unknown key \"{key}\"")).remedy(format!("Did you mean \"{near}\"?")));
         }
     }
     let number = |key: &str| {
@@ -75,8 +73,8 @@ pub(crate) fn parse(text: &str) -> Result<(Camera, Option<[f32; 3]>)> {
     }
     let (width, height) = (side("w", "width")?, side("h", "height")?);
     if width * height > MAX_PIXELS {
-        return Err(Error::input(format!("a picture of {width}x{height} is too large"))
-            .remedy(format!("At most {MAX_PIXELS} pixels are drawn at once.")));
+        return Err(Error::input(format!("an image of {width}x{height} is too large"))
+            .remedy(format!("At most {MAX_PIXELS} pixels are rendered at once.")));
     }
     let cam_from_world = pose(value.get("world_to_camera").ok_or_else(|| missing("world_to_camera"))?)?;
     let background = match value.get("background").filter(|v| !v.is_null()) {
@@ -99,7 +97,7 @@ pub(crate) fn parse(text: &str) -> Result<(Camera, Option<[f32; 3]>)> {
 pub(crate) fn json(text: &str) -> Result<Value> {
     serde_json::from_str(text).map_err(|e| {
         let remedy = if text.contains("NaN") || text.contains("Infinity") {
-            "It holds NaN or Infinity, which JSON does not know: correct that number."
+            "It contains NaN or Infinity, which JSON does not allow: correct that number."
         } else if e.is_eof() {
             "The file looks truncated: write it again."
         } else {

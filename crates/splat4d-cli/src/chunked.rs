@@ -35,7 +35,7 @@ impl FromStr for Wanted {
         match text {
             "all" => Ok(Self::All),
             "shared" => Ok(Self::One(Part::Shared)),
-            _ => text.parse().map(|c| Self::One(Part::Chunk(c))).map_err(|_| "give shared, a number or all".into()),
+            _ => text.parse().map(|c| Self::One(Part::Chunk(c))).map_err(|_| "expected shared, a number or all".into()),
         }
     }
 }
@@ -45,8 +45,8 @@ pub(crate) fn in_words(outlook: &Outlook) -> String {
     let Outlook { recipe, plan, seconds, memory, .. } = outlook;
     let longest = (0..plan.len()).map(|c| plan.frames(c).len()).max().unwrap_or(0);
     let mut words = format!(
-        "{} chunks of at most {longest} frames and {} Gaussians, {} frames shared by neighbours, {} steps each, and a shared \
-         layer before them; about {} at a time",
+        "{} chunks of at most {longest} frames and {} Gaussians, {} frames of overlap, {} steps each, after a shared \
+         layer; about {} at a time",
         plan.len(),
         grouped(recipe.densify.max_cap),
         plan.overlap,
@@ -122,7 +122,7 @@ pub(crate) fn join(
     if let Some(seams) = &seams {
         let whose = if seams.held_out { "held-out" } else { "training" };
         console.say(&format!(
-            "flicker where chunks meet: {:.3}/255, in their midst {:.3}/255 ({whose} cameras, {} cuts)",
+            "flicker at chunk boundaries: {:.3}/255, within chunks {:.3}/255 ({whose} cameras, {} boundaries)",
             seams.across, seams.inside, seams.cuts
         ));
     }
@@ -157,7 +157,9 @@ fn seams(chunked: &Chunked, deadline: &Deadline, console: &Console) -> Result<Op
         &mut |event| console.event(event),
     )?;
     if let Some(done) = ended {
-        console.say(&format!("the flicker where chunks meet is measured at {done} cuts: no more fits into --minutes"));
+        console.say(&format!(
+            "flicker at chunk boundaries is measured at {done} of them: --minutes leaves no time for more"
+        ));
     }
     Ok(found)
 }

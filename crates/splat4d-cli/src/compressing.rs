@@ -62,6 +62,8 @@ impl Order {
     }
 }
 
+/// What the first Ctrl-C is answered with while a scene is tuned.
+const SAVING: &str = "stopping: a checkpoint is being saved";
 /// What an owner's record calls this verb.
 const COMMAND: &str = "compress";
 
@@ -82,9 +84,9 @@ impl Work {
     /// A new compression, or what the same order left unfinished. Errors: the folder cannot be written, or is not to be.
     pub(crate) fn begin(dir: PathBuf, order: Order, force: bool) -> Result<Self> {
         let asked = order.text();
-        let capture = Run::open(&order.source)?.capture();
+        let origin = Run::open(&order.source)?.origin();
         let mut inputs = vec![Input::new(&order.source, "the run")];
-        inputs.extend(capture.as_deref().map(|c| Input::new(c, "the run's capture")));
+        inputs.extend(origin.inputs());
         let request = Request { command: COMMAND, inputs: &inputs, asked: &asked, force, mixes: Mixes::Anything };
         let (folder, found) = OutputFolder::begin(&dir, &request)?;
         if found == Found::Unfinished && dir.join(ORDER).is_file() {
@@ -109,9 +111,9 @@ impl Work {
     pub(crate) fn reopen(dir: &Path) -> Result<Self> {
         let path = dir.join(ORDER);
         if !path.is_file() {
-            return Err(Error::input("this folder holds no compression")
+            return Err(Error::input("this folder contains no compression")
                 .at(dir.display())
-                .remedy("Give the folder that `splat4d compress` wrote, or begin anew: splat4d compress RUN."));
+                .remedy("Give the folder that `splat4d compress` wrote, or start again: splat4d compress RUN."));
         }
         Self::opened(dir, OutputFolder::amend(dir, COMMAND)?)
     }
@@ -121,7 +123,7 @@ impl Work {
         let order: Order = toml::from_str(&files::read_text(&path)?).map_err(|e| {
             Error::input(format!("it is not readable: {}", e.message()))
                 .at(path.display())
-                .remedy("Begin anew: splat4d compress RUN.")
+                .remedy("Start again: splat4d compress RUN.")
         })?;
         order.settings.check().map_err(|e| e.at(path.display()))?;
         Ok(Self { dir: dir.to_owned(), folder, order, fresh: false, device: Device::Cpu, size: SIZE })
@@ -146,7 +148,8 @@ impl Work {
 
     /// Until size and guard are content.
     fn work(&mut self, eval: bool, measure: &Measure, console: &Console) -> anyhow::Result<()> {
-        let stop = interrupt::flag("stopping: a checkpoint is being saved");
+        let stop = interrupt::flag(SAVING);
+        interrupt::ends(self.kept());
         let source = Source::open(&self.order.source)?;
         not_empty(&source.scene, &self.order.source)?;
         source.scene.without_head("a playback file")?;
@@ -161,7 +164,9 @@ impl Work {
         let before = if eval { Some(original.scores(original.scene, console)?) } else { None };
         self.choose_size(&original, console)?;
         let (file, after) = loop {
+            interrupt::asks(SAVING);
             let compressed = self.compress(&original, &stop, console)?;
+            interrupt::ends(self.kept());
             let file = self.write_file(&compressed, console)?;
             let Some(before) = &before else { break (file, None) };
             let scene = read_scene(&self.dir.join("scene.safetensors"))?;
@@ -182,6 +187,11 @@ impl Work {
         Ok(())
     }
 
+    /// What is said where a Ctrl-C ends it.
+    fn kept(&self) -> String {
+        format!("what was tuned is kept: splat4d compress --resume {} continues", in_command(&self.dir))
+    }
+
     /// Everything before and after, measured in one go.
     fn compare(
         &self,
@@ -191,7 +201,14 @@ impl Work {
         stop: &AtomicBool,
         console: &Console,
     ) -> anyhow::Result<Compressed> {
-        let unpruned = if self.order.unpruned { Some(self.train_unpruned(original, stop, console)?) } else { None };
+        let unpruned = if self.order.unpruned {
+            interrupt::asks(SAVING);
+            let trained = self.train_unpruned(original, stop, console)?;
+            interrupt::ends(self.kept());
+            Some(trained)
+        } else {
+            None
+        };
         let smooth = antialias(original.recipe.appearance.antialias);
         let read = |path: &Path| -> Result<Arc<[u8]>> { Ok(files::read(path)?.into()) };
         let file = read(&self.dir.join(playable::FILE))?;
@@ -276,7 +293,7 @@ impl Work {
             self.order.free,
             &cameras,
             [most, BESIDES],
-            &mut |done, total| console.phase("looking for a size", done, total),
+            &mut |done, total| console.phase("searching for the size", done, total),
         )?;
         console.clear();
         let last = trials.iter().rev().find(|t| t.prune == chosen.prune).expect("what was chosen was tried");
@@ -358,7 +375,7 @@ impl Work {
             }
             return Ok(false);
         }
-        console.say(&format!("again, with {:.0} % pruned instead of {:.0} %", 100.0 * next, 100.0 * prune));
+        console.say(&format!("repeating with {:.0} % pruned instead of {:.0} %", 100.0 * next, 100.0 * prune));
         self.order.tried.push(Tried { prune, bytes, psnr: is });
         self.order.settings.prune = next;
         self.folder.clear()?;
@@ -422,7 +439,7 @@ fn steps(run: &Run) -> Vec<Step> {
 /// Before and after in a few lines.
 fn say(told: &Compressed, size: [usize; 2], console: &Console) {
     let fair = told.fair();
-    let name = if told.unpruned.is_some() { "unpruned, as many steps more" } else { "before" };
+    let name = if told.unpruned.is_some() { "unpruned, same additional steps" } else { "before" };
     let line = |name: &str, side: &Side| {
         let number = |value: Option<f64>, digits: usize| value.map_or("-".into(), |v| format!("{v:.digits$}"));
         format!(
@@ -443,6 +460,11 @@ fn say(told: &Compressed, size: [usize; 2], console: &Console) {
     console.say(&line("after", &told.after));
     if let Some(times) = told.smaller() {
         let faster = told.after.fps / fair.fps;
-        console.say(&format!("{times:.1} times smaller than 32-bit floats, {faster:.2} times as fast"));
+        // What would have been shipped otherwise comes first: the plain file, and not the floats of the run.
+        let plain = told.plain.as_ref().filter(|plain| plain.bytes > 0);
+        let plain = plain.map_or_else(String::new, |plain| {
+            format!("{:.1} times smaller than the plain playback file, ", plain.bytes as f64 / told.after.bytes as f64)
+        });
+        console.say(&format!("{plain}{times:.1} times smaller than 32-bit floats, {faster:.2} times as fast"));
     }
 }

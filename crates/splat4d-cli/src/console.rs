@@ -45,12 +45,26 @@ struct State {
     /// The first iteration after a pause gets a plain line of its own.
     said_progress: bool,
     warnings: Vec<String>,
+    /// What `--json` would print, for a program that wants the objects themselves; none: it is printed.
+    objects: Option<Vec<Value>>,
 }
 
 impl Console {
     pub fn new(loudness: Loudness, json: bool) -> Self {
         let terminal = std::io::stderr().is_terminal() && std::env::var_os("TERM").is_none_or(|t| t != "dumb");
         Self { loudness, json, terminal, state: RefCell::default() }
+    }
+
+    /// A console that prints nothing but warnings and keeps the objects of `--json`.
+    pub(crate) fn keeping_objects() -> Self {
+        let console = Self::new(Loudness::Quiet, true);
+        console.state.borrow_mut().objects = Some(Vec::new());
+        console
+    }
+
+    /// The objects that were kept.
+    pub(crate) fn into_objects(self) -> Vec<Value> {
+        self.state.into_inner().objects.unwrap_or_default()
     }
 
     /// Whether machines are listening.
@@ -94,7 +108,9 @@ impl Console {
 
     /// One JSON line; only with `--json`.
     pub fn emit(&self, value: &Value) {
-        if self.json {
+        if let Some(objects) = &mut self.state.borrow_mut().objects {
+            objects.push(value.clone());
+        } else if self.json {
             print(&one_json_line(value));
         }
     }
@@ -173,7 +189,8 @@ impl Console {
             Event::Predicted { iterations, gaussians, size: [width, height], seconds, memory_estimate } => {
                 self.clear();
                 self.say(&format!(
-                    "{} steps on pictures of {width}x{height}, at most {} Gaussians: about {} minutes in all and {} of memory",
+                    "{} steps on images of {width}x{height}, at most {} Gaussians: about {} minutes in total and {} \
+                     of memory",
                     grouped(*iterations),
                     grouped(*gaussians),
                     human_seconds(*seconds),
@@ -181,7 +198,7 @@ impl Console {
                 ));
             }
             Event::Replanned { iteration, iterations, seconds, minutes } => self.detail(&format!(
-                "step {}: at this speed it would end after {} and not {}; from here on it is {} steps in all",
+                "step {}: at this speed training would take {} instead of {}; planned steps are now {}",
                 grouped(*iteration),
                 human_seconds(*seconds),
                 human_seconds(60.0 * minutes),
@@ -218,7 +235,7 @@ impl Console {
                 self.detail(&format!("checkpoint of step {} in {}", grouped(*iteration), path.display()));
             }
             Event::RolledBack { iteration, to, what } => self.warn(&format!(
-                "step {iteration} was not finite ({what}); training went back to step {to} and continues with \
+                "step {iteration} was not finite ({what}); training rolled back to step {to} and continues with \
                  smaller steps"
             )),
             Event::Finished { iteration, seconds, gaussians, peak_memory, advice } => {

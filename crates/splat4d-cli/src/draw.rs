@@ -164,19 +164,18 @@ impl<'a> Painter<'a> {
         match channel {
             Channel::Label if self.scene.labels.is_empty() => {
                 return Err(Error::input("the scene has no labels")
-                    .remedy("Give the capture's cameras masks of labels, then: splat4d label RUN (docs/labels.md)."));
+                    .remedy("Give the capture's cameras label masks, then: splat4d label RUN (docs/labels.md)."));
             }
             Channel::Feature if self.scene.feature_channels() == 0 => {
-                return Err(Error::input("the scene has no features").remedy(
-                    "Give the capture's cameras pictures of features, then: splat4d label RUN (docs/labels.md).",
-                ));
+                return Err(Error::input("the scene has no features")
+                    .remedy("Give the capture's cameras feature images, then: splat4d label RUN (docs/labels.md)."));
             }
             Channel::Life => self.numbers = channels::lifetimes(self.scene),
             Channel::Uncertainty => {
                 let seen: Vec<&View> = views.iter().filter(|v| !v.held).collect();
                 if seen.is_empty() {
-                    return Err(Error::input("nobody knows from where the scene was seen")
-                        .remedy("Render uncertainty of a run: a bare scene file brings no training cameras."));
+                    return Err(Error::input("the training cameras are unknown")
+                        .remedy("Render uncertainty of a run: a scene file alone has no training cameras."));
                 }
                 let chosen: Vec<&View> = seen.iter().copied().step_by(seen.len().div_ceil(WITNESSES)).collect();
                 let witnesses: Vec<Witness<'_>> =

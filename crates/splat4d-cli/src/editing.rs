@@ -47,8 +47,9 @@ impl<'a> Bring<'a> {
 
     fn capture(&self) -> Result<(Arc<Capture>, Dataset, bool)> {
         let Some(run) = &self.source.run else {
-            return Err(Error::input("a scene file does not bring the pictures that it was learnt from")
-                .remedy("Give the run folder."));
+            return Err(
+                Error::input("a scene file does not contain its training images").remedy("Give the run folder.")
+            );
         };
         let (capture, recipe) = run.open_capture()?;
         let capture = Arc::new(capture);
@@ -68,7 +69,7 @@ impl Context for Bring<'_> {
             names.dedup();
             names.truncate(12);
             let remedy = if names.is_empty() {
-                "Give a run folder, or a .s4d that brings its cameras along.".to_owned()
+                "Give a run folder, or a .s4d that contains its cameras.".to_owned()
             } else {
                 format!("It has: {}.", names.join(", "))
             };
@@ -96,9 +97,9 @@ impl Context for Bring<'_> {
     fn subject(&self) -> Result<Vec<(Camera, Time, Mask)>> {
         let (capture, data, _) = self.capture()?;
         if !data.has_masks() {
-            return Err(Error::input("the capture has no masks: nobody can say what its subject is")
+            return Err(Error::input("the capture has no masks, so its subject is unknown")
                 .at(capture.root.display())
-                .remedy("Give masks in the capture, or select by places: box, sphere."));
+                .remedy("Add masks to the capture, or select by position: box, sphere."));
         }
         let step = capture.train.len().div_ceil(MOST_MASKS).max(1);
         let chosen: Vec<usize> = capture.train.iter().copied().step_by(step).collect();
@@ -129,7 +130,7 @@ impl Context for Bring<'_> {
         self.console.clear();
         let count = selected.iter().flatten().filter(|f| **f).count();
         self.console.say(&format!(
-            "floaters: {} of {} Gaussians; {pictures} held-out pictures: {before:.2} dB with them, {after:.2} dB without",
+            "floaters: {} of {} Gaussians; {pictures} held-out images: {before:.2} dB with them, {after:.2} dB without",
             files::grouped(count),
             files::grouped(scene.len())
         ));
@@ -173,11 +174,11 @@ impl Bring<'_> {
     /// Errors: no run with its capture, no held-out views, a strength that is not from 0 to 1.
     pub(crate) fn propose(&self, scene: &Scene<f32>, strength: f64) -> Result<Proposal> {
         if !(0.0..=1.0).contains(&strength) {
-            return Err(Error::input(format!("a strength of {strength}")).remedy("Give 0 to 1"));
+            return Err(Error::input(format!("invalid strength {strength}")).remedy("Give 0 to 1"));
         }
         let (capture, data, antialias) = self.capture()?;
         let told = support(scene, &data, &capture.train, &capture.held, antialias, &mut |done, total| {
-            self.console.phase("looking for floaters", done, total);
+            self.console.phase("searching for floaters", done, total);
         })?;
         let found = told.floaters(strength);
         let mut without = scene.clone();
@@ -210,7 +211,7 @@ pub(crate) fn read(path: &Path) -> Result<Edits> {
         let line = e.span().map_or(String::new(), |s| format!(" (byte {})", s.start));
         Error::input(format!("invalid list of edits{line}: {}", e.message()))
             .at(path.display())
-            .remedy("docs/edit.md tells all steps.")
+            .remedy("docs/edit.md lists all steps.")
     })
 }
 

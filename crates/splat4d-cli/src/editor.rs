@@ -72,7 +72,7 @@ impl Eye {
         let sized = (1..=MOST_SIDE).contains(&self.width) && (1..=MOST_SIDE).contains(&self.height);
         let length: f64 = self.quat.iter().map(|x| x * x).sum();
         if !(numbers.copied().all(f64::is_finite) && sized && length > 0.0 && self.fx > 0.0 && self.fy > 0.0) {
-            return Err(Error::input("invalid view: expected a camera").remedy("Load the page again"));
+            return Err(Error::input("invalid view: expected a camera").remedy("Reload the page"));
         }
         let rotation = quat::to_rotation(quat::normalize(self.quat).0);
         let world_from_cam = Se3 { rotation, translation: self.position };
@@ -181,9 +181,7 @@ impl Editor {
     pub(crate) fn new(source: Source, title: String, file: &Path) -> Result<Self> {
         let folder = file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
         if !folder.is_dir() {
-            return Err(Error::input("lies in a folder that is not there")
-                .at(file.display())
-                .remedy("Make the folder"));
+            return Err(Error::input("its folder does not exist").at(file.display()).remedy("Create the folder"));
         }
         let text = file.exists().then(|| files::read_text(file)).transpose()?;
         let listed = if text.is_some() { editing::read(file)? } else { Edits::default() };
@@ -209,9 +207,8 @@ impl Editor {
     ///
     /// Errors: what is no question, and those of its work; nothing is changed then.
     pub(crate) fn answer(&self, asked: Value) -> Result<EditAnswer> {
-        let ask: Ask = serde_json::from_value(asked).map_err(|e| {
-            Error::input(format!("the page asks for what is not known: {e}")).remedy("Load the page again")
-        })?;
+        let ask: Ask = serde_json::from_value(asked)
+            .map_err(|e| Error::input(format!("unknown request of the page: {e}")).remedy("Reload the page"))?;
         let told = |told: Value| Ok(EditAnswer { told, scene: None });
         match ask {
             Ask::Open { kept } => told(self.open(kept)),
@@ -295,8 +292,8 @@ impl Editor {
             }
             let outside = |name: &String| !Path::new(name).components().all(|c| matches!(c, Component::Normal(_)));
             if let Some(name) = names.into_iter().find(outside) {
-                return Err(Error::input(format!("`{name}` does not lie beside the list"))
-                    .remedy("Put it there, or write the step into the file yourself"));
+                return Err(Error::input(format!("`{name}` is not in the folder of the list"))
+                    .remedy("Move it there, or write the step into the file by hand"));
             }
         }
         Ok(())
@@ -359,7 +356,7 @@ impl Editor {
     fn bend(&self, steps: &[Step], select: &str, times: [f64; 2], nodes: usize) -> Result<Value> {
         if self.source.playback.is_some() {
             return Err(
-                Error::input("a playback file cannot be bent").remedy("Give the run folder or scene.safetensors")
+                Error::input("a playback file cannot be deformed").remedy("Give the run folder or scene.safetensors")
             );
         }
         let (scene, _) = self.replayed(steps)?;
@@ -381,7 +378,7 @@ impl Editor {
         let camera = view.camera()?;
         let mut state = self.lock();
         let Some(bent) = state.bent.as_mut().filter(|b| b.number == number) else {
-            return Err(Error::input("these nodes are no longer held").remedy("Select them again"));
+            return Err(Error::input("these nodes are no longer stored").remedy("Select them again"));
         };
         let handles: Vec<(DragHandle, [f64; 3])> = handles
             .into_iter()
@@ -414,7 +411,7 @@ fn jpeg(image: &Image<f32>) -> Result<String> {
     let mut bytes = Vec::new();
     image::RgbImage::from_raw(rgb.width as u32, rgb.height as u32, rgb.data)
         .and_then(|picture| JpegEncoder::new_with_quality(&mut bytes, QUALITY).encode_image(&picture).ok())
-        .ok_or_else(|| Error::input("the picture cannot be packed"))?;
+        .ok_or_else(|| Error::input("the image cannot be encoded"))?;
     Ok(format!("data:image/jpeg;base64,{}", files::base64(&bytes)))
 }
 
@@ -483,7 +480,7 @@ impl Drawn<'_> {
         };
         let sound = self.corners.iter().flatten().all(|x| x.is_finite());
         if !(least..=CORNERS).contains(&self.corners.len()) || !sound {
-            return Err(Error::input("what was drawn has too few or too many corners").remedy("Draw it again"));
+            return Err(Error::input("the outline has too few or too many corners").remedy("Draw it again"));
         }
         let mut image = Image::default();
         draw(scene, camera, t, true, &mut image)?;
@@ -491,7 +488,7 @@ impl Drawn<'_> {
         let world = camera.cam_from_world.inverse();
         let depth = |i: usize| f64::from(image.depth.data[i] / image.alpha.data[i]);
         let shows = |i: usize| image.alpha.data[i] >= SEEN;
-        let nothing = || Error::input("nothing is seen there").remedy("Draw over what can be seen");
+        let nothing = || Error::input("nothing is visible there").remedy("Draw over something visible");
         // The pixel of a corner, within the picture.
         let pixel = |[u, v]: [f64; 2]| {
             let column = (k.fx * u + k.cx).clamp(0.0, (camera.width - 1) as f64) as usize;
@@ -586,7 +583,8 @@ impl Drawn<'_> {
 pub(crate) fn token() -> Result<String> {
     let mut bytes = [0; 16];
     getrandom::fill(&mut bytes).map_err(|e| {
-        Error::input(format!("the system has no randomness ({e})")).remedy("Without it nobody can be kept from editing")
+        Error::input(format!("the system provides no random numbers ({e})"))
+            .remedy("Without them, other pages cannot be prevented from editing")
     })?;
     Ok(bytes.iter().map(|b| format!("{b:02x}")).collect())
 }
@@ -660,7 +658,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_drawn_over_the_picture_becomes_words() {
+    fn shapes_drawn_over_the_image_become_text() {
         let bench = Bench::new();
         let pick = |shape: &str, corners: Value, through: bool| {
             bench.ask(json!({"do": "pick", "steps": [], "shape": shape, "corners": corners, "view": view(), "t": 0.0,
@@ -685,7 +683,7 @@ mod tests {
         let nothing = bench
             .refused(json!({"do": "pick", "steps": [], "shape": "box", "corners": [[0.4, 0.3], [0.45, 0.35]],
             "view": view(), "t": 0.0, "through": false, "now": false}));
-        assert!(nothing.contains("nothing is seen there"), "{nothing}");
+        assert!(nothing.contains("nothing is visible there"), "{nothing}");
     }
 
     #[test]
@@ -721,7 +719,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_bad_is_said_and_changes_nothing() {
+    fn invalid_requests_are_refused_and_change_nothing() {
         let bench = Bench::new();
         bench.ask(json!({"do": "save", "steps": [{"do": "delete", "select": "color(1,0,0, 0.5)"}]}));
         let save = |step: Value| bench.refused(json!({"do": "save", "steps": [step]}));
@@ -756,7 +754,7 @@ mod tests {
 
     /// What would have taken all memory, or made numbers of none: the server answers, and goes on with the page's steps.
     #[test]
-    fn what_is_too_much_is_refused_and_the_rest_goes_on() {
+    fn excessive_requests_are_refused_and_others_continue() {
         let bench = Bench::new();
         let good = json!({"do": "delete", "select": "box(-9,-9,-9, 0,9,9)"});
         for (bad, word) in [
@@ -775,7 +773,7 @@ mod tests {
     }
 
     #[test]
-    fn nodes_are_pulled_and_the_picture_follows() {
+    fn nodes_are_pulled_and_the_image_follows() {
         let bench = Bench::new();
         let bent = bench.ask(
             json!({"do": "bend", "steps": [], "select": "box(-9,-9,-9, 0,9,9)", "at": 0.5, "t": 0.5, "nodes": 16}),

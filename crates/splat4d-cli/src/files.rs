@@ -24,7 +24,7 @@ pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
 /// Makes a folder and its parents.
 pub fn make_folder(path: &Path) -> Result<()> {
     std::fs::create_dir_all(path)
-        .map_err(|e| Error::environment("the folder cannot be made", e).at(path.display()))
+        .map_err(|e| Error::environment("the folder cannot be created", e).at(path.display()))
         .map_err(|e| {
             e.remedy("Choose another place with -o: one where you may write, below a folder and not below a file.")
         })

@@ -162,10 +162,7 @@ fn append_to(
     }
     console.clear();
     meta.ok_or_else(|| {
-        Error::input("not one part of the take is finished")
-            .at(run.display())
-            .remedy("Train --chunk shared first")
-            .into()
+        Error::input("no chunk is finished").at(run.display()).remedy("Train --chunk shared first").into()
     })
 }
 

@@ -21,9 +21,10 @@ use splat4d_train::capture::{Capture, CaptureKind, CaptureOptions, ImageStore, T
 use splat4d_train::eval::Align;
 use splat4d_train::eval::flow::flow_error;
 use splat4d_train::eval::points::point_errors;
-use splat4d_train::eval::run::{EvalOptions, Measured, Scores, evaluate};
+use splat4d_train::eval::run::{EvalOptions, Measured, Scores, assess, evaluate};
 use splat4d_train::eval::tracks::track_error;
 use splat4d_train::eval::trajectory::trajectory_error;
+use splat4d_train::event::Event;
 use splat4d_train::path_text::in_command;
 use splat4d_train::recipe::{MotionName, Recipe};
 use splat4d_train::run::chunks::Chunked;
@@ -112,7 +113,7 @@ pub(crate) fn all(run: &Path, measure: &Measure, deadline: &Deadline, console: &
         amend(run, [("evaluation_seconds".into(), json!(deadline.now() - started))])?;
     }
     playback_by(run, deadline, console)?;
-    if Times::leaves("there is no orbit film", [time.film, 0.0], run, deadline, console) {
+    if Times::leaves("the orbit film is missing", [time.film, 0.0], run, deadline, console) {
         let started = deadline.now();
         match orbit(run, &scene, console) {
             Ok(film) => {
@@ -120,7 +121,7 @@ pub(crate) fn all(run: &Path, measure: &Measure, deadline: &Deadline, console: &
                 amend(run, [("orbit_seconds".into(), json!(deadline.now() - started))])?;
             }
             // The scene and its scores stand without the film.
-            Err(error) => console.warn(&format!("there is no orbit film: {error:#}")),
+            Err(error) => console.warn(&format!("the orbit film was not written: {error:#}")),
         }
     }
     write_report(run, console)
@@ -176,7 +177,7 @@ impl Times {
             return true;
         }
         console.warn(&format!(
-            "{missing}: about {} are needed, and {} are left of --minutes. `splat4d eval {}` makes up for it.",
+            "{missing}: it takes about {}, and {} are left of --minutes. `splat4d eval {}` does it later.",
             human_seconds(seconds),
             human_seconds(left - kept),
             in_command(run)
@@ -214,7 +215,7 @@ pub(crate) fn playback_by(run: &Path, deadline: &Deadline, console: &Console) ->
             ],
         ),
         Err(error) => {
-            console.warn(&format!("there is no playback file: {error:#}"));
+            console.warn(&format!("the playback file was not written: {error:#}"));
             Ok(())
         }
     }
@@ -234,8 +235,8 @@ pub fn scores(run: &Path, scene: &Scene<f32>, measure: &Measure, console: &Conso
     flow(run, scene, &capture, &recipe, console)?;
     if capture.held.is_empty() {
         console.warn(
-            "no view was held out, so that quality on new views cannot be measured. Hold out a camera (--hold-out \
-             camera=0) or every 8th image (--hold-out every=8).",
+            "no view was held out, so quality on new views is not measured. Hold out a camera (--hold-out camera=0) \
+             or every 8th image (--hold-out every=8).",
         );
     }
     Ok(evaluation)
@@ -261,20 +262,17 @@ pub(crate) fn scores_on(
     if measured.frames(&capture).is_empty() {
         return Err(Error::input(format!("the run's capture has no views of the split `{split}`"))
             .at(run.display())
-            .remedy("A data set has `val` where it brings a list of them, such as transforms_val.json.")
+            .remedy("A data set has `val` if it contains a list of these views, such as transforms_val.json.")
             .into());
     }
     if !backgrounds.is_empty() && capture.background.is_none() {
-        return Err(Error::input("the run's pictures have no transparent pixels, and so no background to choose")
+        return Err(Error::input("the run's images have no transparent pixels, so there is no background to choose")
             .at(run.display())
             .remedy("Leave --background out.")
             .into());
     }
     let own = capture.background;
-    let all: Vec<(&str, Option<[f32; 3]>)> = match backgrounds {
-        [] => vec![("", own)],
-        chosen => chosen.iter().map(|(name, color)| (*name, Some(*color))).collect(),
-    };
+    let all = on_backgrounds(own, backgrounds);
     let measuring = Measuring { opened: &opened, recipe: &recipe, measure };
     for (name, background) in all {
         let place = if background == own { split.to_owned() } else { format!("{split}-{name}") };
@@ -285,17 +283,85 @@ pub(crate) fn scores_on(
         let capture = Arc::new(Capture { background, ..capture.clone() });
         let place = (!judged).then_some(place);
         let scores = measuring.evaluate(&scene, &capture, measured, place, console)?;
-        let on = if name.is_empty() { String::new() } else { format!(" on {name}") };
-        let views = match measured {
-            Measured::Test => "held-out views",
-            Measured::Validation => "validation views",
-            Measured::Train => "training views",
+        say_split(&scores, measured, name, console);
+    }
+    Ok(())
+}
+
+/// Backgrounds with their names; where none are asked for, the capture's own.
+fn on_backgrounds<'a>(own: Option<[f32; 3]>, asked: &[(&'a str, [f32; 3])]) -> Vec<(&'a str, Option<[f32; 3]>)> {
+    match asked {
+        [] => vec![("", own)],
+        chosen => chosen.iter().map(|(name, color)| (*name, Some(*color))).collect(),
+    }
+}
+
+fn say_split(scores: &Scores, measured: Measured, background: &str, console: &Console) {
+    let on = if background.is_empty() { String::new() } else { format!(" on {background}") };
+    let views = match measured {
+        Measured::Test => "held-out views",
+        Measured::Validation => "validation views",
+        Measured::Train => "training views",
+    };
+    console.say(&format!("{views}{on}: {}", in_words(|key| scores.held(key))));
+    let entry = &scores.report.results()[scores.report.method()];
+    console.emit(&json!({
+        "type": "results", "iteration": scores.report.iteration, "conditions": scores.report.conditions, "results": entry,
+    }));
+}
+
+/// Scores a scene that is no run's on views of a capture, and writes scores and images into `out`, if there is such a folder.
+///
+/// Errors: the capture has no such views; images without alpha, which are composited on nothing; those of measuring.
+#[allow(clippy::too_many_arguments)]
+pub(crate) fn foreign_scores(
+    mut scene: Scene<f32>,
+    capture: &Capture,
+    recipe: &Recipe,
+    out: Option<&Path>,
+    measured: Measured,
+    backgrounds: &[(&str, [f32; 3])],
+    measure: &Measure,
+    console: &Console,
+) -> anyhow::Result<()> {
+    let mut capture = capture.clone();
+    capture.coarse().into_iter().for_each(|w| console.warn(w));
+    if capture.offset != scene.offset {
+        capture.relocate(scene.offset);
+    }
+    if measured.frames(&capture).is_empty() {
+        return Err(Error::input(format!("the capture has no views of the split `{}`", measured.name()))
+            .remedy("Choose them with --hold-out, for instance --hold-out every=8, or measure --split train.")
+            .into());
+    }
+    if !backgrounds.is_empty() && capture.background.is_none() {
+        return Err(Error::input("the capture's images have no transparent pixels, and so no background to choose")
+            .remedy("Leave --background out.")
+            .into());
+    }
+    for (name, background) in on_backgrounds(capture.background, backgrounds) {
+        scene.background = background.unwrap_or(scene.background);
+        let capture = Arc::new(Capture { background, ..capture.clone() });
+        let memory = usize::try_from(recipe.run.image_memory).unwrap_or(usize::MAX);
+        let store = Arc::new(ImageStore::new(capture.clone(), memory));
+        let options = EvalOptions {
+            folder: out.map(Path::to_owned).unwrap_or_default(),
+            antialias: recipe.appearance.antialias,
+            lpips_weights: measure.lpips_weights.clone(),
+            pictures: out.is_some(),
+            train_views: 0,
+            measured,
+            place: (!name.is_empty()).then(|| format!("{}-{name}", measured.name())),
+            device: measure.device,
+            ..EvalOptions::default()
         };
-        console.say(&format!("{views}{on}: {}", in_words(|key| scores.held(key))));
-        let entry = &scores.report.results()[scores.report.method()];
-        console.emit(&json!({
-            "type": "results", "iteration": scores.report.iteration, "conditions": scores.report.conditions, "results": entry,
-        }));
+        let mut listen = |event: &Event| console.event(event);
+        let scores = match out {
+            Some(_) => evaluate(&scene, &capture, &store, 0, &options, &mut listen)?,
+            None => assess(&scene, &capture, &store, 0, &options, &mut listen)?,
+        };
+        console.clear();
+        say_split(&scores, measured, name, console);
     }
     Ok(())
 }
@@ -323,7 +389,7 @@ pub(crate) fn trajectory(run: &Path, truth: &Path, console: &Console) -> anyhow:
         let _ = write!(words, "; RPE {turn:.3}°, {shift:.5} units");
     }
     if let Some([middle, most]) = found.clock_errors() {
-        let _ = write!(words, "; clocks off by {:.2} ms at the median, {:.2} ms at most", 1e3 * middle, 1e3 * most);
+        let _ = write!(words, "; time offsets wrong by {:.2} ms (median), {:.2} ms at most", 1e3 * middle, 1e3 * most);
     }
     console.say(&words);
     console.emit(&json!({"type": "trajectory", "results": found.report()}));
@@ -386,7 +452,7 @@ fn tracks(run: &Path, scene: &Scene<f32>, capture: &Capture, console: &Console) 
     let Some(e) = track_error(scene, capture)? else { return Ok(()) };
     console.say(&format!(
         "tracks of {} points in space: median error {:.4} units, {:.2} % of a character's height ({:.1} % of the \
-         moments followed); the nearest Gaussian itself is {:.4} units away, {:.4} at the first frame",
+         times tracked); nearest Gaussian at {:.4} units, {:.4} in the first frame",
         e.points,
         e.median,
         e.percent(),
@@ -403,7 +469,7 @@ fn tracks(run: &Path, scene: &Scene<f32>, capture: &Capture, console: &Console) 
     let Some(e) = point_errors(scene, capture)? else { return Ok(()) };
     let percent = |shares: &[f64]| shares.iter().map(|s| format!("{:.1}", 100.0 * s)).collect::<Vec<_>>().join(", ");
     let mut words = format!(
-        "points followed in space: median error {:.4} units, {} % within 1, 2, 4, 8, 16 % of their height, {:.1} % lost",
+        "points tracked in space: median error {:.4} units, {} % within 1, 2, 4, 8, 16 % of their height, {:.1} % lost",
         e.median,
         percent(&e.within),
         100.0 * e.lost
@@ -424,7 +490,7 @@ fn tracks(run: &Path, scene: &Scene<f32>, capture: &Capture, console: &Console) 
             let _ = write!(words, ", drift slope {slope:.2}");
         }
         if let Some(right) = p.visibility {
-            let _ = write!(words, ", visibility right for {:.1} %", 100.0 * right);
+            let _ = write!(words, ", visibility correct for {:.1} %", 100.0 * right);
         }
         console.say(&words);
     }
@@ -453,7 +519,7 @@ fn flow(run: &Path, scene: &Scene<f32>, capture: &Capture, recipe: &Recipe, cons
     whole.train.retain(|i| capture.train.contains(i));
     let Some(e) = flow_error(scene, &whole)? else { return Ok(()) };
     let mut words = format!(
-        "flow of {} {} views: end-point error {:.3} px in the mean, {:.3} at the median, {:.1} % within 1 px",
+        "flow of {} {} views: end-point error mean {:.3} px, median {:.3} px, {:.1} % within 1 px",
         e.pictures,
         if e.held { "held-out" } else { "training" },
         e.mean,
@@ -492,7 +558,7 @@ fn in_words(score: impl Fn(&str) -> Option<f64>) -> String {
         ("PSNR-aligned", "aligned", 2, " dB"),
         ("PSNR-cc", "colour-corrected", 2, " dB"),
         ("PSNR-dynamic", "dynamic regions", 2, " dB"),
-        ("PSNR-dynamic-aligned", "there aligned", 2, " dB"),
+        ("PSNR-dynamic-aligned", "dynamic regions, aligned", 2, " dB"),
         ("PSNR-foreground", "foreground", 2, " dB"),
         ("SSIM", "SSIM", 4, ""),
         ("MS-SSIM", "MS-SSIM", 4, ""),
@@ -550,7 +616,7 @@ fn orbit(run: &Path, scene: &Scene<f32>, console: &Console) -> anyhow::Result<Pa
     for (i, shot) in shots.iter().enumerate() {
         painter.draw(&shot.camera, shot.time);
         film.frame(&painter.rgb(Channel::Color, [0.0, 1.0]))?;
-        console.phase("filming the orbit", i + 1, shots.len());
+        console.phase("rendering the orbit film", i + 1, shots.len());
     }
     film.finish()?;
     console.clear();

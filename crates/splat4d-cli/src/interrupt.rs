@@ -1,21 +1,124 @@
 //! Ctrl-C: the first asks to stop (training saves a checkpoint), the second ends the program at once.
+//!
+//! Work that does not ask whether it should stop ([`ends`]) is ended after a moment: all files are written under temporary names,
+//! and locks of dead processes are taken over, so that the same command goes on.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 /// Exit code that shells expect of a program ended by Ctrl-C: 128 + SIGINT.
 const ENDED_BY_INTERRUPT: i32 = 130;
+/// Exit code of interrupted work (docs/exit-codes.md).
+const INTERRUPTED: i32 = 1;
+/// Time for work that asks; people wait two seconds.
+const PATIENCE: Duration = Duration::from_millis(1200);
+
+/// What a Ctrl-C does now.
+struct State {
+    raised: bool,
+    /// What is said of the first one.
+    first: &'static str,
+    /// Where the program is ended soon: what is said then.
+    last: Option<String>,
+    /// Whether another program has called, which must not be ended.
+    embedded: bool,
+}
+
+static STATE: Mutex<State> = Mutex::new(State { raised: false, first: "stopping", last: None, embedded: false });
+
+fn state() -> MutexGuard<'static, State> {
+    STATE.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// What follows a Ctrl-C.
+#[derive(Debug, PartialEq)]
+enum Reaction {
+    /// The program ends now.
+    Exit,
+    /// The work stops by itself.
+    Stops,
+    /// The work may stop by itself; if it does not soon, the program ends with these words.
+    Ends(String),
+}
+
+impl State {
+    fn signalled(&mut self) -> Reaction {
+        if std::mem::replace(&mut self.raised, true) {
+            return Reaction::Exit;
+        }
+        match &self.last {
+            Some(last) if !self.embedded => Reaction::Ends(last.clone()),
+            _ => Reaction::Stops,
+        }
+    }
+}
 
 /// A flag that the first Ctrl-C (or SIGTERM) raises. `first` is then said on stderr.
 pub fn flag(first: &'static str) -> Arc<AtomicBool> {
     let flag = Arc::new(AtomicBool::new(false));
     let raised = flag.clone();
+    asks(first);
     // Where no handler can be set, Ctrl-C simply ends the program; checkpoints on disk stay valid.
     let _ = ctrlc::set_handler(move || {
-        if raised.swap(true, Ordering::SeqCst) {
-            std::process::exit(ENDED_BY_INTERRUPT);
+        let reaction = state().signalled();
+        raised.store(true, Ordering::SeqCst);
+        match reaction {
+            Reaction::Exit => std::process::exit(ENDED_BY_INTERRUPT),
+            Reaction::Stops => {}
+            Reaction::Ends(last) => drop(std::thread::spawn(move || {
+                std::thread::sleep(PATIENCE);
+                end(&last);
+            })),
         }
-        eprintln!("\n{first} (Ctrl-C again ends at once)");
+        eprintln!("\n{} (Ctrl-C again ends at once)", state().first);
     });
     flag
+}
+
+/// From now on the work asks for the flag, and does what `first` says.
+pub(crate) fn asks(first: &'static str) {
+    let mut state = state();
+    (state.first, state.last) = (first, None);
+}
+
+/// From now on a Ctrl-C ends the program after a moment, also where the work does not ask; `last` says what is kept and how to go
+/// on. A Ctrl-C that came before, and that nothing has followed, ends it now.
+pub(crate) fn ends(last: impl Into<String>) {
+    let last = last.into();
+    let mut state = state();
+    if state.raised && !state.embedded {
+        end(&last);
+    }
+    (state.first, state.last) = ("stopping", Some(last));
+}
+
+/// Another program has called: it must not be ended.
+pub(crate) fn embedded() {
+    state().embedded = true;
+}
+
+fn end(last: &str) -> ! {
+    eprintln!("\nstopped: {last}");
+    std::process::exit(INTERRUPTED);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn work_that_does_not_ask_is_ended_soon_and_other_work_is_not() {
+        let state = |last: Option<&str>, embedded| State {
+            raised: false,
+            first: "stopping",
+            last: last.map(str::to_owned),
+            embedded,
+        };
+        let mut asking = state(None, false);
+        assert_eq!([asking.signalled(), asking.signalled()], [Reaction::Stops, Reaction::Exit]);
+        let mut ending = state(Some("all is kept"), false);
+        assert_eq!([ending.signalled(), ending.signalled()], [Reaction::Ends("all is kept".into()), Reaction::Exit]);
+        assert_eq!(state(Some("all is kept"), true).signalled(), Reaction::Stops, "another program is not ended");
+    }
 }

@@ -59,7 +59,7 @@ fn learn_features(
     let losses = features::learn(scene, capture, rounds.unwrap_or(features::ROUNDS), &mut phase)?;
     console.clear();
     let list: Vec<String> = losses.iter().map(|l| format!("{l:.4}")).collect();
-    console.detail(&format!("half the squared error of a pixel's features, round by round: {}", list.join(", ")));
+    console.detail(&format!("half the squared error of a pixel's features, per round: {}", list.join(", ")));
     let (scores, views) = match features::measure(scene, capture, &capture.held)? {
         Some(scores) => (Some(scores), "held-out"),
         None => (features::measure(scene, capture, &capture.train)?, "training"),
@@ -67,7 +67,7 @@ fn learn_features(
     if let Some(scores) = scores {
         let channels = scene.feature_channels();
         console.say(&format!(
-            "{channels} feature channels: {:.1} % of the variance of {} {views} views is explained, mean cosine {:.3}",
+            "{channels} feature channels: {:.1} % of the variance of {} {views} views explained, mean cosine {:.3}",
             100.0 * scores.explained,
             scores.pictures,
             scores.cosine
@@ -128,7 +128,7 @@ fn in_words(scores: &LabelScores, views: &str) -> String {
     let each = scores.names.iter().zip(&scores.iou);
     let each: Vec<String> = each.filter_map(|(name, iou)| Some(format!("{name} {:.3}", (*iou)?))).collect();
     format!(
-        "labels of {} {views} views: {:.1} % of the pixels are right, mean IoU {:.3} ({})",
+        "labels of {} {views} views: {:.1} % of the pixels correct, mean IoU {:.3} ({})",
         scores.pictures,
         100.0 * scores.accuracy,
         scores.mean_iou(),

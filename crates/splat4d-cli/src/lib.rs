@@ -9,12 +9,14 @@
 //!
 //! | module | content |
 //! |---|---|
-//! | `console.rs`, `run_folder.rs`, `camera_file.rs`, `video.rs` | output, run folders, camera files, films |
+//! | `camera_file.rs`, `console.rs`, `video.rs` | camera files, output, films |
 //! | `paths/` | orbits, data-set cameras and key-framed camera paths |
+//! | `run_folder.rs` | run folders |
 //! | `source.rs`, `source/` | scenes of other programs that are folders or archives |
 //! | `raw.rs`, `asked.rs` | channel values as files; files of queried points and their results |
 //! | `measure.rs`, `measure/` | how scenes and files play, for `compress`, the studies and `bench --playback` |
 //! | `baking.rs`, `baking/` | the playback file at the end of a run |
+//! | `comparing.rs` | runs and results of other programs, for `compare` |
 //! | `report/`, `report/compress/` | `report.html`, drawn without a library |
 //! | `film.rs` | the playback file of a long capture, which grows during training |
 //! | `labelling.rs`, `chunked.rs`, `compressing.rs`, `predicting.rs`, `predicting/`, `editing.rs`, `editor.rs` | the work of `label`, `train --chunk` and `join`, `compress`, `predict`, `edit`, `view --edit` |
@@ -28,6 +30,7 @@ mod asked;
 mod baking;
 mod camera_file;
 mod chunked;
+mod comparing;
 mod compressing;
 pub mod console;
 mod deadline;
@@ -73,6 +76,7 @@ Examples:
   splat4d train examples/knight            train, measure, report and film the bundled capture
   splat4d train my-take --minutes 10       finish within ten minutes
   splat4d train --resume runs/my-take      continue a run exactly
+  splat4d status runs/my-take              steps, workers and time left of a run
   splat4d eval runs/knight --baseline      compare with a static scene
   splat4d render runs/knight -o turn.mp4   film an orbit through space and time
   splat4d localise runs/knight photo.jpg   pose and time of an image
@@ -129,7 +133,9 @@ enum Verb {
     Import(verbs::import::Args),
     Train(Box<verbs::train::Args>),
     Join(verbs::join::Args),
+    Status(verbs::status::Args),
     Eval(verbs::eval::Args),
+    Compare(verbs::compare::Args),
     Predict(verbs::predict::Args),
     Render(verbs::render::Args),
     Localise(verbs::localise::Args),
@@ -151,7 +157,9 @@ impl Verb {
             Verb::Import(args) => verbs::import::run(args, console),
             Verb::Train(args) => verbs::train::run(args, console),
             Verb::Join(args) => verbs::join::run(args, console),
+            Verb::Status(args) => verbs::status::run(args, console),
             Verb::Eval(args) => verbs::eval::run(args, console),
+            Verb::Compare(args) => verbs::compare::run(args, console),
             Verb::Predict(args) => verbs::predict::run(args, console),
             Verb::Render(args) => verbs::render::run(args, console),
             Verb::Localise(args) => verbs::localise::run(args, console),
@@ -182,14 +190,18 @@ pub fn main_from(words: impl IntoIterator<Item = OsString>) -> u8 {
     })
 }
 
-/// One verb with its options, for another program: says nothing but warnings, and returns errors.
-pub fn call(words: &[OsString]) -> anyhow::Result<()> {
+/// One verb with its options, for another program: prints nothing but warnings, and returns the objects that `--json` would
+/// print, or the error.
+pub fn call(words: &[OsString]) -> anyhow::Result<Vec<serde_json::Value>> {
     let name = OsString::from("splat4d");
     let cli = Cli::try_parse_from(std::iter::once(&name).chain(words)).map_err(|e| {
         let text = e.to_string();
         Error::input(text.trim_start_matches("error: ").trim_end().to_owned())
     })?;
-    cli.verb.run(None, &Console::new(Loudness::Quiet, false))
+    interrupt::embedded();
+    let console = Console::keeping_objects();
+    cli.verb.run(None, &console)?;
+    Ok(console.into_objects())
 }
 
 /// Parses the arguments of a program with the command's manners, does what `work` makes of them, and tells errors.
@@ -279,7 +291,7 @@ mod tests {
     }
 
     #[test]
-    fn causes_are_told_once() {
+    fn causes_are_printed_once() {
         let io = std::io::Error::other("disk on fire");
         let error = anyhow::Error::from(Error::io("cannot be read", io)).context("the report");
         let text = told(&error);

@@ -90,9 +90,9 @@ impl Work {
         }
         let recipe = run.recipe()?;
         if recipe.capture.observe >= 1.0 {
-            return Err(Error::input("the run saw all of its take, so that nothing is left to predict")
+            return Err(Error::input("the run was trained on its whole clip, so nothing is left to predict")
                 .at(&place)
-                .remedy("Train one that keeps the end: splat4d train CAPTURE --observe 0.8"));
+                .remedy("Train without the end of the clip: splat4d train CAPTURE --observe 0.8"));
         }
         console.phase("reading the run", 0, 0);
         let (capture, recipe) = run.open_capture()?;
@@ -106,7 +106,7 @@ impl Work {
         if let Some(actions) = &order.actions {
             actions.check(ticks, horizon)?;
         }
-        console.phase("following what moves", 0, 0);
+        console.phase("tracking moving parts", 0, 0);
         let times: Vec<f64> = (0..ticks).map(|i| clock.until - (ticks - 1 - i) as f64 / fps).collect();
         let observed = observe(&scene, &times, order.nodes).map_err(|e| e.at(&place))?;
         console.clear();
@@ -139,7 +139,7 @@ impl Work {
         let truth = oracle.as_ref().map(|scene| self.follow(scene));
         let mut cases = Vec::new();
         for (i, f) in forecasts.iter().enumerate() {
-            console.phase("comparing with pictures", i, forecasts.len());
+            console.phase("comparing with images", i, forecasts.len());
             cases.push(views.cases(self, &f.scene)?);
         }
         console.clear();
@@ -279,9 +279,11 @@ impl Work {
             run.capture().and_then(|c| c.canonicalize().ok()) == self.run.capture().and_then(|c| c.canonicalize().ok());
         let scene = read_scene(&run.scene_file()?)?;
         if !same || scene.clip[1] <= self.clock.until {
-            return Err(Error::input("invalid oracle: expected a run of the same capture that saw more of it")
-                .at(path.display())
-                .remedy("Train it on the same capture with the same recipe, without --observe"));
+            return Err(Error::input(
+                "invalid oracle: expected a run of the same capture that was trained on more of it",
+            )
+            .at(path.display())
+            .remedy("Train it on the same capture with the same recipe, without --observe"));
         }
         Ok(Some(scene))
     }

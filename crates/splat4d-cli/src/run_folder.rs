@@ -13,7 +13,7 @@ use splat4d_train::event::Event;
 use splat4d_train::output::{Found, Input, Mixes, OutputFolder, Owner, Request, STATE};
 use splat4d_train::path_text::of_text;
 use splat4d_train::recipe::Recipe;
-use splat4d_train::run::checkpoint;
+use splat4d_train::run::{capture_options, checkpoint};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -108,12 +108,12 @@ impl Run {
     /// Reads the folder. Errors: it is no run; a file in it is damaged.
     pub fn open(path: &Path) -> Result<Self> {
         if !path.exists() {
-            return Err(Error::input("there is no such run")
+            return Err(Error::input("no such run")
                 .at(path.display())
                 .remedy("Give the folder that `splat4d train` wrote, for instance runs/knight."));
         }
         if !Self::is(path) {
-            return Err(Error::input("is not a run: it holds neither recipe.toml nor a scene nor checkpoints")
+            return Err(Error::input("is not a run: it contains neither recipe.toml nor a scene nor checkpoints")
                 .at(path.display())
                 .remedy("Give the folder that `splat4d train` wrote, for instance runs/knight."));
         }
@@ -189,7 +189,7 @@ impl Run {
         let text = self.recipe.as_deref().ok_or_else(|| {
             Error::input("the run has no recipe.toml")
                 .at(path.display())
-                .remedy("Train again; it is written at the start.")
+                .remedy("Train again: the file is written at the start.")
         })?;
         Recipe::from_toml(text).map_err(|e| e.at(path.display()))
     }
@@ -213,6 +213,16 @@ impl Run {
     /// The capture it was trained on.
     pub(crate) fn capture(&self) -> Option<PathBuf> {
         self.info.get("capture").and_then(Value::as_str).map(of_text)
+    }
+
+    /// What it was trained on.
+    pub(crate) fn origin(&self) -> Origin {
+        let opened = || {
+            let (root, recipe) = (self.capture()?, self.recipe().ok()?);
+            // Also masks and maps that the recipe does not look at.
+            Capture::open(&root, &capture_options(&recipe).ok()?).ok()
+        };
+        Origin { capture: self.capture(), elsewhere: opened().map(|c| c.elsewhere).unwrap_or_default() }
     }
 
     /// Warnings and notes about the run: those of the capture's reader, and those since, in that order.
@@ -248,9 +258,9 @@ impl Run {
             return Ok(scene);
         }
         checkpoint::list(&self.path).pop().ok_or_else(|| {
-            Error::input("the run holds no scene and no checkpoint yet")
+            Error::input("the run has no scene and no checkpoint yet")
                 .at(self.path.display())
-                .remedy("Let it train, or continue it with `splat4d train --resume`.")
+                .remedy("Wait for the first checkpoint, or continue it with `splat4d train --resume`.")
         })
     }
 
@@ -352,6 +362,28 @@ pub fn usual_folder(capture: &str) -> PathBuf {
     Path::new("runs").join(if name.is_empty() { "run" } else { name })
 }
 
+/// The folder of a capture, and what it reads from elsewhere: none of it is an output.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(crate) struct Origin {
+    capture: Option<PathBuf>,
+    elsewhere: BTreeSet<PathBuf>,
+}
+
+impl Origin {
+    /// Of an opened capture.
+    pub(crate) fn of(capture: &Capture) -> Self {
+        Self { capture: Some(capture.root.clone()), elsewhere: capture.elsewhere.clone() }
+    }
+
+    /// All of it.
+    pub(crate) fn inputs(&self) -> impl Iterator<Item = Input<'_>> {
+        let what =
+            |path: &PathBuf| if path.is_dir() { "a folder of the capture's images," } else { "a file of the capture," };
+        let elsewhere = self.elsewhere.iter().map(move |path| Input::new(path, what(path)));
+        self.capture.iter().map(|c| Input::new(c, "the capture")).chain(elsewhere)
+    }
+}
+
 /// What a training run was asked for: the same command continues it, from whatever state a crash left.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Asked {
@@ -365,21 +397,21 @@ pub struct Asked {
     pub minutes: Option<f64>,
     /// Whether the time is foretold.
     pub predict: bool,
-    /// Folders elsewhere that the capture holds by links.
+    /// What the capture reads from elsewhere.
     #[serde(skip)]
-    linked: BTreeSet<PathBuf>,
+    elsewhere: BTreeSet<PathBuf>,
 }
 
 impl Asked {
     pub fn new(capture: &Path, recipe: &Recipe, minutes: Option<f64>, predict: bool) -> Self {
         let capture = capture.canonicalize().unwrap_or_else(|_| capture.to_owned());
         let (version, recipe) = (env!("CARGO_PKG_VERSION").into(), recipe.to_toml());
-        Self { version, capture, recipe, minutes, predict, linked: BTreeSet::new() }
+        Self { version, capture, recipe, minutes, predict, elsewhere: BTreeSet::new() }
     }
 
-    /// The same of an opened capture, whose linked folders hold no output either.
+    /// The same of an opened capture; what it reads from elsewhere holds no output either.
     pub fn of(capture: &Capture, recipe: &Recipe, minutes: Option<f64>, predict: bool) -> Self {
-        Self { linked: capture.linked_folders(), ..Self::new(&capture.root, recipe, minutes, predict) }
+        Self { elsewhere: capture.elsewhere.clone(), ..Self::new(&capture.root, recipe, minutes, predict) }
     }
 
     /// Of a run that ended before its first checkpoint, so that there is nothing else to continue from.
@@ -395,8 +427,8 @@ impl Asked {
     /// Takes the folder of the run for a new training or the rest of one. What is there of one that took no step is removed.
     pub fn begin(&self, run: &Path, force: bool, command: &str) -> Result<(OutputFolder, Found)> {
         let asked = serde_json::to_string(self).expect("it is plain data");
-        let linked = self.linked.iter().map(|folder| Input::new(folder, "a folder of the capture's images,"));
-        let inputs: Vec<Input<'_>> = std::iter::once(Input::new(&self.capture, "the capture")).chain(linked).collect();
+        let origin = Origin { capture: Some(self.capture.clone()), elsewhere: self.elsewhere.clone() };
+        let inputs: Vec<Input<'_>> = origin.inputs().collect();
         let request = Request { command, inputs: &inputs, asked: &asked, force, mixes: Mixes::Anything };
         let (folder, found) = OutputFolder::begin(run, &request)?;
         if found == Found::Unfinished && checkpoint::list(run).is_empty() {
@@ -459,7 +491,7 @@ pub(crate) fn beside(results: &Value) -> Vec<Beside<'_>> {
 }
 
 /// The entry `ours_N` with the largest N.
-fn newest(results: &Value) -> Option<(usize, &Value)> {
+pub(crate) fn newest(results: &Value) -> Option<(usize, &Value)> {
     results.as_object()?.iter().filter_map(|(k, v)| Some((step_of(k)?, v))).max_by_key(|e| e.0)
 }
 
@@ -467,7 +499,7 @@ fn step_of(name: &str) -> Option<usize> {
     name.strip_prefix("ours_")?.parse().ok()
 }
 
-fn view_scores(entry: &Value) -> Vec<ViewScore> {
+pub(crate) fn view_scores(entry: &Value) -> Vec<ViewScore> {
     let psnr = entry.get("PSNR").and_then(Value::as_object);
     let mut views: Vec<ViewScore> = psnr
         .into_iter()

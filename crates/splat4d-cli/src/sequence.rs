@@ -6,7 +6,7 @@ use splat4d::format::dialect;
 use splat4d::layers::Scene;
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::{Error, Result};
-use splat4d_train::output::{Input, Mixes, OutputFolder, Request};
+use splat4d_train::output::{Input, Mixes, OutputFolder, Request, check_file};
 use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
 
@@ -125,11 +125,18 @@ pub(crate) fn take(
     command: &str,
     force: bool,
 ) -> Result<OutputFolder> {
-    let capture = read.run.and_then(Run::capture);
-    let mut inputs: Vec<Input<'_>> = capture.iter().map(|c| Input::new(c, "the run's capture")).collect();
-    // Of files it is known by their names whether they would be in the way.
+    let origin = read.run.map(Run::origin).unwrap_or_default();
+    let mut inputs: Vec<Input<'_>> = origin.inputs().collect();
+    let sources = Pattern::of(read.path).filter(|_| !read.path.exists());
+    if let Some(sources) = &sources {
+        inputs.push(Input { may_hold: true, ..Input::new(sources.folder(), "the folder of what is read,") });
+    }
     if read.path.is_dir() {
         inputs.push(Input { may_hold: read.run.is_some(), ..Input::new(read.path, "what is read,") });
+    } else {
+        let own = [Input::new(read.path, "what is read,")];
+        let mut frames = patterns.iter().flat_map(|p| (0..count).map(|i| p.file(i)));
+        frames.try_for_each(|frame| check_file(&frame, &own))?;
     }
     let is = |name: &OsStr| patterns.iter().any(|p| p.takes(name));
     let written = |name: &OsStr| patterns.iter().any(|p| p.writes(name, count));
@@ -168,19 +175,19 @@ pub(crate) fn frames(path: &Path) -> Result<Frames> {
     let ending = |name: &OsStr| Path::new(name).extension().map(OsStr::to_ascii_lowercase);
     if let Some((_, other)) = found.iter().find(|(_, name)| ending(name) != ending(&found[0].1)) {
         let (one, other) = (found[0].1.display(), other.display());
-        return Err(Error::input(format!("holds frames of several kinds, such as {one} and {other}"))
+        return Err(Error::input(format!("contains frames of several formats, such as {one} and {other}"))
             .at(path.display())
             .remedy("Give a pattern, for instance 'FOLDER/frame_%05d.ply'."));
     }
     if found.is_empty() {
         let kinds = either(&endings());
-        return Err(Error::input(format!("holds neither a run, nor a SOG scene, nor numbered {kinds} files"))
+        return Err(Error::input(format!("contains neither a run, nor a SOG scene, nor numbered {kinds} files"))
             .at(path.display())
             .remedy("Give a run folder, a scene file, or a folder with frame_00000.ply and so on."));
     }
     if let Some(twice) = found.windows(2).find(|w| w[0].0 == w[1].0) {
         let (number, one, other) = (twice[0].0, twice[0].1.display(), twice[1].1.display());
-        return Err(Error::input(format!("holds two files with the number {number}: {one} and {other}"))
+        return Err(Error::input(format!("contains two files with the number {number}: {one} and {other}"))
             .at(path.display())
             .remedy("Move one of them away, or give a pattern, for instance 'FOLDER/frame_%05d.ply'."));
     }
@@ -287,12 +294,11 @@ pub fn moments(scene: &Scene<f32>, fps: Option<f64>, range: [Option<f64>; 2]) ->
     let [from, to] = [range[0].unwrap_or(scene.clip[0]), range[1].unwrap_or(scene.clip[1])];
     let count = ((to - from) * fps + 1e-6).floor() + 1.0;
     if !(1.0..=MAX_FILES).contains(&count) {
-        return Err(Error::input(format!("from {from} s to {to} s at {fps} a second are {count} files")).remedy(
-            format!(
+        return Err(Error::input(format!("from {from} s to {to} s at {fps} frames per second are {count} files"))
+            .remedy(format!(
                 "The scene lasts from {} to {} s; at most {MAX_FILES} files are written.",
                 scene.clip[0], scene.clip[1]
-            ),
-        ));
+            )));
     }
     Ok((fps, (0..count as usize).map(|i| from + i as f64 / fps).collect()))
 }
@@ -330,7 +336,7 @@ mod tests {
         assert_eq!(names(folder.path()), ["f9.ply", "f10.ply", "f100.compressed.ply"]);
         assert_eq!(names(&folder.path().join("f%d.ply")), ["f9.ply", "f10.ply"]);
         std::fs::write(folder.path().join("f3.spz"), b"").unwrap();
-        assert!(frames(folder.path()).unwrap_err().to_string().contains("several kinds"));
+        assert!(frames(folder.path()).unwrap_err().to_string().contains("several formats"));
         let empty = tempfile::tempdir().unwrap();
         assert!(frames(empty.path()).unwrap_err().to_string().contains("numbered"));
     }

@@ -57,13 +57,13 @@ pub(crate) fn start_for(
     console.say(&format!("the player is at {url}"));
     console.emit(&json!({"type": "serving", "url": url}));
     if !running.address().ip().is_loopback() {
-        console.warn("everybody who reaches this machine over the network can look at the scene.");
+        console.warn("every computer that reaches this machine over the network can view the scene.");
     }
     if !place.no_open && !open_browser(&url) {
         let port = running.address().port();
         console.say(&format!(
-            "there is no screen here. On a computer that has one: ssh -L {port}:localhost:{port} {}, then open \
-             http://localhost:{port}/{} there",
+            "this machine has no screen. On your own computer: ssh -L {port}:localhost:{port} {}, then open \
+             http://localhost:{port}/{}",
             machine(),
             token.map_or(String::new(), |token| format!("#edit={token}"))
         ));
@@ -125,7 +125,7 @@ impl Watch {
         match start(config, place, console) {
             Ok(running) => Self { running: Some(running) },
             Err(error) => {
-                console.warn(&format!("training goes on unseen: {error}"));
+                console.warn(&format!("training continues without the page: {error}"));
                 Self::nobody()
             }
         }
@@ -148,7 +148,7 @@ impl Watch {
             }
             Event::Warning { message } => running.publish(&News::Note(json!({ "message": message }))),
             Event::RolledBack { iteration, to, what } => {
-                let message = format!("step {iteration} was not finite ({what}); back to step {to}");
+                let message = format!("step {iteration} was not finite ({what}); rolled back to step {to}");
                 running.publish(&News::Note(json!({ "message": message })));
             }
             Event::Finished { iteration, seconds, gaussians, .. } => running.publish(&News::Done(json!({

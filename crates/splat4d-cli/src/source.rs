@@ -50,9 +50,10 @@ pub struct Source {
 /// Refuses an output that would replace what is read (the scene, a file of its run's capture, or one of `others`) or what any run
 /// needs, and one in a folder that another process owns.
 pub(crate) fn keep(path: &Path, run: Option<&Run>, output: &Path, others: &[&Path]) -> Result<()> {
-    let capture = run.and_then(Run::capture);
+    // A new file replaces nothing: the capture need not be opened.
+    let origin = run.filter(|_| output.is_file()).map(Run::origin).unwrap_or_default();
     let mut inputs = vec![Input { may_hold: run.is_some(), ..Input::new(path, "what is read,") }];
-    inputs.extend(capture.iter().map(|c| Input::new(c, "the run's capture")));
+    inputs.extend(origin.inputs());
     inputs.extend(others.iter().map(|file| Input::new(file, "what is read,")));
     check_file(output, &inputs)?;
     if Run::needs(output) {
@@ -122,12 +123,12 @@ impl Source {
     pub(crate) fn finite(mut self) -> Self {
         let all = self.scene.len();
         let dropped = self.scene.drop_non_finite();
-        self.warnings.counted(dropped, all, "hold NaN or infinity and were left out");
+        self.warnings.counted(dropped, all, "contain NaN or infinity and were left out");
         self
     }
 
     /// A scene of our own, without a run.
-    pub(crate) fn own(scene: Scene<f32>) -> Self {
+    pub fn own(scene: Scene<f32>) -> Self {
         let warnings = Warnings::default();
         Self { scene, run: None, ply: None, playback: None, provenance: None, dialect: None, warnings }
     }
@@ -180,7 +181,7 @@ fn open_sequence(path: &Path, fps: f64) -> Result<Source> {
     // Frames far from the origin may each have an offset: that of the first is the scene's.
     let mut offset = None;
     if let Some(missing) = &found.missing {
-        warnings.say(format!("frames are missing: {missing}. Nothing is shown at their times, which are kept"));
+        warnings.say(format!("frames are missing: {missing}. The scene is empty at their times"));
     }
     for file in &found.files {
         let bytes = files::read(file)?;
@@ -194,7 +195,7 @@ fn open_sequence(path: &Path, fps: f64) -> Result<Source> {
         let mut opened = own.open(&bytes).map_err(|e| e.at(file.display()))?;
         warnings.append(opened.warnings);
         if *up.get_or_insert(opened.scene.up) != opened.scene.up {
-            return Err(Error::input("the frame's axes differ from those of the frames before it")
+            return Err(Error::input("the frame's axes differ from those of the previous frames")
                 .at(file.display())
                 .remedy("Convert all frames with the same --up."));
         }
@@ -222,7 +223,7 @@ pub fn read_scene(path: &Path) -> Result<Scene<f32>> {
 /// Refuses a scene without Gaussians.
 pub fn not_empty(scene: &Scene<f32>, path: &Path) -> Result<()> {
     if scene.is_empty() {
-        return Err(Error::input("holds no Gaussians")
+        return Err(Error::input("contains no Gaussians")
             .at(path.display())
             .remedy("Train it again, or give another file."));
     }

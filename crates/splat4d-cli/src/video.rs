@@ -13,10 +13,10 @@ use std::process::{Child, ChildStdin, Command, Stdio};
 const CRF: &str = "18";
 /// File name endings that films may have.
 const ENDINGS: &str =
-    "Use .mp4, .mkv or .mov (needs ffmpeg), .png (animated), or a name without ending for a folder of pictures.";
+    "Use .mp4, .mkv or .mov (needs ffmpeg), .png (animated), or a name without extension for a folder of images.";
 /// Remedy where ffmpeg is missing.
 const INSTEAD: &str =
-    "Install ffmpeg, or write an animated .png or a folder of pictures instead (-o NAME.png, -o FOLDER).";
+    "Install ffmpeg, or write an animated .png or a folder of images instead (-o NAME.png, -o FOLDER).";
 /// Most bytes kept of what ffmpeg says.
 const STDERR_BYTES: usize = 64 << 10;
 
@@ -38,7 +38,7 @@ impl Rgb {
         encoder.set_depth(png::BitDepth::Eight);
         encoder.set_compression(png::Compression::Fast);
         let write = |e: png::Encoder<'_, &mut Vec<u8>>| e.write_header()?.write_image_data(&self.data);
-        write(encoder).expect("a picture in memory can be encoded");
+        write(encoder).expect("an image in memory can be encoded");
         bytes
     }
 }
@@ -199,7 +199,7 @@ impl Film {
         }
         anyhow::anyhow!(
             "ffmpeg could not write the film ({}). {INSTEAD}",
-            if last.is_empty() { "it said nothing".into() } else { last.join("; ") }
+            if last.is_empty() { "it printed nothing".into() } else { last.join("; ") }
         )
     }
 }
@@ -257,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_holds_numbered_pictures() {
+    fn a_folder_holds_numbered_images() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("frames");
         let mut film = Film::create(&path, [4, 4], 24.0, 2).unwrap();

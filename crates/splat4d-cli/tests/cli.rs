@@ -98,7 +98,7 @@ fn help_teaches_and_completions_complete() {
 }
 
 #[test]
-fn pictures_are_found_in_a_scene_and_cameras_compared_with_their_truth() {
+fn images_are_found_in_a_scene_and_cameras_compared_with_their_truth() {
     let work = tempfile::tempdir().unwrap();
     let capture = Capture::new(work.path()).write();
     let run = work.path().join("run");
@@ -117,7 +117,7 @@ fn pictures_are_found_in_a_scene_and_cameras_compared_with_their_truth() {
     std::fs::write(&camera, one.to_string()).unwrap();
     splat4d(&["render", str(&run), "--camera", str(&camera), "-o", str(&picture)]).run().ok();
     let said = splat4d(&["localise", str(&run), str(&picture), "-o", str(&found)]).run().ok();
-    assert!(said.contains("a.png: at (") && said.contains("of what one plain colour leaves"), "{said}");
+    assert!(said.contains("a.png: at (") && said.contains("of that of a plain colour"), "{said}");
     let row = &json_of(&found)[0];
     let number = |v: &Value| v.as_f64().unwrap();
     let pose = &stated["world_to_camera"];
@@ -368,7 +368,7 @@ fn one_gaussian(folder: &Path) -> PathBuf {
 }
 
 #[test]
-fn a_scene_becomes_a_page_alone_or_beside_its_file() {
+fn a_scene_becomes_a_page_alone_or_next_to_its_file() {
     let work = tempfile::tempdir().unwrap();
     let (file, page) = (one_gaussian(work.path()), work.path().join("page.html"));
     splat4d(&["export", str(&file), "--html", "-o", str(&page)]).run().ok();
@@ -450,7 +450,7 @@ fn a_run_is_watched_and_trains_without_a_server_too() {
     let port = taken.local_addr().unwrap().port().to_string();
     let answer = splat4d(&["train", str(&capture), "-o", str(&run("unseen")), "--no-eval"]).args(&TINY);
     let said = answer.args(&["--view", "--no-open", "--json", "--port", &port]).run().ok();
-    assert!(said.contains("goes on unseen") && run("unseen").join("scene.safetensors").is_file(), "{said}");
+    assert!(said.contains("continues without the page") && run("unseen").join("scene.safetensors").is_file(), "{said}");
     let scene = |name: &str| std::fs::read(run(name).join("scene.safetensors")).unwrap();
     assert!(scene("watched") == scene("unseen"), "being watched must not change a bit");
 }
@@ -618,7 +618,7 @@ fn an_interrupt_saves_and_says_how_to_continue() {
 }
 
 #[test]
-fn a_playback_file_is_told_exported_and_refused_when_damaged() {
+fn a_playback_file_is_described_exported_and_refused_when_damaged() {
     let work = tempfile::tempdir().unwrap();
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../splat4d/tests/data/tiny.s4d");
     let told: Value = serde_json::from_str(&splat4d(&["info", "--json", str(&file)]).run().ok()).unwrap();

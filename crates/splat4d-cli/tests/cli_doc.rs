@@ -16,12 +16,12 @@ const PAGES: [Page; 4] = [
         file: "cli.md",
         head: "# Command line: captures and training\n\nEvery option, as `splat4d COMMAND --help` prints it. Tasks and \
                examples of all commands: [commands](verbs.md).\n\n| page | commands |\n|---|---|\n\
-               | this page | import, info, train, join |\n\
+               | this page | import, info, train, join, status |\n\
                | [results](cli-results.md) | eval, render, predict, localise, bench |\n\
                | [scenes and files](cli-scenes.md) | bake, compress, view, export |\n\
                | [conversion and edits](cli-edits.md) | convert, edit, label, completions |\n\n\
                Every command also accepts these options:\n",
-        commands: &["import", "info", "train", "join"],
+        commands: &["import", "info", "train", "join", "status"],
     },
     Page {
         file: "cli-results.md",

@@ -38,7 +38,7 @@ impl Actions {
             return Err(bad(format!("two columns of actions are called {name}")));
         }
         if let Some(name) = stray(&names) {
-            return Err(bad(format!("column {name} is a part of a vector whose other parts are not beside it"))
+            return Err(bad(format!("column {name} belongs to a vector whose other columns are not adjacent"))
                 .remedy("Name three columns in a row NAME.x, NAME.y and NAME.z, or no column so"));
         }
         let row = |(number, line): (usize, &str)| {

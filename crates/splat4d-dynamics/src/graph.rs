@@ -14,11 +14,12 @@
 #[cfg(test)]
 mod tests;
 
-use crate::learnt::{Action, Network, Scales, State, dot, put, row};
+use crate::learnt::{Action, Network, Scales, State, put, row};
 use crate::optimise::no_gaussians;
 use crate::paths::{Moment, nearest};
 use splat4d::Result;
 use splat4d::math::se3::{norm, sub};
+use splat4d::math::vec3::dot;
 use splat4d::math::{Real, Rng};
 use splat4d::nn::{InputGrad, Kept, Mlp, MlpShape, Passed};
 use splat4d::scene::{Grads, Key, Params};

@@ -13,6 +13,7 @@
 use crate::paths::{Moment, Paths, Pose, nearest};
 use nalgebra::{DMatrix, DVector};
 use splat4d::math::mat3::procrustes;
+use splat4d::math::median;
 use splat4d::math::quat;
 use splat4d::math::se3::{norm, sub};
 
@@ -75,7 +76,7 @@ impl Koopman {
                 errors.push(distance(&model.rollout(&seen, truth.len()), truth));
             }
         }
-        let medians: Vec<f64> = errors.into_iter().map(median).collect();
+        let medians: Vec<f64> = errors.into_iter().map(|mut of| median(&mut of).unwrap_or(0.0)).collect();
         let best = (0..medians.len()).min_by(|&a, &b| medians[a].total_cmp(&medians[b])).map_or(1, |i| i + 1);
         Self::with(paths, best)
     }
@@ -104,11 +105,6 @@ impl Koopman {
             })
             .collect()
     }
-}
-
-fn median(mut of: Vec<f64>) -> f64 {
-    of.sort_by(f64::total_cmp);
-    of.get(of.len() / 2).copied().unwrap_or(0.0)
 }
 
 /// How many pairs so many ticks can tell: one at least.

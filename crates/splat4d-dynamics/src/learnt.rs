@@ -7,6 +7,7 @@ use crate::actions::Actions;
 use crate::optimise::Optimiser;
 use crate::paths::{Moment, Neighbours, Paths, Pose};
 use splat4d::math::se3::{norm, scale, sub};
+use splat4d::math::vec3::dot;
 use splat4d::math::{Real, Rng};
 use splat4d::scene::{Grads, Params};
 use splat4d::{Error, Result};
@@ -78,10 +79,6 @@ pub trait Network: Clone {
         d_hidden: &mut Vec<F>,
         d: &mut Grads<F>,
     );
-}
-
-pub(crate) fn dot<F: Real>(a: [F; 3], b: [F; 3]) -> F {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
 pub(crate) fn row<F: Real>(x: &[F], i: usize) -> [F; 3] {

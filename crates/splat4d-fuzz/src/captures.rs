@@ -1,6 +1,7 @@
 //! Files of captures: one of a sound capture's files holds the bytes, and the capture is opened.
 
 use crate::Reader;
+use crate::zip::zip;
 use image::{ImageBuffer, ImageFormat, Luma, Rgb};
 use serde_json::json;
 use splat4d::format::npy;
@@ -25,9 +26,46 @@ pub(crate) const READERS: &[Reader] = &[
         read: |b| open("panoptic", "train_meta.json", b),
     },
     Reader { name: "poses_bounds", seeds: || vec![poses_bounds()], read: |b| open("n3dv", "poses_bounds.npy", b) },
+    Reader { name: "nerfies_dataset", seeds: || vec![DATASET.into()], read: |b| open("nerfies", "dataset.json", b) },
+    Reader { name: "nerfies_metadata", seeds: || vec![METADATA.into()], read: |b| open("nerfies", "metadata.json", b) },
+    Reader { name: "nerfies_camera", seeds: || vec![nerfies().into()], read: |b| open("nerfies", "camera/0.json", b) },
+    Reader { name: "nerfies_scene", seeds: || vec![FRAMING.into()], read: |b| open("nerfies", "scene.json", b) },
+    Reader { name: "metashape_xml", seeds: || vec![metashape().into()], read: |b| open("metashape", "cameras.xml", b) },
+    Reader { name: "realityscan_csv", seeds: realityscan, read: |b| open("realityscan", "cameras.csv", b) },
+    Reader {
+        name: "polycam_json",
+        seeds: || vec![polycam().into()],
+        read: |b| open("polycam", "keyframes/cameras/0.json", b),
+    },
+    Reader { name: "record3d_json", seeds: || vec![record3d().into()], read: |b| open("record3d", "metadata.json", b) },
     Reader { name: "colmap_cameras", seeds: || vec![cameras()], read: |b| open("colmap", "sparse/0/cameras.bin", b) },
     Reader { name: "colmap_images", seeds: || vec![images()], read: |b| open("colmap", "sparse/0/images.bin", b) },
     Reader { name: "colmap_points", seeds: || vec![points()], read: |b| open("colmap", "sparse/0/points3D.bin", b) },
+    Reader {
+        name: "colmap_cameras_txt",
+        seeds: || vec![CAMERAS_TXT.into()],
+        read: |b| open("colmap_txt", "sparse/0/cameras.txt", b),
+    },
+    Reader {
+        name: "colmap_images_txt",
+        seeds: || vec![IMAGES_TXT.into()],
+        read: |b| open("colmap_txt", "sparse/0/images.txt", b),
+    },
+    Reader {
+        name: "colmap_points_txt",
+        seeds: || vec![POINTS_TXT.into()],
+        read: |b| open("colmap_txt", "sparse/0/points3D.txt", b),
+    },
+    Reader { name: "image_file", seeds: image_files, read: |b| open("own", "images/0.png", b) },
+    Reader { name: "mask_png", seeds: || vec![grey(255)], read: |b| open("beside", "mask.png", b) },
+    Reader { name: "labels_png", seeds: || vec![grey(1)], read: |b| open("beside", "labels.png", b) },
+    Reader { name: "features_npy", seeds: || vec![floats(&[6, 8, 2])], read: |b| open("beside", "features.npy", b) },
+    Reader { name: "tracks_npz", seeds: tracks_npz, read: |b| open("tracks_npz", "tracks.npz", b) },
+    Reader { name: "tracks_csv", seeds: || vec![TRACKS.into()], read: |b| open("beside", "tracks.csv", b) },
+    Reader { name: "flow_png", seeds: || vec![flow_png()], read: |b| open("flow_png", "flow.png", b) },
+    Reader { name: "flow_flo", seeds: || vec![flo()], read: |b| open("flow_flo", "flow.flo", b) },
+    Reader { name: "flow_npy", seeds: || vec![floats(&[6, 8, 2])], read: |b| open("flow_npy", "flow.npy", b) },
+    Reader { name: "depth_npy", seeds: || vec![floats(&[6, 8])], read: |b| open("npy", "depth.npy", b) },
     Reader { name: "depth_exr", seeds: || vec![exr()], read: |b| open("exr", "depth.exr", b) },
     Reader { name: "depth_png", seeds: || vec![depth_png()], read: |b| open("png", "depth.png", b) },
     Reader { name: "picture", seeds: pictures, read: |b| drop(Rgb8::decode(b, Path::new("picture"))) },
@@ -47,6 +85,7 @@ fn open(layout: &'static str, file: &str, bytes: &[u8]) {
         let folder = folders.entry(layout).or_insert_with(|| made(layout));
         write(folder.path(), file, bytes);
         if let Ok(capture) = Capture::open(folder.path(), &CaptureOptions::default()) {
+            let _ = capture.check_labels(&capture.frames[0]);
             let store = ImageStore::new(Arc::new(capture), 1 << 20);
             let _ = store.load(0);
         }
@@ -75,9 +114,62 @@ fn made(layout: &str) -> TempDir {
             put("sparse/0/images.bin", &images());
             put("sparse/0/points3D.bin", &points());
         }
+        "colmap_txt" => {
+            put("sparse/0/cameras.txt", CAMERAS_TXT.as_bytes());
+            put("sparse/0/images.txt", IMAGES_TXT.as_bytes());
+            put("sparse/0/points3D.txt", POINTS_TXT.as_bytes());
+        }
+        "nerfies" => {
+            put("dataset.json", DATASET.as_bytes());
+            put("metadata.json", METADATA.as_bytes());
+            put("scene.json", FRAMING.as_bytes());
+            for i in 0..2 {
+                put(&format!("camera/{i}.json"), nerfies().as_bytes());
+                put(&format!("rgb/1x/{i}.png"), &png());
+            }
+        }
+        "metashape" | "realityscan" => {
+            (0..2).for_each(|i| put(&format!("images/p{i}.png"), &png()));
+            match layout {
+                "metashape" => put("cameras.xml", metashape().as_bytes()),
+                _ => put("cameras.csv", &realityscan()[0]),
+            }
+        }
+        "polycam" => {
+            for i in 0..2 {
+                put(&format!("keyframes/cameras/{i}.json"), polycam().as_bytes());
+                put(&format!("keyframes/images/{i}.png"), &png());
+            }
+        }
+        "record3d" => {
+            put("metadata.json", record3d().as_bytes());
+            (0..2).for_each(|i| put(&format!("rgb/{i}.png"), &png()));
+        }
+        "beside" => {
+            put("mask.png", &grey(255));
+            put("labels.png", &grey(1));
+            put("features.npy", &floats(&[6, 8, 2]));
+            put("tracks.csv", TRACKS.as_bytes());
+            put("capture.json", beside().as_bytes());
+        }
+        "tracks_npz" => {
+            put("tracks.npz", &tracks_npz()[0]);
+            put("capture.json", own().replacen("\"name\"", "\"tracks\":\"tracks.npz\",\"name\"", 1).as_bytes());
+        }
+        flow if flow.starts_with("flow_") => {
+            let file = flow.replace('_', ".");
+            let key = format!("\"flow\":[\"{file}\"],\"name\"");
+            put(
+                &file,
+                &[flow_png(), flo(), floats(&[6, 8, 2])]
+                    [["flow_png", "flow_flo"].iter().position(|f| *f == flow).unwrap_or(2)],
+            );
+            put("capture.json", own().replacen("\"name\"", &key, 1).as_bytes());
+        }
         ending => {
             put("depth.exr", &exr());
             put("depth.png", &depth_png());
+            put("depth.npy", &floats(&[6, 8]));
             let depth = format!("\"depth\":\"depth.{ending}\",\"name\"");
             put("capture.json", own().replacen("\"name\"", &depth, 1).as_bytes());
         }
@@ -179,4 +271,150 @@ fn pictures() -> Vec<Vec<u8>> {
 /// A depth map of 8x6, written by `splat4d render --raw-format exr`.
 fn exr() -> Vec<u8> {
     include_bytes!("../seeds/depth.exr").to_vec()
+}
+
+/// COLMAP's text files.
+const CAMERAS_TXT: &str = "# Camera list\n1 PINHOLE 8 6 8 8 4 3\n";
+const IMAGES_TXT: &str = "# Image list\n1 1 0 0 0 0 0 4 1 0.png\n1.5 2.5 1\n2 1 0 0 0 0.1 0 4 1 1.png\n1.5 2.5 1\n";
+const POINTS_TXT: &str = "# 3D point list\n1 0.1 0.2 0.3 255 0 9 0.5 1 0 2 0\n";
+
+/// Nerfies' files.
+const DATASET: &str = r#"{"count": 2, "ids": ["0", "1"], "train_ids": ["0"], "val_ids": ["1"]}"#;
+const METADATA: &str = r#"{"0": {"warp_id": 0, "appearance_id": 0, "camera_id": 0}, "1": {"warp_id": 1, "appearance_id": 1, "camera_id": 0}}"#;
+const FRAMING: &str = r#"{"scale": 0.5, "center": [0.0, 0.1, 0.2], "near": 0.1, "far": 9.0}"#;
+
+fn nerfies() -> String {
+    json!({"orientation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "position": [0.0, 0.0, -4.0], "focal_length": 8.0,
+        "pixel_aspect_ratio": 1.0, "principal_point": [4.0, 3.0], "radial_distortion": [0.01, 0, 0],
+        "tangential_distortion": [0, 0], "skew": 0.0, "image_size": [WIDTH, HEIGHT]})
+    .to_string()
+}
+
+fn metashape() -> String {
+    let camera = |i: u32| {
+        format!(
+            "<camera id=\"{i}\" sensor_id=\"0\" label=\"p{i}\"><transform>1 0 0 0 0 1 0 0 0 0 1 -4 0 0 0 1</transform></camera>"
+        )
+    };
+    format!(
+        "<?xml version=\"1.0\"?>\n<document version=\"2.0.0\"><chunk label=\"a\" enabled=\"true\"><sensors><sensor id=\"0\" \
+         type=\"frame\"><resolution width=\"{WIDTH}\" height=\"{HEIGHT}\"/><calibration type=\"frame\" class=\"adjusted\"><f>8</f>\
+         <cx>0.5</cx><cy>-0.25</cy><b1>1</b1><k1>-0.1</k1><p1>0.001</p1></calibration></sensor></sensors><components>\
+         <component id=\"0\"><transform><rotation>1 0 0 0 1 0 0 0 1</rotation><translation>1 2 3</translation><scale>2</scale>\
+         </transform></component></components><cameras>{}{}</cameras></chunk></document>",
+        camera(0),
+        camera(1)
+    )
+}
+
+/// With commas, and as a spreadsheet with decimal commas.
+fn realityscan() -> Vec<Vec<u8>> {
+    let head = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n";
+    let rows =
+        "p0.png,1,2,3,10,20,30,36,0.75,-0.3,0.01,0,0,0,0,0\np1.png,1.5,2,3,11,20,30,36,0.75,-0.3,0.01,0,0,0,0,0\n";
+    let text = format!("{head}{rows}");
+    let other = text.replace(',', ";").replace('.', ",").replace(",png", ".png");
+    vec![text.into(), other.into()]
+}
+
+fn polycam() -> String {
+    json!({"fx": 8, "fy": 8, "cx": 4, "cy": 3, "width": WIDTH, "height": HEIGHT, "timestamp": 1_700_000, "blur_score": 50,
+        "t_00": 1, "t_01": 0, "t_02": 0, "t_03": 0, "t_10": 0, "t_11": 1, "t_12": 0, "t_13": 0, "t_20": 0, "t_21": 0,
+        "t_22": 1, "t_23": 4})
+    .to_string()
+}
+
+fn record3d() -> String {
+    json!({"w": WIDTH, "h": HEIGHT, "fps": 20, "K": [8, 0, 0, 0, 8, 0, 4, 3, 1], "frameTimestamps": [100.0, 100.05],
+        "poses": [[0, 0, 0, 1, 0, 0, 4], [0, 0, 0, 1, 0.1, 0, 4]],
+        "perFrameIntrinsicCoeffs": [[8, 8, 4, 3], [8.1, 8, 4, 3]]})
+    .to_string()
+}
+
+/// A capture with everything that may lie beside its first picture.
+fn beside() -> String {
+    let files = "\"masks\":[\"mask.png\",\"mask.png\"],\"labels\":[\"labels.png\",\"labels.png\"],\
+                 \"features\":[\"features.npy\",\"features.npy\"],\"tracks\":\"tracks.csv\",\"name\"";
+    own().replacen("\"name\"", files, 1).replacen("\"fps\"", "\"labels\":[\"a\",\"b\"],\"fps\"", 1)
+}
+
+const TRACKS: &str = "point,frame,x,y\n0,0,1.5,2\n0,1,2.5,2\n1,1,3,4\n";
+
+fn tracks_npz() -> Vec<Vec<u8>> {
+    let (tracks, seen) = (floats(&[2, 3, 2]), floats(&[2, 3]));
+    [false, true].map(|deflate| zip(&[("tracks.npy", &tracks), ("visibility.npy", &seen)], deflate)).into()
+}
+
+/// Columns of 0 and of this value in turn.
+fn grey(value: u8) -> Vec<u8> {
+    encoded(&ImageBuffer::from_fn(WIDTH, HEIGHT, |x, _| Luma([value * (x % 2) as u8])), ImageFormat::Png)
+}
+
+fn flow_png() -> Vec<u8> {
+    let code = |x: u32, y: u32| Rgb([(32768 + 64 * (x % 2)) as u16, (32768 + 32 * y) as u16, 1]);
+    encoded(&ImageBuffer::from_fn(WIDTH, HEIGHT, code), ImageFormat::Png)
+}
+
+fn flo() -> Vec<u8> {
+    let mut out = 202_021.25f32.to_le_bytes().to_vec();
+    [WIDTH, HEIGHT].iter().for_each(|x| out.extend(x.to_le_bytes()));
+    (0..2 * WIDTH * HEIGHT).for_each(|i| out.extend((0.25 * (i % 3) as f32).to_le_bytes()));
+    out
+}
+
+fn floats(shape: &[usize]) -> Vec<u8> {
+    let data: Vec<f32> = (0..shape.iter().product()).map(|i| 1.0 + 0.1 * i as f32).collect();
+    let mut out = Vec::new();
+    npy::write_f32(shape, &data, &mut out).expect("memory takes all bytes");
+    out
+}
+
+/// A JPEG with its orientation in EXIF, and a PNG.
+fn image_files() -> Vec<Vec<u8>> {
+    let plain = include_bytes!("../seeds/few.jpg");
+    // APP1 with a big-endian TIFF of one entry: tag 0x0112 (orientation), a short, 6.
+    let exif = b"Exif\0\0MM\0\x2a\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0";
+    let length = (exif.len() as u16 + 2).to_be_bytes();
+    vec![[&plain[..2], b"\xFF\xE1", &length, exif, &plain[2..]].concat(), png()]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn seeds_are_sound() {
+        let layouts = [
+            "own",
+            "nerf",
+            "panoptic",
+            "n3dv",
+            "colmap",
+            "colmap_txt",
+            "nerfies",
+            "metashape",
+            "realityscan",
+            "polycam",
+            "record3d",
+            "beside",
+            "tracks_npz",
+            "flow_png",
+            "flow_flo",
+            "flow_npy",
+            "exr",
+            "png",
+            "npy",
+        ];
+        for layout in layouts {
+            let folder = made(layout);
+            let capture = Capture::open(folder.path(), &CaptureOptions::default());
+            let capture = capture.unwrap_or_else(|e| panic!("{layout}: {e}"));
+            capture.check_labels(&capture.frames[0]).unwrap();
+            let store = ImageStore::new(Arc::new(capture), 1 << 20);
+            assert!(store.load(0).is_ok(), "{layout}: {:?}", store.load(0).err().map(|e| e.to_string()));
+        }
+        for image in image_files() {
+            assert!(Rgb8::decode(&image, Path::new("image")).is_ok());
+        }
+    }
 }

@@ -1,20 +1,25 @@
 //! Files of scenes and arrays.
 
 use crate::Reader;
+use crate::zip::zip;
 use flate2::Compression;
 use flate2::read::GzDecoder;
 use flate2::write::GzEncoder;
 use splat4d::format::dialect::{WriteOptions, still};
 use splat4d::format::playback::{self, HEADER_BYTES, Index};
-use splat4d::format::{DIALECTS, npy, ply, safetensors, scene, sog, splat};
+use splat4d::format::sog::levels;
+use splat4d::format::{DIALECTS, foreign, npy, ply, safetensors, scene, sog, splat};
 use splat4d::layers::{Evaluation, Layer, Scene};
 use splat4d::math::Rng;
 use splat4d::motion::{Spacetime, SpacetimeSpec};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, LIFE, LifeKind, Params, SH, Time};
+use splat4d_cli::source::Source;
 use std::borrow::Cow;
+use std::cell::RefCell;
 use std::io::{Read, Write};
 use std::sync::Arc;
+use tempfile::TempDir;
 
 pub(crate) const READERS: &[Reader] = &[
     Reader { name: "playback", seeds: playback_seeds, read: playback_file },
@@ -32,10 +37,21 @@ pub(crate) const READERS: &[Reader] = &[
     Reader { name: "safetensors", seeds: scene_seeds, read: |b| drop(safetensors::SafeTensors::read(b)) },
     Reader { name: "npy", seeds: npy_seeds, read: |b| drop(npy::Npy::read(b)) },
     Reader { name: "npz", seeds: npz_seeds, read: |b| drop(npy::Npy::read_member(b, "data")) },
+    Reader { name: "ply_zip", seeds: ply_zips, read: |b| file("scene.zip", b) },
+    Reader { name: "sog_levels", seeds: || vec![LEVELS.into()], read: sog_levels },
+    Reader { name: "foreign", seeds: foreign_seeds, read: |b| drop(foreign::unread("a.splat4d", b)) },
 ];
+
+/// The index of a streamed SOG scene.
+const LEVELS: &str = r#"{"version": 1, "lodLevels": 2, "filenames": ["0_0/meta.json", "1_0/meta.json"], "environment": "env/meta.json",
+    "tree": {"children": [{"lods": {"0": {"file": 0, "offset": 0, "count": 2}, "1": {"file": 1, "offset": 0, "count": 1}}},
+    {"lods": {"0": {"file": 0, "offset": 2, "count": 1}}}]}}"#;
 
 /// A SOG scene of some Gaussians, made by splat-transform 3.7 of numbers of our own.
 const SOG: &[u8] = include_bytes!("../seeds/few.sog");
+
+/// Most pieces of a streamed scene that are put together: each is the whole seed.
+const PIECES: usize = 64;
 
 /// Opens a file of any kind and shows a moment of it.
 fn open(bytes: &[u8]) {
@@ -67,7 +83,7 @@ fn standing() -> Scene<f32> {
     still(numbers(5, 4, LifeKind::Infinite))
 }
 
-fn moving() -> Scene<f32> {
+pub(crate) fn moving() -> Scene<f32> {
     let mut params = numbers(5, 1, LifeKind::GaussHalf);
     let spec = SpacetimeSpec { order: 1, rotation: true, detach: false, origin: 0.5, features: None };
     let motion = Spacetime::new(spec, &mut params).expect("the order is known");
@@ -140,6 +156,49 @@ fn sog_meta(bytes: &[u8]) {
     drop(sog::read(&files));
 }
 
+/// Another index for pieces that are all the seed.
+fn sog_levels(bytes: &[u8]) {
+    let Ok(finest) = levels::finest(bytes) else { return };
+    let params = sog::unzip(SOG).and_then(|files| sog::read(&files)).expect("the seed is sound").0;
+    let pieces: Vec<_> = finest.pieces.into_iter().take(PIECES).map(|(_, rows)| (params.clone(), rows)).collect();
+    drop(levels::join(&pieces));
+}
+
+/// Archives of one scene, stored and deflated.
+fn ply_zips() -> Vec<Vec<u8>> {
+    let ply = &written(".ply")[0];
+    [false, true].map(|deflate| zip(&[("a/scene.ply", ply), ("readme.txt", b"x")], deflate)).into()
+}
+
+/// Beginnings of files that are named and not read.
+fn foreign_seeds() -> Vec<Vec<u8>> {
+    let json = r#"{"format": "a", "version": 1, "gaussians": 5, "filenames": []}"#;
+    let torch = zip(&[("archive/data.pkl", b"x"), ("archive/version", b"3")], false);
+    vec![
+        json.into(),
+        torch,
+        b"\x80\x02}q\0.".to_vec(),
+        b"S4D1\0\0\0\x01aaaaaaaaaaaaaaaa".to_vec(),
+        b"glTF\x02\0\0\0".to_vec(),
+    ]
+}
+
+thread_local! {
+    static FOLDER: RefCell<Option<TempDir>> = const { RefCell::new(None) };
+}
+
+/// Opens a file by its path, as the commands do.
+fn file(name: &str, bytes: &[u8]) {
+    FOLDER.with_borrow_mut(|folder| {
+        let folder = folder.get_or_insert_with(|| tempfile::tempdir().expect("there is a place for temporary files"));
+        let path = folder.path().join(name);
+        std::fs::write(&path, bytes).expect("the disk takes a file");
+        if let Ok(source) = Source::open(&path) {
+            show(&source.scene);
+        }
+    });
+}
+
 fn array(shape: &[usize]) -> Vec<u8> {
     let (mut out, count) = (Vec::new(), shape.iter().product::<usize>());
     let data: Vec<f32> = (0..count).map(|i| i as f32).collect();
@@ -154,33 +213,8 @@ fn npy_seeds() -> Vec<Vec<u8>> {
     vec![array(&[2, 3]), array(&[7]), array(&[]), columns]
 }
 
-/// A zip of one file.
-fn npz(name: &str, plain: &[u8], deflate: bool) -> Vec<u8> {
-    let mut packed = plain.to_vec();
-    if deflate {
-        let mut zip = flate2::write::DeflateEncoder::new(Vec::new(), Compression::fast());
-        zip.write_all(plain).expect("memory takes all bytes");
-        packed = zip.finish().expect("memory takes all bytes");
-    }
-    let mut shared = vec![20, 0, 0, 0, if deflate { 8 } else { 0 }, 0];
-    shared.extend([0; 8]);
-    shared.extend((packed.len() as u32).to_le_bytes());
-    shared.extend((plain.len() as u32).to_le_bytes());
-    shared.extend((name.len() as u16).to_le_bytes());
-    shared.extend([0, 0]);
-    let mut out = [b"PK\x03\x04", &shared[..], name.as_bytes(), &packed].concat();
-    let directory = [b"PK\x01\x02\x14\0", &shared[..], &[0; 14], name.as_bytes()].concat();
-    let at = out.len() as u32;
-    out.extend(&directory);
-    out.extend(b"PK\x05\x06\0\0\0\0\x01\0\x01\0");
-    out.extend((directory.len() as u32).to_le_bytes());
-    out.extend(at.to_le_bytes());
-    out.extend([0, 0]);
-    out
-}
-
 fn npz_seeds() -> Vec<Vec<u8>> {
-    [false, true].map(|deflate| npz("data.npy", &array(&[4, 7]), deflate)).into()
+    [false, true].map(|deflate| zip(&[("data.npy", &array(&[4, 7]))], deflate)).into()
 }
 
 fn playback_seeds() -> Vec<Vec<u8>> {
@@ -233,4 +267,20 @@ fn mend(bytes: &mut [u8]) {
     bytes[24..28].copy_from_slice(&sum);
     let sum = crc(&bytes[..HEADER_BYTES - 4]);
     bytes[HEADER_BYTES - 4..HEADER_BYTES].copy_from_slice(&sum);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn seeds_are_sound() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("scene.zip");
+        for zip in ply_zips() {
+            std::fs::write(&path, zip).unwrap();
+            assert_eq!(Source::open(&path).unwrap_or_else(|e| panic!("{e}")).scene.len(), 5);
+        }
+        assert_eq!(levels::finest(LEVELS.as_bytes()).unwrap().pieces.len(), 2);
+    }
 }

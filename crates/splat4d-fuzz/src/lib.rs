@@ -10,7 +10,9 @@ mod captures;
 mod formats;
 mod http;
 pub mod mutate;
+mod runs;
 mod texts;
+mod zip;
 
 /// A reader.
 pub struct Reader {
@@ -22,7 +24,7 @@ pub struct Reader {
 }
 
 /// All of them.
-pub const READERS: &[&[Reader]] = &[formats::READERS, captures::READERS, texts::READERS, http::READERS];
+pub const READERS: &[&[Reader]] = &[formats::READERS, captures::READERS, texts::READERS, runs::READERS, http::READERS];
 
 /// All of them, one by one.
 pub fn readers() -> impl Iterator<Item = &'static Reader> {

@@ -1,14 +1,18 @@
-//! Texts that people and programs give: recipes, edits, paths, points, actions, calibrations.
+//! What people and programs give besides scenes and captures: recipes, edits, paths, points, actions, calibrations, requests of a
+//! page, videos.
 
 use crate::Reader;
+use splat4d::Error;
 use splat4d::edit::{Edits, Expr};
-use splat4d_cli::texts;
+use splat4d_cli::texts::{self, Page};
 use splat4d_dynamics::actions::Actions;
 use splat4d_import::calibration;
+use splat4d_import::corrections::{self, Corrections};
+use splat4d_import::video::{self, Selection};
 use splat4d_train::recipe::Recipe;
 use std::cell::RefCell;
 use std::path::Path;
-use tempfile::NamedTempFile;
+use tempfile::{NamedTempFile, TempDir};
 
 pub(crate) const READERS: &[Reader] = &[
     Reader { name: "recipe", seeds: recipes, read: |b| drop(Recipe::from_toml(&text(b))) },
@@ -20,6 +24,10 @@ pub(crate) const READERS: &[Reader] = &[
     Reader { name: "points", seeds: points, read: |b| drop(texts::points(&text(b))) },
     Reader { name: "actions", seeds: actions, read: |b| drop(Actions::parse(&text(b))) },
     Reader { name: "calibration", seeds: calibrations, read: calibration },
+    Reader { name: "calibration_rig", seeds: rigs, read: calibration },
+    Reader { name: "corrections", seeds: || seeds(&[CORRECTIONS]), read: corrections },
+    Reader { name: "edit_request", seeds: requests, read: edit_request },
+    Reader { name: "video_avi", seeds: films, read: film },
 ];
 
 fn text(bytes: &[u8]) -> String {
@@ -101,4 +109,149 @@ fn calibration(bytes: &[u8]) {
         std::fs::write(path, bytes).expect("the disk takes a file");
         drop(calibration::read(path));
     });
+}
+
+/// Calibrations of rigs in the other dialects: EasyMocap, Qualisys, `transforms.json`, `capture.json`.
+fn rigs() -> Vec<Vec<u8>> {
+    let matrix = |name: &str, rows: usize, cols: usize, data: &str| {
+        format!("{name}: !!opencv-matrix\n  rows: {rows}\n  cols: {cols}\n  dt: d\n  data: [{data}]\n")
+    };
+    let easymocap = [
+        "%YAML:1.0\n---\nnames:\n  - \"1\"\n".to_owned(),
+        matrix("K_1", 3, 3, "8, 0, 4, 0, 8, 3, 0, 0, 1"),
+        matrix("dist_1", 1, 5, "0.1, 0, 0, 0, 0"),
+        matrix("Rot_1", 3, 3, "1, 0, 0, 0, 1, 0, 0, 0, 1"),
+        matrix("T_1", 3, 1, "0, 0, 4"),
+    ]
+    .concat();
+    seeds(&[
+        &easymocap,
+        "<?xml version=\"1.0\"?>\n<calibration created=\"x\"><cameras><camera serial=\"1\" active=\"1\" model=\"a\">\
+         <fov_video left=\"0\" top=\"0\" right=\"8\" bottom=\"6\"/><transform x=\"1\" y=\"2\" z=\"3\" r11=\"1\" r12=\"0\" r13=\"0\" \
+         r21=\"0\" r22=\"1\" r23=\"0\" r31=\"0\" r32=\"0\" r33=\"1\"/><intrinsic focallength=\"8\" focalLengthU=\"512\" focalLengthV=\"512\" \
+         centerPointU=\"256\" centerPointV=\"192\" skew=\"0\" radialDistortion1=\"0.1\" radialDistortion2=\"0\" \
+         radialDistortion3=\"0\" tangentalDistortion1=\"0\" tangentalDistortion2=\"0\"/></camera></cameras></calibration>\n",
+        r#"{"fl_x": 8, "fl_y": 8, "cx": 4, "cy": 3, "w": 8, "h": 6, "frames": [{"file_path": "a.png",
+        "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]}]}"#,
+        r#"{"version": 1, "cameras": [{"name": "a", "width": 8, "height": 6, "fx": 8, "fy": 8, "cx": 4, "cy": 3, "images": "a/%d.png",
+        "world_to_camera": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]}]}"#,
+    ])
+}
+
+/// `import.toml`, as it is written.
+const CORRECTIONS: &str = "version = 1\n[[camera]]\nname = \"a\"\nuse = true\noffset = 0.5\nkeep_offset = true\n[camera.lens]\nfx = 8\ncx = 4\ncy = 3\nk = [0.1]\n\n[[camera]]\nname = \"b\"\nuse = false\n";
+
+thread_local! {
+    static FOLDER: TempDir = tempfile::tempdir().expect("there is a place for temporary files");
+    static PAGE: RefCell<Option<Page>> = const { RefCell::new(None) };
+}
+
+fn in_folder(name: &str, bytes: &[u8], read: impl FnOnce(&Path)) {
+    FOLDER.with(|folder| {
+        std::fs::write(folder.path().join(name), bytes).expect("the disk takes a file");
+        read(folder.path());
+    });
+}
+
+fn corrections(bytes: &[u8]) {
+    in_folder(corrections::FILE, bytes, |folder| {
+        if let Ok(read) = Corrections::read(folder, &["a".into(), "b".into()]) {
+            read.cameras.iter().for_each(|c| assert!(c.given_offset().is_none_or(f64::is_finite)));
+        }
+    });
+}
+
+fn requests() -> Vec<Vec<u8>> {
+    let view = r#""view": {"position": [0, 0, -5], "quat": [1, 0, 0, 0], "fx": 16, "fy": 16, "cx": 8, "cy": 6, "near": 0.01,
+        "width": 16, "height": 12}"#;
+    let step = r#"{"do": "delete", "select": "sphere(0,0,0, 0.5)"}"#;
+    let with_view = |text: &str| text.replace("VIEW", view).replace("STEP", step);
+    [
+        r#"{"do": "open"}"#,
+        r#"{"do": "show", "steps": [STEP], VIEW, "t": 0.5}"#,
+        r#"{"do": "bake", "steps": [STEP]}"#,
+        r#"{"do": "save", "steps": [STEP]}"#,
+        r#"{"do": "select", "steps": [], "select": "box(-1,-1,-1, 1,1,1)", "t": 0}"#,
+        r#"{"do": "pick", "steps": [], "shape": "box", "corners": [[0, 0], [9, 9]], VIEW, "t": 0, "through": true, "now": true}"#,
+        r#"{"do": "bend", "steps": [], "select": "all", "at": 0, "t": 0.5, "nodes": 4}"#,
+        r#"{"do": "pull", "number": 0, "handles": [], "pins": [], VIEW}"#,
+    ]
+    .map(|text| with_view(text).into_bytes())
+    .into()
+}
+
+/// What a page of `view --edit` sends.
+fn edit_request(bytes: &[u8]) {
+    PAGE.with_borrow_mut(|page| {
+        let list = FOLDER.with(|folder| folder.path().join("edits.toml"));
+        let _ = std::fs::remove_file(&list);
+        let new = || Page::new(crate::formats::moving(), &list).expect("there is no list yet");
+        // Each request meets a page that has just been opened.
+        drop(page.insert(new()).ask(&text(bytes)));
+    });
+}
+
+/// An AVI of two frames of motion JPEG at 25 a second.
+fn films() -> Vec<Vec<u8>> {
+    let chunk = |name: &[u8; 4], body: &[u8]| {
+        let mut out = [&name[..], &(body.len() as u32).to_le_bytes(), body].concat();
+        out.resize(out.len().next_multiple_of(2), 0);
+        out
+    };
+    let mut header = vec![0; 56];
+    header[..8].copy_from_slice(b"vidsMJPG");
+    header[20..24].copy_from_slice(&1u32.to_le_bytes());
+    header[24..28].copy_from_slice(&25u32.to_le_bytes());
+    let stream = chunk(b"LIST", &[&b"strl"[..], &chunk(b"strh", &header)].concat());
+    let headers = chunk(b"LIST", &[&b"hdrl"[..], &stream].concat());
+    let frame = chunk(b"00dc", include_bytes!("../seeds/few.jpg"));
+    let frames = chunk(b"LIST", &[&b"movi"[..], &frame, &frame].concat());
+    vec![chunk(b"RIFF", &[&b"AVI "[..], &headers, &frames].concat())]
+}
+
+/// Reads a video as where there is no ffmpeg.
+fn film(bytes: &[u8]) {
+    in_folder("film.avi", bytes, |folder| {
+        let none = Err(Error::input("there is no ffmpeg"));
+        let Ok(source) = video::open_with(&folder.join("film.avi"), 1.0, none) else { return };
+        let Ok(mut reader) = source.frames(&Selection::default()) else { return };
+        let mut frame = video::Frame::default();
+        while reader.next(&mut frame).unwrap_or(false) {}
+    });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn seeds_are_sound() {
+        in_folder(corrections::FILE, CORRECTIONS.as_bytes(), |folder| {
+            let read = Corrections::read(folder, &["a".into(), "b".into()]).unwrap();
+            assert_eq!(read.given_offsets(), [Some(0.5), None]);
+        });
+        for (i, rig) in rigs().iter().enumerate() {
+            in_folder("rig", rig, |folder| {
+                let read = calibration::read(&folder.join("rig"));
+                assert!(read.is_ok(), "{i}: {:?}", read.err().map(|e| e.to_string()));
+            });
+        }
+        in_folder("film.avi", &films()[0], |folder| {
+            let none = Err(Error::input("there is no ffmpeg"));
+            let film = video::open_with(&folder.join("film.avi"), 1.0, none).unwrap();
+            assert_eq!(film.info().frames, Some(2));
+        });
+        in_folder("x", b"", |folder| {
+            let page = Page::new(crate::formats::moving(), &folder.join("list.toml")).unwrap();
+            for request in requests() {
+                // All are understood, though not every one has something to do.
+                let error = page.ask(&text(&request)).err().map(|e| e.to_string()).unwrap_or_default();
+                assert!(
+                    !error.contains("unknown request") && !error.contains("invalid JSON"),
+                    "{}: {error}",
+                    text(&request)
+                );
+            }
+        });
+    }
 }

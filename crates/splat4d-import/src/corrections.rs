@@ -12,17 +12,22 @@ pub const FILE: &str = "import.toml";
 /// The version of the file.
 const VERSION: u32 = 1;
 /// What stands above.
-const HEAD: &str = "\
-# What `import` found of every camera. Correct what is wrong and run the same command again: it goes on from here.
+const HEAD: &str = "# What `import` found of every camera. Correct what is wrong and run the same command again: it \
+                    goes on from here.
 #
-#   offset        seconds that are added to the camera's clock; an event that the camera notes at t is at t + offset
-#   keep_offset   true: take the offset as it stands here, and do not look for it again
-#   rate          how slow the camera's clock is, seconds a second
-#   lens          pixels of the stored pictures, OpenCV's distortion
-#   keep_lens     true: take the lens as it stands here
+#   offset        seconds that are added to the camera's clock; an event \
+                    that the camera notes at t is at t + offset
+#   keep_offset   true: take the offset as it stands \
+                    here, and do not look for it again
+#   rate          how slow the camera's clock is, seconds a \
+                    second
+#   lens          pixels of the stored images, OpenCV's distortion
+#   keep_lens     true: \
+                    take the lens as it stands here
 #   use           false: leave the camera out
 #
-# `sigma`, `by` and `checked` say how sure the offset is, and are not read.
+# `sigma`, `by` \
+                    and `checked` say how sure the offset is, and are not read.
 
 ";
 
@@ -232,11 +237,11 @@ impl Corrections {
     fn parse(text: &str) -> Result<Self> {
         let found: Self = toml::from_str(text).map_err(|e| {
             let what = e.to_string().trim().to_owned();
-            Error::input(what).remedy("Correct it, or remove the file: it is written anew.")
+            Error::input(what).remedy("Correct it, or remove the file: it is written again.")
         })?;
         if found.version != VERSION {
             let what = format!("its version is {}, not {VERSION}", found.version);
-            return Err(Error::new(ErrorKind::Unsupported, what).remedy("Remove the file: it is written anew."));
+            return Err(Error::new(ErrorKind::Unsupported, what).remedy("Remove the file: it is written again."));
         }
         for (i, camera) in found.cameras.iter().enumerate() {
             let place = |e: Error| e.at(format!("camera {:.80}", camera.name));

@@ -1,4 +1,4 @@
-"""A loss of your own, added to those of the recipe. With PyTorch: torch.from_numpy(picture), backward(), grad.numpy()."""
+"""A loss of your own, added to those of the recipe. With PyTorch: torch.from_numpy(image), backward(), grad.numpy()."""
 import sys
 
 import numpy as np
@@ -6,10 +6,10 @@ import numpy as np
 import splat4d
 
 
-def edges(picture, truth, view):
-    """Squared difference of horizontal steps, and its gradient to the picture."""
-    error = np.diff(picture, axis=1) - np.diff(truth, axis=1)
-    gradient = np.zeros_like(picture)
+def edges(image, truth, view):
+    """Squared difference of horizontal steps, and its gradient to the image."""
+    error = np.diff(image, axis=1) - np.diff(truth, axis=1)
+    gradient = np.zeros_like(image)
     gradient[:, 1:] += 2 * error / error.size
     gradient[:, :-1] -= 2 * error / error.size
     return float(np.mean(error**2)), gradient

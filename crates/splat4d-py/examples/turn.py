@@ -11,6 +11,6 @@ for i in range(8):
     angle = tau * i / 8
     eye = middle + [4 * cos(angle), 4 * sin(angle), 1.5]
     camera = splat4d.Camera.look_at(eye, middle, scene.up, width=320, height=240)
-    picture = scene.render(camera, first + (last - first) * i / 7)
+    image = scene.render(camera, first + (last - first) * i / 7)
     with open(f"turn{i}.ppm", "wb") as file:
-        file.write(b"P6 320 240 255\n" + (255 * picture.clip(0, 1) + 0.5).astype("u1").tobytes())
+        file.write(b"P6 320 240 255\n" + (255 * image.clip(0, 1) + 0.5).astype("u1").tobytes())

@@ -81,7 +81,7 @@ pub(crate) enum Kind {
 /// Anything that NumPy makes an array of, in its own type of numbers, if pictures may have that one.
 pub(crate) fn pixels<'py>(value: &Bound<'py, PyAny>, what: &str) -> PyResult<(Bound<'py, PyAny>, Kind)> {
     let array = value.py().import("numpy")?.call_method1("asarray", (value,)).map_err(|e| {
-        bad_input(format!("{what} is no array ({})", e.value(value.py())), "Give a picture [height, width, 3]")
+        bad_input(format!("{what} is no array ({})", e.value(value.py())), "Give an image [height, width, 3]")
     })?;
     let dtype = array.getattr("dtype")?;
     let kind: (String, usize) = (dtype.getattr("kind")?.extract()?, dtype.getattr("itemsize")?.extract()?);
@@ -97,13 +97,10 @@ pub(crate) fn planes(value: &Bound<'_, PyAny>, what: &str) -> PyResult<Planes<f3
     let (value, kind) = pixels(value, what)?;
     let array = numbers::<f32>(&value, what)?;
     let &[height, width, 3] = array.shape() else {
-        return Err(bad_input(
-            format!("{what} has the shape {:?}", array.shape()),
-            "Give a picture [height, width, 3]",
-        ));
+        return Err(bad_input(format!("{what} has the shape {:?}", array.shape()), "Give an image [height, width, 3]"));
     };
     if height * width == 0 {
-        return Err(bad_input(format!("{what} has {width}x{height} pixels"), "Give a picture with pixels"));
+        return Err(bad_input(format!("{what} has {width}x{height} pixels"), "Give an image with pixels"));
     }
     let mut out = Planes::new(3, height, width);
     let view = array.as_array();
@@ -131,7 +128,7 @@ pub(crate) fn pair(render: &Bound<'_, PyAny>, truth: &Bound<'_, PyAny>) -> PyRes
     let (a, b) = (planes(render, "render")?, planes(truth, "truth")?);
     if (a.height, a.width) != (b.height, b.width) {
         let what = format!("render has {}x{} pixels, truth {}x{}", a.width, a.height, b.width, b.height);
-        return Err(bad_input(what, "Give pictures of one size"));
+        return Err(bad_input(what, "Give images of one size"));
     }
     Ok((a, b))
 }

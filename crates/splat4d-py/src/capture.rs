@@ -203,7 +203,7 @@ impl Capture {
 
     fn __repr__(&self) -> String {
         let c = &self.capture;
-        format!("Capture({:?}, {} cameras, {} pictures)", c.name, c.cameras.len(), c.frames.len())
+        format!("Capture({:?}, {} cameras, {} images)", c.name, c.cameras.len(), c.frames.len())
     }
 }
 

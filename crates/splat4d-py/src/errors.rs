@@ -64,3 +64,18 @@ pub(crate) fn warn(py: Python<'_>, messages: &[String]) -> PyResult<()> {
         PyErr::warn(py, &category, &text, 1)
     })
 }
+
+/// Words of the command in remedies, and what says the same in Python.
+const WORDS: [(&str, &str); 5] = [
+    ("`train --resume`", "splat4d.resume"),
+    ("--resume", "splat4d.resume"),
+    ("--force", "force=True"),
+    ("with -o", "as `out`"),
+    ("--motion ", "motion="),
+];
+
+/// The error of training as an exception that speaks of Python's arguments.
+pub(crate) fn in_python(error: &splat4d::Error) -> PyErr {
+    let text = WORDS.iter().fold(error.to_string(), |text, (word, other)| text.replace(word, other));
+    exception(&text, Some(error.kind()))
+}

@@ -266,6 +266,6 @@ fn store(samples: &Samples, camera: &scene::Camera, path: &Path) -> Result<()> {
     let mut bytes = Vec::new();
     PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive)
         .write_image(&samples.data, camera.width as u32, camera.height as u32, samples.kind)
-        .map_err(|e| Error::input(format!("a picture cannot be stored ({e})")).at(path.display()))?;
+        .map_err(|e| Error::input(format!("an image cannot be stored ({e})")).at(path.display()))?;
     write_atomically(path, &bytes)
 }

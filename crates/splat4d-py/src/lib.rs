@@ -9,9 +9,10 @@
 //! | module | content |
 //! |---|---|
 //! | `errors.rs`, `arrays.rs`, `plain.rs`, `settings.rs` | errors, NumPy in and out, plain values, settings by name |
-//! | `camera.rs`, `gaussians.rs`, `scene.rs` | cameras, Gaussians at a time, scenes |
+//! | `camera.rs`, `scene_arrays.rs`, `gaussians.rs` | cameras, arrays into scenes, Gaussians at a time |
 //! | `from_arrays.rs` | images in memory become a capture on disk |
-//! | `metrics.rs`, `loss.rs` | metrics; losses written in Python |
+//! | `metrics.rs`, `loss.rs`, `motion.rs` | metrics; losses and motion models written in Python |
+//! | `rendering.rs`, `scene.rs` | renders with gradients, scenes |
 //! | `run.rs`, `capture.rs`, `train.rs` | runs, captures, training |
 
 mod arrays;
@@ -22,9 +23,12 @@ mod from_arrays;
 mod gaussians;
 mod loss;
 mod metrics;
+mod motion;
 mod plain;
+mod rendering;
 mod run;
 mod scene;
+mod scene_arrays;
 mod settings;
 mod train;
 
@@ -45,6 +49,8 @@ mod _native {
     use crate::loss::{View, photometric};
     #[pymodule_export]
     use crate::metrics::metrics;
+    #[pymodule_export]
+    use crate::rendering::Rendering;
     #[pymodule_export]
     use crate::run::Run;
     #[pymodule_export]
@@ -68,11 +74,13 @@ mod _native {
         py.detach(|| splat4d_cli::main_from(words))
     }
 
-    /// Runs one command with its options, quietly: `command("bake", "runs/knight", "-o", "knight.s4d")`.
+    /// Runs one command with its options, quietly: `command("bake", "runs/knight", "-o", "knight.s4d")`. Returns the objects that
+    /// the command prints with `--json` (docs/events.md), a list of dicts.
     #[pyfunction]
     #[pyo3(signature = (*words))]
-    fn command(py: Python<'_>, words: Vec<PathBuf>) -> PyResult<()> {
+    fn command(py: Python<'_>, words: Vec<PathBuf>) -> PyResult<Py<PyAny>> {
         let words: Vec<OsString> = words.into_iter().map(PathBuf::into_os_string).collect();
-        py.detach(|| splat4d_cli::call(&words)).or_raise()
+        let objects = py.detach(|| splat4d_cli::call(&words)).or_raise()?;
+        plain::plain(py, &serde_json::Value::Array(objects))
     }
 }

@@ -92,7 +92,7 @@ impl Asked {
         let gradient = numbers::<f32>(&gradient, "the loss's gradient")?;
         if gradient.shape() != [shown.height, shown.width, shown.channels] {
             let what = format!("the loss's gradient has the shape {:?}", gradient.shape());
-            let wanted = format!("Return that of the picture, [{}, {}, {}]", shown.height, shown.width, shown.channels);
+            let wanted = format!("Return that of the image, [{}, {}, {}]", shown.height, shown.width, shown.channels);
             return Err(bad_input(what, &wanted));
         }
         let all = gradient.as_array();

@@ -4,7 +4,11 @@ use crate::arrays::{finite, numbers, picture, plane, shaped};
 use crate::camera::Camera;
 use crate::errors::{OrRaise, bad_input};
 use crate::gaussians::Gaussians;
+use crate::motion::{Hook, raise};
+use crate::rendering::{self, Rendering};
+use crate::scene_arrays::{self, About, Moving, Shapes};
 use pyo3::prelude::*;
+use pyo3::types::PyDict;
 use splat4d::device;
 use splat4d::flow::tracks;
 use splat4d::layers::{Evaluation, Head};
@@ -13,9 +17,9 @@ use splat4d::scene::{Planes, Time};
 use splat4d_cli::draw::{Channel, Painter, antialias};
 use splat4d_cli::paths::View;
 use splat4d_cli::sequence::moments;
-use splat4d_cli::source::Source;
+use splat4d_cli::source::{Source, read_scene};
 use std::ffi::OsString;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 /// Alpha below which a pixel has no depth (the faintest splat that is drawn).
@@ -24,14 +28,21 @@ const DEPTH_ALPHA: f32 = 1.0 / 255.0;
 /// A scene in space and time.
 #[pyclass(frozen, module = "splat4d")]
 pub(crate) struct Scene {
-    path: PathBuf,
+    /// Where it was opened; none: it was made here.
+    path: Option<PathBuf>,
     source: Arc<Source>,
     views: Vec<View>,
 }
 
-/// Opens a run folder, a playback file, a scene file, or a file or folder of another program's Gaussians.
+/// Name of the file that a scene without one is written to, in a folder of its own, for the commands that read files.
+const SCENE: &str = "scene.safetensors";
+
+/// Opens a run folder, a playback file, a scene file, or a file or folder of another program's Gaussians. A scene that was
+/// trained with a `Motion` of your own needs it again.
 #[pyfunction]
-pub(crate) fn open(py: Python<'_>, path: PathBuf) -> PyResult<Scene> {
+#[pyo3(signature = (path, *, motion=None))]
+pub(crate) fn open(py: Python<'_>, path: PathBuf, motion: Option<&Bound<'_, PyAny>>) -> PyResult<Scene> {
+    motion.map(Hook::register).transpose()?;
     Scene::open(py, path)
 }
 
@@ -41,7 +52,54 @@ impl Scene {
         let views = source.views().or_raise()?;
         let warnings: Vec<String> = source.warnings.lines().iter().map(ToString::to_string).collect();
         crate::errors::warn(py, &warnings)?;
-        Ok(Self { path, source: Arc::new(source), views })
+        Ok(Self { path: Some(path), source: Arc::new(source), views })
+    }
+
+    /// A scene that is in no file.
+    fn made(scene: splat4d::layers::Scene<f32>, views: Vec<View>) -> Self {
+        Self { path: None, source: Arc::new(Source::own(scene)), views }
+    }
+
+    /// Runs `work` on the file of the scene: its own or, where it has none, one in a folder that is deleted afterwards.
+    fn with_file<T>(&self, py: Python<'_>, work: impl FnOnce(&Path, &Path) -> anyhow::Result<T> + Send) -> PyResult<T>
+    where
+        T: Send,
+    {
+        py.detach(|| {
+            let folder =
+                tempfile::tempdir().map_err(|e| splat4d::Error::environment("no temporary folder could be made", e))?;
+            let own = folder.path().join(SCENE);
+            if self.path.is_none() {
+                let mut bytes = Vec::new();
+                splat4d::format::scene::write(&self.source.scene, &mut bytes)?;
+                std::fs::write(&own, bytes)
+                    .map_err(|e| splat4d::Error::environment("the scene could not be written", e))?;
+            }
+            work(self.path.as_deref().unwrap_or(&own), folder.path())
+        })
+        .or_raise()
+    }
+}
+
+/// The scene's parameters. Errors: it is a playback file's.
+fn learnable(scene: &Scene) -> PyResult<&splat4d::layers::Scene<f32>> {
+    rendering::check(&scene.source.scene)?;
+    Ok(&scene.source.scene)
+}
+
+/// How far outside of the clip a time may be without a warning, frames: the first and the last frame last so long.
+const OUTSIDE: f64 = 1.0;
+
+impl Scene {
+    /// The time, with a warning where nothing was seen then. Errors: not a number.
+    fn time(&self, py: Python<'_>, t: f64) -> PyResult<Time> {
+        let scene = &self.source.scene;
+        let ([from, to], frame) = (scene.clip, OUTSIDE / scene.fps.max(f64::MIN_POSITIVE));
+        if scene.is_moving() && t.is_finite() && !(from - frame..=to + frame).contains(&t) {
+            let message = format!("{t} s is outside of the scene's clip, {from} to {to} s: nothing was seen then");
+            crate::errors::warn(py, &[message])?;
+        }
+        time(t)
     }
 }
 
@@ -52,6 +110,76 @@ fn time(t: f64) -> PyResult<Time> {
 
 #[pymethods]
 impl Scene {
+    /// A scene of Gaussians of your own, given as `Gaussians(...)` takes them.
+    ///
+    /// Static: [N, ...] each. With a pose for each of several times: `means` [T, N, 3], `quats` [T, N, 4] or both, at `times`
+    /// [T] seconds [k/fps]; between them positions and rotations are interpolated. With kinematics: `velocities` [N, 3], or
+    /// [N, P, 3] for the first P powers of time (P at most 3, scene units / s^p), and `rotation_rates` [N, 4] (1/s, added to
+    /// `quats`), both around `centers` [N] seconds, or around second 0 where there are none; with `durations` [N] seconds the
+    /// opacity is multiplied by exp(−½((t − center)/duration)²). `clip`: first and last second; `up` [0, 1, 0]; `background`
+    /// [black].
+    #[staticmethod]
+    #[pyo3(signature = (
+        means, quats, scales, opacities, *, sh=None, colors=None, times=None, velocities=None, rotation_rates=None,
+        centers=None, durations=None, fps=30.0, clip=None, up=None, background=None
+    ))]
+    #[allow(clippy::too_many_arguments)]
+    fn from_arrays(
+        means: &Bound<'_, PyAny>,
+        quats: &Bound<'_, PyAny>,
+        scales: &Bound<'_, PyAny>,
+        opacities: &Bound<'_, PyAny>,
+        sh: Option<&Bound<'_, PyAny>>,
+        colors: Option<&Bound<'_, PyAny>>,
+        times: Option<&Bound<'_, PyAny>>,
+        velocities: Option<&Bound<'_, PyAny>>,
+        rotation_rates: Option<&Bound<'_, PyAny>>,
+        centers: Option<&Bound<'_, PyAny>>,
+        durations: Option<&Bound<'_, PyAny>>,
+        fps: f64,
+        clip: Option<[f64; 2]>,
+        up: Option<&Bound<'_, PyAny>>,
+        background: Option<&Bound<'_, PyAny>>,
+    ) -> PyResult<Self> {
+        let about = About { clip, fps, up, background };
+        let fps = about.checked_fps()?;
+        let shapes = Shapes::new(means, quats, scales, opacities, sh, colors, true)?;
+        let moving = Moving { times, velocities, rotation_rates, centers, durations, fps };
+        let (layer, seen) = scene_arrays::layer(&shapes, &moving)?;
+        Ok(Self::made(about.scene(vec![layer], seen)?, Vec::new()))
+    }
+
+    /// A scene of frames that have nothing to do with each other, each a `Gaussians`: frame k is seen around k/fps seconds.
+    #[staticmethod]
+    #[pyo3(signature = (frames, *, fps=30.0, up=None, background=None))]
+    fn from_frames(
+        py: Python<'_>,
+        frames: Vec<PyRef<'_, Gaussians>>,
+        fps: f64,
+        up: Option<&Bound<'_, PyAny>>,
+        background: Option<&Bound<'_, PyAny>>,
+    ) -> PyResult<Self> {
+        let about = About { clip: None, fps, up, background };
+        let fps = about.checked_fps()?;
+        let params = frames.iter().map(|g| Ok(g.shapes(py)?.params(splat4d::scene::LifeKind::Infinite)));
+        let params = params.collect::<PyResult<Vec<_>>>()?;
+        let joined = splat4d::format::sequence::join(&params, fps, [0.0, 1.0, 0.0]).or_raise()?;
+        Ok(Self::made(about.scene(joined.layers, joined.clip)?, Vec::new()))
+    }
+
+    /// All learnable arrays of the scene by their names in `scene.safetensors`: `layers.0.means` [N, 3],
+    /// `layers.0.log_scales` [N, 3], `layers.0.opacity_logits` [N], `layers.0.sh` [N, K, 3], … and those of its motion model.
+    /// Copies. Not of a playback file, which has none.
+    fn parameters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        rendering::parameters(py, learnable(self)?)
+    }
+
+    /// The scene with these of its arrays replaced, in no file yet. Names and shapes are those of `parameters()`.
+    fn with_parameters(&self, parameters: &Bound<'_, PyDict>) -> PyResult<Self> {
+        let scene = rendering::with_parameters(learnable(self)?, parameters)?;
+        Ok(Self::made(scene, self.views.clone()))
+    }
+
     /// First and last second.
     #[getter]
     fn clip(&self) -> (f64, f64) {
@@ -98,9 +226,11 @@ impl Scene {
 
     /// The Gaussians alive at second t as NumPy arrays.
     fn at(&self, py: Python<'_>, t: f64) -> PyResult<Gaussians> {
-        time(t)?;
+        self.time(py, t)?;
         self.source.scene.without_head("an array of Gaussians").or_raise()?;
-        Gaussians::at(py, &self.source, t)
+        let now = Gaussians::at(py, &self.source, t)?;
+        raise(&self.source.scene)?;
+        Ok(now)
     }
 
     /// Renders at second t: `color` [h, w, 3] over the background, `alpha` [h, w], or expected `depth` [h, w] along the
@@ -109,7 +239,11 @@ impl Scene {
     /// `label` [h, w] (-1: none), `feature` [h, w, C], `life` [h, w] in seconds, `uncertainty` [h, w] in scene units
     /// (of a run). float32, NaN where empty. `device`: `cpu`, `gpu` or `auto`, for colour, alpha and depth; the CPU
     /// renders the others.
-    #[pyo3(signature = (camera, t, *, channel="color", background=None, device="cpu"))]
+    ///
+    /// With `requires_grad`, renders colour, alpha and depth on the CPU and returns a `Rendering`, whose `backward(d_color)`
+    /// takes the gradient of any function of the picture to the scene's `parameters()`, the camera and the time.
+    #[pyo3(signature = (camera, t, *, channel="color", background=None, device="cpu", requires_grad=false))]
+    #[allow(clippy::too_many_arguments)]
     fn render<'py>(
         &self,
         py: Python<'py>,
@@ -118,8 +252,9 @@ impl Scene {
         channel: &str,
         background: Option<&Bound<'py, PyAny>>,
         device: &str,
+        requires_grad: bool,
     ) -> PyResult<Bound<'py, PyAny>> {
-        let t = time(t)?;
+        let t = self.time(py, t)?;
         let Some(kind) = Channel::named(channel) else {
             return Err(bad_input(
                 format!("there is no channel `{channel}`"),
@@ -131,7 +266,19 @@ impl Scene {
         let scene = &self.source.scene;
         let background = background.map_or(scene.background, |b| b.map(|x| x as f32));
         let depth = channel == "depth";
-        let smooth = self.source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.appearance.antialias);
+        let smooth = self.smooth();
+        if requires_grad {
+            if channel != "color" {
+                let remedy = "Leave `channel` out: the Rendering has color, alpha and depth";
+                return Err(bad_input(format!("the channel {channel} has no gradients"), remedy));
+            }
+            learnable(self)?;
+            let config = RenderConfig { antialias: antialias(smooth), ..RenderConfig::default() };
+            let (scene, camera) = (Arc::new(scene.clone()), camera.0.clone());
+            let rendering = Rendering::new(py, scene, camera, t, background, config)?;
+            raise(&self.source.scene)?;
+            return Ok(Bound::new(py, rendering)?.into_any());
+        }
         if kind.is_field() {
             let drawn = py.detach(|| {
                 let painter = Painter::new(scene, background, smooth, false);
@@ -139,6 +286,7 @@ impl Scene {
                 painter.draw(&camera.0, t.0);
                 Ok::<Planes<f32>, splat4d::Error>(painter.raw())
             });
+            raise(scene)?;
             let drawn = drawn.or_raise()?;
             return if drawn.channels > 1 { picture(py, drawn) } else { Ok(plane(py, drawn)?.into_bound(py)) };
         }
@@ -155,6 +303,7 @@ impl Scene {
             trouble.extend(failed.map(|e| format!("drawn on the CPU: {}", e.cause())));
             (image, trouble)
         });
+        raise(scene)?;
         if device == device::Device::Gpu {
             crate::errors::warn(py, &trouble)?;
         }
@@ -192,26 +341,52 @@ impl Scene {
     /// Writes one seekable file that plays anywhere (.s4d); `tolerance`: largest error of a Gaussian, pixels.
     #[pyo3(signature = (path, *, tolerance=None))]
     fn bake(&self, py: Python<'_>, path: PathBuf, tolerance: Option<f64>) -> PyResult<()> {
-        let mut words = vec!["bake".into(), self.path.clone().into_os_string(), "-o".into(), path.into_os_string()];
-        words.extend(tolerance.map(|px| OsString::from(format!("--tolerance={px}"))));
-        py.detach(|| splat4d_cli::call(&words)).or_raise()
+        self.with_file(py, |file, _| {
+            let mut words: Vec<OsString> = vec!["bake".into(), file.into(), "-o".into(), path.into_os_string()];
+            words.extend(tolerance.map(|px| OsString::from(format!("--tolerance={px}"))));
+            splat4d_cli::call(&words).map(drop)
+        })
     }
 
     /// Writes a file in the format of its extension: .html (player and scene as one page), .ply (at time t, in the
-    /// scene's axes), or a format of `splat4d convert`.
+    /// scene's axes), or a format of `splat4d convert`, .safetensors (everything, to go on with) and .s4d among them.
     #[pyo3(signature = (path, t=None))]
     fn export(&self, py: Python<'_>, path: PathBuf, t: Option<f64>) -> PyResult<()> {
         t.map(time).transpose()?;
-        let from = self.path.clone().into_os_string();
-        let ending = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
-        let out = path.into_os_string();
-        let mut words = match ending.as_deref() {
-            Some("html") => vec!["export".into(), from, "--html".into(), "-o".into(), out],
-            Some("ply") => vec!["export".into(), from, "-o".into(), out],
-            _ => vec!["convert".into(), from, out],
-        };
-        words.extend(t.map(|t| OsString::from(format!("--time={t}"))));
-        py.detach(|| splat4d_cli::call(&words)).or_raise()
+        self.with_file(py, |file, _| {
+            let ending = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
+            let (from, out) = (file.into(), path.into_os_string());
+            let mut words: Vec<OsString> = match ending.as_deref() {
+                Some("html") => vec!["export".into(), from, "--html".into(), "-o".into(), out],
+                Some("ply") => vec!["export".into(), from, "-o".into(), out],
+                _ => vec!["convert".into(), from, out],
+            };
+            words.extend(t.map(|t| OsString::from(format!("--time={t}"))));
+            splat4d_cli::call(&words).map(drop)
+        })
+    }
+
+    /// The scene with a list of edits replayed (docs/edit.md), in no file yet. `edits`: the text of a list, or the path of
+    /// one.
+    fn edit(&self, py: Python<'_>, edits: &Bound<'_, PyAny>) -> PyResult<Self> {
+        let text: Option<String> =
+            edits.extract().ok().filter(|text: &String| text.contains('\n') || text.contains('='));
+        let path: PathBuf = if text.is_some() { PathBuf::new() } else { edits.extract()? };
+        let scene = self.with_file(py, |file, folder| {
+            let list = match text {
+                Some(text) => {
+                    let list = folder.join("edits.toml");
+                    std::fs::write(&list, text)
+                        .map_err(|e| splat4d::Error::environment("the list could not be written", e))?;
+                    list
+                }
+                None => path,
+            };
+            let out = folder.join("edited.safetensors");
+            splat4d_cli::call(&["edit".into(), file.into(), list.into_os_string(), "-o".into(), out.clone().into()])?;
+            Ok(read_scene(&out)?)
+        })?;
+        Ok(Self::made(scene, self.views.clone()))
     }
 
     /// Number of Gaussians, alive or not.
@@ -221,7 +396,15 @@ impl Scene {
 
     fn __repr__(&self) -> String {
         let [from, to] = self.source.scene.clip;
-        format!("Scene({:?}, {} Gaussians, {from} to {to} s)", self.path, self.source.scene.len())
+        let place = self.path.as_ref().map_or("in memory".into(), |path| format!("{path:?}"));
+        format!("Scene({place}, {} Gaussians, {from} to {to} s)", self.source.scene.len())
+    }
+}
+
+impl Scene {
+    /// Whether its run draws thin splats dimmed.
+    fn smooth(&self) -> bool {
+        self.source.run.as_ref().and_then(|r| r.recipe().ok()).is_some_and(|r| r.appearance.antialias)
     }
 }
 

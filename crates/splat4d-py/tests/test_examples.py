@@ -14,16 +14,17 @@ import splat4d
 from common import KNIGHT, PLAYABLE, ROOT, InFolder
 
 FOLDER = ROOT / "crates/splat4d-py/examples"
-# Lines of an example, at most; the one for Rerun says all of its archetypes.
+# Lines of an example, at most, but for those that say all archetypes of Rerun, or hold a network.
 LINES = 20
+LONG = ["to_rerun.py", "torch_motion.py"]
 # Bytes of a notebook with its outputs, at most: GitHub shows small ones at once.
 NOTEBOOK_BYTES = 300_000
 
 
 class Examples(InFolder):
-    def run_example(self, name, given, *written):
+    def run_example(self, name, given, *written, further=()):
         done = subprocess.run(
-            [sys.executable, FOLDER / name, given], cwd=self.folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+            [sys.executable, FOLDER / name, given, *further], cwd=self.folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         )
         self.assertEqual(done.returncode, 0, done.stdout)
         for file in written:
@@ -34,7 +35,7 @@ class Examples(InFolder):
         here = pathlib.Path(__file__).read_text()
         for example in FOLDER.glob("*.py"):
             self.assertIn(f'"{example.name}"', here)
-            self.assertTrue(len(example.read_text().splitlines()) <= LINES or example.name == "to_rerun.py", example.name)
+            self.assertTrue(len(example.read_text().splitlines()) <= LINES or example.name in LONG, example.name)
 
     def test_gaussians(self):
         self.assertIn("alive", self.run_example("gaussians.py", PLAYABLE, "moment.npz"))
@@ -54,6 +55,11 @@ class Examples(InFolder):
     @unittest.skipUnless(importlib.util.find_spec("torch"), "PyTorch is not installed")
     def test_torch_loss(self):
         self.assertIn("50 steps", self.run_example("torch_loss.py", KNIGHT))
+
+    @unittest.skipUnless(importlib.util.find_spec("torch"), "PyTorch is not installed")
+    def test_torch_motion(self):
+        told = self.run_example("torch_motion.py", KNIGHT, "out/run/scene.s4d", further=["out", "20"])
+        self.assertIn("plays without Python", told)
 
     @unittest.skipUnless(importlib.util.find_spec("rerun"), "Rerun is not installed")
     def test_to_rerun(self):

@@ -45,18 +45,18 @@ async function inflate(stored, bytes) {
     if (done) break;
     if (at + value.length > bytes) {
       reader.cancel().catch(() => {});
-      throw new Error(`it inflates to more than the ${bytes} bytes that the index states`);
+      throw new Error(`it decompresses to more than the ${bytes} bytes stated in the index`);
     }
     out.set(value, at);
     at += value.length;
   }
-  if (at !== bytes) throw new Error(`it inflates to ${at} bytes, not the ${bytes} that the index states`);
+  if (at !== bytes) throw new Error(`it decompresses to ${at} bytes, expected ${bytes} as in the index`);
   return out;
 }
 
 function finite(numbers, what) {
   for (let i = 0; i < numbers.length; i++) {
-    if (!Number.isFinite(numbers[i])) throw new Error(`${what} ${i} is no finite number`);
+    if (!Number.isFinite(numbers[i])) throw new Error(`${what} ${i} is not finite`);
   }
 }
 
@@ -82,7 +82,7 @@ function page(data, { count, labels }) {
   const words = transpose(data, start, count);
   for (let i = 0; labels && i < count; i++) {
     const label = words[WORDS * i + 7] & 0xffff;
-    if (label >= labels) throw new Error(`Gaussian ${i} names entry ${label} of a palette of ${labels}`);
+    if (label >= labels) throw new Error(`Gaussian ${i} refers to entry ${label} of a palette of ${labels}`);
   }
   return { count, headers, words };
 }
@@ -101,11 +101,11 @@ function mask(data, { count, from, to }) {
     stride = Math.ceil(count / 32),
     number = data.length >= 8 ? view.getUint32(0, true) : 0;
   const right = 8 + number * (8 + packed);
-  if (number < 1 || data.length !== right) throw new Error(`it is no mask of ${number} key times`);
+  if (number < 1 || data.length !== right) throw new Error(`not a mask of ${number} key times`);
   const keys = Float64Array.from({ length: number }, (_, k) => view.getFloat64(8 + 8 * k, true));
   finite(keys, 'key time');
-  if (keys.some((t, k) => k && !(keys[k - 1] < t))) throw new Error('its key times do not rise');
-  if (keys[0] !== from || keys[number - 1] !== to) throw new Error('its key times are not those of the index');
+  if (keys.some((t, k) => k && !(keys[k - 1] < t))) throw new Error('its key times are not increasing');
+  if (keys[0] !== from || keys[number - 1] !== to) throw new Error('its key times differ from the index');
   const bytes = new Uint8Array(4 * stride * number);
   for (let k = 0, at = 8 + 8 * number; k < number; k++) {
     const row = 4 * stride * k;

@@ -20,12 +20,18 @@ export function tool(name, label, onclick, props = {}) {
   return h('button', { ...own, ...props }, icon(name));
 }
 
-/** Changes an icon button's picture and name. */
+/** Changes an icon button's symbol and name. */
 export function retool(button, name, label) {
   if (button.title === label) return;
   button.title = label;
   button.setAttribute('aria-label', label);
   button.replaceChildren(icon(name));
+}
+
+/** Disables a button with the reason as its tooltip; no reason enables it and gives it the tooltip of its use. */
+export function allow(node, reason, use = '') {
+  node.disabled = !!reason;
+  node.title = reason || use;
 }
 
 export const button = (label, onclick, props = {}, name = null) =>

@@ -4,7 +4,7 @@
 import { History, boxOf, combined, easedKey, factorAt, fadedTo, keyed, keysOf, movedTo, nameOf, placeAt, pulledAt, pulledTo, quatOf,
   ready, round, shiftedKey, turnOf, withBox, withKey, withoutKey } from './edit-steps.js';
 import { Overlay } from './edit-tools.js';
-import { button, choice, clock, field, h, segments, tool } from './dom.js';
+import { allow, button, choice, clock, field, h, segments, tool } from './dom.js';
 import { clamp } from './camera.js';
 
 /** Longer side of pictures that the program draws, pixels: at rest, and while something is pulled. */
@@ -18,18 +18,18 @@ const GRIP = 0.12;
 
 const TOOLS = [['', 'Look'], ['box', 'Box'], ['sphere', 'Sphere'], ['lasso', 'Lasso'], ['color', 'Colour']];
 const HOW = [['new', 'New'], ['add', 'Add'], ['remove', 'Remove'], ['within', 'Within']];
-const PLAIN = [['size(0.1, 99)', 'Size', 'By size: size(least, most), scene units'],
-  ['speed(0.1, 99)', 'Speed', 'By speed: speed(least, most), scene units a second'],
-  ['life(0, 0.1)', 'Lifespan', 'By lifespan: life(least, most), seconds']];
+const PLAIN = [['size(0.1, 99)', 'Size', 'Select by size: size(min, max), in scene units'],
+  ['speed(0.1, 99)', 'Speed', 'Select by speed: speed(min, max), in scene units per second'],
+  ['life(0, 0.1)', 'Lifespan', 'Select by lifespan: life(min, max), in seconds']];
 const WORDS = [['all', 'Everything'], ['opacity(0, 0.1)', 'Opacity …'], ['color(1,0,0, 0.2)', 'Colour …'], ['sphere(0,0,0, 1)', 'Sphere …'], ['box(-1,-1,-1, 1,1,1)', 'Box …']];
 
-const ACTS = { Delete: 'Take the selection out', 'Keep only': 'Take everything else out', Hide: 'Take it out from now on',
-  Colour: 'Exposure, saturation, tint', Opacity: 'Fade it, also over time', Move: 'Shift, turn and scale it, also over time',
-  Bend: 'Pull it into another pose' };
-const TOOL_TITLES = { '': 'Turn and move the camera', box: 'Drag a box over the picture', sphere: 'Drag from a middle outwards',
-  lasso: 'Draw around something', color: 'Tap a colour' };
-const HOW_TITLES = { new: 'In place of the selection', add: 'As well as the selection', remove: 'Out of the selection',
-  within: 'Only what both have' };
+const ACTS = { Delete: 'Delete the selection', 'Keep only': 'Delete everything else', Hide: 'Hide the selection for a time range',
+  Colour: 'Change exposure, saturation and tint', Opacity: 'Change the opacity, also over time', Move: 'Shift, rotate and scale, also over time',
+  Bend: 'Deform: drag nodes to another pose' };
+const TOOL_TITLES = { '': 'Turn and move the camera', box: 'Drag a box over the image', sphere: 'Drag outwards from the centre',
+  lasso: 'Draw a line around the object', color: 'Click a colour in the image' };
+const HOW_TITLES = { new: 'Replace the selection', add: 'Add to the selection', remove: 'Remove from the selection',
+  within: 'Keep only what both selections contain' };
 
 const STYLE = `
 .edit-overlay{position:absolute;inset:0;width:100%;height:100%;pointer-events:none}
@@ -182,8 +182,8 @@ export class Editing {
       if (v) this.#pick(v);
       this.more.value = '';
     });
-    this.area = h('textarea', { 'aria-label': 'Selection in words', rows: 2, spellcheck: 'false',
-      placeholder: 'Draw over the picture, or write: box(…) and not layer(sky)',
+    this.area = h('textarea', { 'aria-label': 'Selection as text', rows: 2, spellcheck: 'false',
+      placeholder: 'Draw over the image, or type: box(…) and not layer(sky)',
       onchange: () => { this.text = this.area.value; this.#changedSelection(); } });
     this.boxed = h('div', { class: 'row', role: 'group', 'aria-label': 'Box', hidden: true }, ...'xyz'.split('').map((axis, k) => h('span', {},
       `${axis} `, ...['low', 'high'].map((end, i) => number(`Box ${axis} ${['from', 'to'][i]}`, 0, v => {
@@ -192,15 +192,15 @@ export class Editing {
       })))));
     this.said = h('p', { class: 'note said', role: 'status', 'aria-live': 'polite' });
     const act = (label, make, props) => button(label, () => make(), props);
-    this.acts = h('div', { class: 'acts', role: 'group', 'aria-label': 'With the selection' },
+    this.acts = h('div', { class: 'acts', role: 'group', 'aria-label': 'Actions on the selection' },
       act('Delete', () => this.add({ do: 'delete' })), act('Keep only', () => this.add({ do: 'crop' })),
       act('Hide', () => this.add({ do: 'hide', from: round(this.time), to: round(this.player.last + this.player.frameTime) })),
       act('Colour', () => this.add({ do: 'recolor', exposure: 0.5 })),
       act('Opacity', () => this.add({ do: 'opacity', factor: 0.5 })),
       act('Move', () => this.add({ do: 'move', to: { shift: [0, 0, 0], about: (this.#told?.center ?? [0, 0, 0]).map(round) } }, true)),
       act('Bend', () => this.add({ do: 'drag', at: round(this.time), nodes: NODES, handles: [], pins: [] }, true),
-        this.about.drag ? {} : { disabled: true, title: 'A playback file cannot be bent; give the run' }),
-      act('Floaters', () => this.propose(), this.about.floaters ? {} : { disabled: true, title: 'Needs the run with its pictures' }));
+        this.about.drag ? {} : { disabled: true, title: 'Not available for playback files. Open the run folder instead.' }),
+      act('Floaters', () => this.propose(), this.about.floaters ? {} : { disabled: true, title: 'Not available: floaters are found in the training images. Open the run folder instead.' }));
     this.list = h('ol', { 'aria-label': 'Edits' });
     this.props = h('div', { class: 'props', role: 'group' });
     const check = (box, text, title) => h('label', { class: 'check', title }, box, text);
@@ -209,8 +209,8 @@ export class Editing {
         this.saveTool, tool('close', 'Close', () => this.toggle(false)))),
       h('div', { class: 'row choose' }, this.tools), h('div', { class: 'row choose' },
         ...PLAIN.map(([words, text, title]) => button(text, () => this.#pick(words), { title })), this.more), h('div', { class: 'row choose' }, this.hows,
-        check(this.through, 'Through', 'Also what lies behind what is seen'),
-        this.about.moving ? check(this.now, 'Now', 'What is there at this moment, instead of most of its life') : null),
+        check(this.through, 'Through', 'Also select Gaussians behind the visible surface'),
+        this.about.moving ? check(this.now, 'Now', 'Select by positions at this time. Otherwise: by positions at most times of the lifespan') : null),
       this.area, this.boxed, this.said, this.acts, this.list, this.props);
     ui.dock.insertBefore(this.panel, ui.bar);
     ui.help.querySelector('dl')?.append(...[['Edit', 'X'], ['Undo, redo', 'Ctrl + Z', 'Y'], ['Save the edits', 'Ctrl + S'], ['Delete the selection', 'Del']]
@@ -293,24 +293,23 @@ export class Editing {
 
   refresh() {
     const { history } = this, focused = this.panel.contains(this.ui.focused()) ? this.ui.focused().getAttribute('aria-label') : null;
-    this.undoTool.disabled = !history.undoable;
-    this.redoTool.disabled = !history.redoable;
-    this.saveTool.disabled = !history.dirty;
+    allow(this.undoTool, !history.undoable && 'Nothing to undo', 'Undo (Ctrl+Z)');
+    allow(this.redoTool, !history.redoable && 'Nothing to redo', 'Redo (Ctrl+Y)');
+    allow(this.saveTool, !history.dirty && 'All edits are saved', 'Save (Ctrl+S)');
     this.#keep();
     this.#numbers(this.overlay.box = this.active < 0 && this.open ? boxOf(this.text) : null);
     this.overlay.redraw();
     this.list.hidden = !this.steps.length;
     this.list.replaceChildren(...this.steps.map((s, i) => h('li', { 'aria-current': String(i === this.active) },
-      button('', () => this.activate(i === this.active ? -1 : i), { 'aria-label': `Set edit ${i + 1}: ${nameOf(s)}`, class: '' }),
-      tool('bin', `Take edit ${i + 1} out`, () => this.remove(i)))));
+      button('', () => this.activate(i === this.active ? -1 : i), { 'aria-label': `Change edit ${i + 1}: ${nameOf(s)}`, class: '' }),
+      tool('bin', `Remove edit ${i + 1}`, () => this.remove(i)))));
     [...this.list.children].forEach((li, i) => li.firstChild.append(h('b', {}, nameOf(this.steps[i])),
       h('small', {}, this.done[i] ? `${this.done[i].selected.toLocaleString('en-GB')} · ` : '', this.steps[i].select ?? '')));
     if (this.area !== this.ui.focused()) this.area.value = this.text;
     const some = this.#told?.gaussians > 0 && this.active < 0;
     for (const b of this.acts.children) {
       if (b.textContent === 'Floaters' || (b.textContent === 'Bend' && !this.about.drag)) continue;
-      b.disabled = !some;
-      b.title = some ? ACTS[b.textContent] : this.active < 0 ? 'Select something first' : 'Finish the edit that is being set first';
+      allow(b, !some && (this.active < 0 ? 'Select something first' : 'Close the open edit first: click it in the list'), ACTS[b.textContent]);
     }
     this.#properties();
     this.#diamonds();
@@ -350,8 +349,8 @@ export class Editing {
       field('Scale', number('Scale', round(place.scale), v => v > 0 && put({ scale: v }))));
     } else if (step.do === 'drag') {
       out.push(h('p', { class: 'note' }, step.handles.length
-        ? 'Pull nodes; tap one to hold it where it is.' : 'Pull a node: all around it follows. Tap one to hold it where it is.'),
-      field('Held', h('span', {}, `${step.handles.length} pulled, ${(step.pins ?? []).length} pinned`)));
+        ? 'Drag nodes. Click a node to pin it.' : 'Drag a node: its surroundings follow. Click a node to pin it.'),
+      field('Nodes', h('span', {}, `${step.handles.length} dragged, ${(step.pins ?? []).length} pinned`)));
       if (this.#bent?.own && !step.handles.length && !step.pins?.length) {
         const own = h('input', { type: 'checkbox', 'aria-label': 'Nodes of the model', ...(!step.nodes && { checked: true }),
           onchange: () => { this.#set({ ...step, nodes: own.checked ? 0 : NODES }); this.#bend(); } });
@@ -371,8 +370,9 @@ export class Editing {
       h('label', { class: 'check' }, h('input', { type: 'checkbox', 'aria-label': `Ease key ${i + 1}`, ...(k.ease && { checked: true }),
         onchange: e => this.#set(easedKey(step, k.t, e.target.checked)) }), 'ease'),
       tool('bin', `Delete key ${i + 1}`, () => this.#set(withoutKey(step, k.t)))))),
-    h('div', { class: 'wrap' }, button('Key here', () => this.#set(withKey(step, this.time)),
-      { title: 'Keeps this moment; what is set at another one becomes a key there', ...(step.do === 'drag' && !step.handles.length && { disabled: true }) })));
+    h('div', { class: 'wrap' }, button('Add key here', () => this.#set(withKey(step, this.time)),
+      step.do === 'drag' && !step.handles.length ? { disabled: true, title: 'Drag a node first' }
+        : { title: 'Add a key frame here. Changes at other times then add their own key frames' })));
   }
 
   /** Keys of the step that is set, on the time line. */
@@ -470,8 +470,8 @@ export class Editing {
     const n = x => x.toLocaleString('en-GB');
     const counts = told.seen.map(([, count]) => count);
     const over = counts.length > 1 ? ` Over the clip: ${counts.map(n).join(', ')}.` : '';
-    const psnr = told.psnr ? ` ${told.pictures} held-out pictures: ${told.psnr[0].toFixed(2)} dB with, ${told.psnr[1].toFixed(2)} dB without.` : '';
-    this.say(`${n(told.gaussians)} of ${n(told.of)} Gaussians, ${n(told.now)} seen now.${psnr || over}`);
+    const psnr = told.psnr ? ` ${told.pictures} held-out images: ${told.psnr[0].toFixed(2)} dB with, ${told.psnr[1].toFixed(2)} dB without.` : '';
+    this.say(`${n(told.gaussians)} of ${n(told.of)} Gaussians selected, ${n(told.now)} visible now.${psnr || over}`);
   }
 
   /** The similarity by which dots and handles are drawn. */
@@ -552,7 +552,7 @@ export class Editing {
   async propose() {
     const strength = this.strength ?? 0.5;
     this.setTool(null);
-    this.say('Looking at every camera …');
+    this.say('Checking every camera …');
     try {
       const told = await this.ask({ do: 'floaters', steps: ready(this.steps), strength, t: this.time });
       this.activate(-1);
@@ -567,8 +567,8 @@ export class Editing {
           this.#tell(null);
           this.refresh();
           this.#apply();
-        }, told.gaussians ? { class: 'soft main' } : { disabled: true }),
-        button('Leave them', () => { this.#tell(null); this.refresh(); })));
+        }, told.gaussians ? { class: 'soft main' } : { disabled: true, title: 'No floaters at this strength' }),
+        button('Keep them', () => { this.#tell(null); this.refresh(); })));
     } catch (error) { this.say(error.message, true); }
   }
 
@@ -628,7 +628,7 @@ export class Editing {
       const steps = ready(this.steps);
       await this.ask({ do: 'save', steps });
       this.history.saved = steps;
-      this.ui.toast(`Saved in ${this.about.file}`);
+      this.ui.toast(`Saved to ${this.about.file}`);
     } catch (error) { this.say(error.message, true); }
     this.refresh();
   }

@@ -62,7 +62,7 @@ export function program(gl, vertex, fragment) {
   if (!gl.getProgramParameter(made, gl.LINK_STATUS) && !gl.isContextLost()) {
     const logs = (gl.getAttachedShaders(made) ?? []).map((s) => gl.getShaderInfoLog(s)).join(' ');
     throw new SceneError(
-      "The graphics driver refuses the player's shaders",
+      "The graphics driver rejects the player's shaders",
       (gl.getProgramInfoLog(made) + logs).slice(0, 500),
       'Update the browser or the driver.',
     );
@@ -78,8 +78,8 @@ export function program(gl, vertex, fragment) {
 /// Throws where the driver ran out of memory.
 export function check(gl, what) {
   for (let e = gl.getError(); e !== gl.NO_ERROR && e !== gl.CONTEXT_LOST_WEBGL; e = gl.getError()) {
-    if (e === gl.OUT_OF_MEMORY) throw new SceneError(what, '', 'Close other pages, or choose a smaller scene.');
-    throw new SceneError(`The graphics driver answers error ${e}`, '', 'Update the browser or the driver.');
+    if (e === gl.OUT_OF_MEMORY) throw new SceneError(what, '', 'Close other pages, or open a smaller scene.');
+    throw new SceneError(`The graphics driver reports error ${e}`, '', 'Update the browser or the driver.');
   }
 }
 

@@ -80,11 +80,11 @@ export class Training {
     this.state = h('span', {}, 'Connecting');
     this.left = h('small');
     this.figures = h('div', { class: 'figures' });
-    this.canvas = h('canvas', { role: 'img', 'aria-label': 'Quality over the steps' });
+    this.canvas = h('canvas', { role: 'img', 'aria-label': 'Quality over steps' });
     const axis = name => h('small', { class: name });
     this.axes = { psnr: [axis('high psnr'), axis('low psnr')], loss: [axis('high loss'), axis('low loss')], step: [axis(), axis()] };
     this.plot = h('div', { class: 'plot', hidden: true },
-      h('div', { class: 'names' }, h('small', { class: 'psnr' }, 'PSNR of training views, dB'), h('small', { class: 'loss' }, 'Loss')),
+      h('div', { class: 'names' }, h('small', { class: 'psnr' }, 'PSNR, training views, dB'), h('small', { class: 'loss' }, 'Loss')),
       h('div', { class: 'area' }, this.canvas, ...this.axes.psnr, ...this.axes.loss),
       h('div', { class: 'names' }, this.axes.step[0], h('small', {}, 'steps'), this.axes.step[1]));
     this.card = h('section', { class: 'card live', 'aria-label': 'Training' },
@@ -158,7 +158,7 @@ export class Training {
       : s > 90 ? `${Math.round(s / 60)} min` : `${Math.round(s)} s`);
     const cells = [
       [count(data.step), data.of ? `of ${count(data.of)} steps` : 'steps'],
-      [isFinite(data.psnr) ? data.psnr.toFixed(2) : '–', 'dB PSNR'],
+      [isFinite(data.psnr) ? data.psnr.toFixed(2) : '–', 'dB, training views'],
       [count(data.gaussians ?? 0), 'Gaussians'],
     ];
     this.left.textContent = data.left > 0 && !this.over ? `${left(data.left)} left` : '';
@@ -200,7 +200,7 @@ export class Training {
     curve('loss', style.getPropertyValue('--muted'), 1.5);
     curve('psnr', style.getPropertyValue('--accent'), 2);
     const psnr = this.#points.map(p => p.psnr);
-    canvas.setAttribute('aria-label', `Quality over the steps: PSNR from ${psnr[0].toFixed(1)} to ${
+    canvas.setAttribute('aria-label', `Quality over steps: PSNR from ${psnr[0].toFixed(1)} to ${
       psnr.at(-1).toFixed(1)} dB`);
   }
 

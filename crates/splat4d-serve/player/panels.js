@@ -2,7 +2,7 @@
 
 import { CHANNELS } from './player.js';
 import { Track } from './track.js';
-import { button, bytes, choice, clock, field, h, pick, save, segments, tool } from './dom.js';
+import { allow, button, bytes, choice, clock, field, h, pick, save, segments, tool } from './dom.js';
 
 export const CHANNEL_NAMES = { color: 'Colour', depth: 'Depth', alpha: 'Alpha', flow: 'Flow' };
 export const SPEEDS = [0.1, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 4];
@@ -12,14 +12,14 @@ const BACKGROUNDS = { scene: null, black: [0, 0, 0], grey: [0.5, 0.5, 0.5], whit
 
 const KEYS = [
   ['Play or pause', 'Space'], ['Seek', '←', '→'], ['One frame', ',', '.'], ['Start, end', 'Home', 'End'],
-  ['Slower, faster', '[', ']'], ['Loop', 'L'], ['Colour, depth, alpha, flow', 'C'], ['Cameras', '1', '…', '9'],
+  ['Slower, faster', '[', ']'], ['Loop', 'L'], ['Channel', 'C'], ['Cameras', '1', '…', '9'],
   ['Next camera', 'N'], ['Reset the view', 'R'], ['Orbit or fly', 'M'], ['Move', 'W', 'A', 'S', 'D'],
-  ['Down, up', 'Q', 'E'], ['Faster moves', 'Shift'], ['Turn', 'Shift + arrows'], ['Nearer, farther', '↑', '↓'],
-  ['Add a path key', 'K'], ['Play the path', 'P'], ['Bullet time', 'B'], ['Full screen', 'F'], ['Figures', 'I'],
-  ['Picture', 'G'], ['Light or dark', 'T'], ['This help', 'H', '?'],
+  ['Down, up', 'Q', 'E'], ['Move faster', 'Shift'], ['Turn', 'Shift + arrows'], ['Zoom', '↑', '↓'],
+  ['Add a camera key', 'K'], ['Play the camera path', 'P'], ['Bullet time', 'B'], ['Full screen', 'F'], ['Statistics', 'I'],
+  ['Save image', 'G'], ['Light or dark', 'T'], ['This help', 'H', '?'],
 ];
 const GESTURES = [
-  ['Drag', 'Turn'], ['Right drag, two fingers', 'Move'], ['Wheel, pinch', 'Nearer, farther'],
+  ['Drag', 'Turn'], ['Right drag, two fingers', 'Move'], ['Wheel, pinch', 'Zoom'],
   ['Alt + wheel', 'Field of view'],
 ];
 
@@ -31,11 +31,11 @@ function panel(title, close, ...children) {
 
 export function viewPanel(ui) {
   const { player } = ui;
-  const channel = segments('Picture', CHANNELS.map(c => [c, CHANNEL_NAMES[c]]), c => player.setChannel(c));
+  const channel = segments('Channel', CHANNELS.map(c => [c, CHANNEL_NAMES[c]]), c => player.setChannel(c));
   const speed = choice('Speed', SPEEDS.map(s => [s, `${s}×`]), s => { player.speed = +s; });
   const loop = h('input', { type: 'checkbox', 'aria-label': 'Loop', onchange: () => ui.setLoop(loop.checked) });
   const scale = choice('Resolution', SCALES, s => ui.setResolution(s));
-  const backend = choice('Drawn with', BACKENDS, b => player.useBackend(b));
+  const backend = choice('Renderer', BACKENDS, b => player.useBackend(b));
   const ground = choice('Background', Object.keys(BACKGROUNDS).map(b => [b, b[0].toUpperCase() + b.slice(1)]), b => {
     player.background = BACKGROUNDS[b];
     player.redraw();
@@ -47,19 +47,19 @@ export function viewPanel(ui) {
   }));
   const labelsField = field('Labels', labels);
   const theme = segments('Theme', [['auto', 'Auto'], ['light', 'Light'], ['dark', 'Dark']], t => ui.setTheme(t));
-  const figures = h('input', { type: 'checkbox', 'aria-label': 'Figures',
+  const figures = h('input', { type: 'checkbox', 'aria-label': 'Statistics',
     onchange: () => ui.setFigures(figures.checked) });
   const path = h('div', { class: 'wrap narrow' },
     button('Back', () => player.step(-1), { 'aria-label': 'One frame back' }, 'back'),
-    button('Next', () => player.step(1), { 'aria-label': 'One frame on' }, 'next'),
+    button('Next', () => player.step(1), { 'aria-label': 'One frame forward' }, 'next'),
     button('Keys', () => ui.toggleHelp(), {}, 'help'));
   const node = panel('View', () => ui.open(null),
     h('div', { class: 'field cramped' }, channel),
     path,
     field('Speed', speed, 'narrow'), field('Loop', loop, 'narrow'), field('Resolution', scale),
-    labelsField, field('Background', ground), field('Theme', theme), field('Drawn with', backend), field('Figures', figures),
+    labelsField, field('Background', ground), field('Theme', theme), field('Renderer', backend), field('Statistics', figures),
     h('div', { class: 'wrap' },
-      button('Save picture', () => ui.screenshot(), {}, 'photo'),
+      button('Save image', () => ui.screenshot(), {}, 'photo'),
       ui.page ? button('Copy link', () => ui.copyLink(), {}, 'link') : null,
       ui.page ? button('Open file', () => ui.pickFile(), {}, 'open') : null));
   node.refresh = () => {
@@ -80,7 +80,10 @@ export function viewPanel(ui) {
     labels.value = player.labels.only !== null ? String(player.labels.only) : player.labels.colors ? OFF + OFF : OFF;
     theme.set(ui.theme);
     figures.checked = ui.figuresOn;
-    for (const item of [path.children[0], path.children[1], speed, loop]) item.disabled = player.still;
+    for (const item of [path.children[0], path.children[1], speed, loop]) {
+      item.disabled = player.still;
+      if (player.still) item.title = 'The scene is static';
+    }
   };
   return node;
 }
@@ -94,11 +97,11 @@ export function cameraPanel(ui) {
     tool('next', 'Next camera', () => player.view((player.viewed ?? -1) + 1))));
   const keys = h('ol', { class: 'keys', 'aria-label': 'Keys of the path' });
   const note = h('p', { class: 'note' },
-    'A key keeps the camera and the scene’s time. Two or more make a path.');
+    'A key stores the camera and the time. Two or more keys make a path.');
   const play = button('Play path', () => ui.playPath(), {}, 'play');
-  const bullet = button('Bullet time', () => ui.bullet(), { title: 'Time stands still, the camera moves' });
+  const bullet = button('Bullet time', () => ui.bullet(), { title: 'Stop the time and move the camera' });
   const out = button('Export', () => save(new Blob([JSON.stringify(player.track, null, 1)],
-    { type: 'application/json' }), 'path.json'), { title: 'For splat4d render --path path.json' });
+    { type: 'application/json' }), 'path.json'), { title: 'Save the path for splat4d render --path path.json' });
   const views3 = h('h3', {}, 'Cameras of the capture');
   const node = panel('Cameras', () => ui.open(null),
     field('Movement', mode),
@@ -120,10 +123,10 @@ export function cameraPanel(ui) {
     }
     list.value = String(player.viewed ?? -1);
     const n = player.track.keys.length;
-    play.disabled = n < 2 && !player.film;
+    allow(play, n < 2 && !player.film && 'A path needs two keys');
     play.lastChild.textContent = player.film && !player.film.frozen ? 'Stop path' : 'Play path';
     bullet.lastChild.textContent = player.film?.frozen ? 'Stop bullet time' : 'Bullet time';
-    out.disabled = !n;
+    allow(out, !n && 'There is no key to export', 'Save the path for splat4d render --path path.json');
     note.hidden = n > 1;
     keys.hidden = !n;
     if (!keys.contains(ui.focused())) keys.replaceChildren(...player.track.keys.map((key, i) => pathKey(ui, key, i)));
@@ -134,7 +137,7 @@ export function cameraPanel(ui) {
 function pathKey(ui, key, i) {
   const { player } = ui;
   const seconds = h('input', { type: 'number', step: 0.1, value: +key.time.toFixed(2),
-    'aria-label': `Key ${i + 1}, second of the film`,
+    'aria-label': `Key ${i + 1}, time in the path, seconds`,
     onchange: () => { player.track.move(i, +seconds.value); seconds.value = +key.time.toFixed(2); } });
   const scene = key.sceneTime === null ? '' : ` · scene ${clock(key.sceneTime - player.first)}`;
   return h('li', {}, h('b', {}, `${i + 1}`), seconds, h('span', {}, `s${scene}`),
@@ -153,7 +156,7 @@ export function helpPage(close) {
 
 /** The figures card; refresh() reads the player's statistics. */
 export function figuresCard(player) {
-  const node = h('dl', { class: 'card stats', hidden: true, 'aria-label': 'Figures' });
+  const node = h('dl', { class: 'card stats', hidden: true, 'aria-label': 'Statistics' });
   const count = n => (n ?? 0).toLocaleString('en-GB');
   node.refresh = () => {
     const s = player.statistics;
@@ -161,11 +164,11 @@ export function figuresCard(player) {
       ['Frames/s', s.atRest ? 'at rest' : s.fps ? s.fps.toFixed(0) : '–'],
       ['Frame', s.frameMs ? `${s.frameMs.toFixed(1)} ms` : '–'],
       ['Sorting', s.sortMs ? `${s.sortMs.toFixed(1)} ms` : '–'],
-      ['Picture', `${s.width} × ${s.height}`], ['Scale', `${Math.round(100 * s.scale)} %`],
-      ['Drawn', count(s.drawn)], ['Active', count(s.active)], ['Resident', count(s.resident)],
+      ['Image', `${s.width} × ${s.height}`], ['Scale', `${Math.round(100 * s.scale)} %`],
+      ['Rendered', count(s.drawn)], ['Active', count(s.active)], ['Resident', count(s.resident)],
       ...(s.leftOut ? [['Left out', count(s.leftOut)]] : []), ['Gaussians', count(s.gaussians)], ['Read', `${bytes(s.bytesRead)} of ${bytes(s.bytesTotal)}`],
-      ['First picture', s.firstFrame ? `${s.firstFrame.toFixed(0)} ms` : '–'],
-      ['Drawn with', s.backend === 'webgpu' ? 'WebGPU' : s.backend === 'webgl2' ? 'WebGL2' : s.backend ?? '–'],
+      ['First image', s.firstFrame ? `${s.firstFrame.toFixed(0)} ms` : '–'],
+      ['Renderer', s.backend === 'webgpu' ? 'WebGPU' : s.backend === 'webgl2' ? 'WebGL2' : s.backend ?? '–'],
     ];
     node.replaceChildren(...rows.flatMap(([k, v]) => [h('dt', {}, k), h('dd', {}, v)]));
   };

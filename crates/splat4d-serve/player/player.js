@@ -273,7 +273,7 @@ export class Player extends EventTarget {
     const where = typeof source === 'string' ? source : source?.name;
     const told = error instanceof SceneError ? error : Object.assign(new SceneError(
       error.message || String(error), where ?? 'player',
-      'Try again; if it comes back, try another browser and tell us about it.'), { cause: error });
+      'Try again. If it happens again, try another browser and report it.'), { cause: error });
     this.playing = false;
     this.#become('error');
     this.emit('error', { error: told, what: told.what, where: told.where, remedy: told.remedy });
@@ -319,7 +319,7 @@ export class Player extends EventTarget {
       const onorder = () => this.redraw(CONTENT);
       try {
         if (name !== 'webgl2') {
-          if (!navigator.gpu) throw new Error(isSecureContext ? 'not offered' : 'needs https or this computer');
+          if (!navigator.gpu) throw new Error(isSecureContext ? 'not supported' : 'needs https or localhost');
           this.backend = await (await import('./webgpu.js')).WebGPUBackend.create(this.canvas, {
             onlost, hardware: name === 'card',
           });
@@ -333,7 +333,7 @@ export class Player extends EventTarget {
         this.#newCanvas();
       }
     }
-    throw new SceneError('This browser cannot draw the scene', reasons.join('; '),
+    throw new SceneError('This browser cannot render the scene', reasons.join('; '),
       'Turn on hardware acceleration in its settings, or open the page in a current Chrome, Edge, Firefox or Safari.');
   }
 
@@ -349,8 +349,8 @@ export class Player extends EventTarget {
     this.figures.lost = reason?.message ?? String(reason);
     this.#losses = this.#losses.filter(t => now - t < 60000).concat(now);
     if (this.#losses.length > LOSSES) {
-      return this.fail(new SceneError('The graphics device was lost again and again', reason?.message ?? 'GPU',
-        'Close other pages that use the GPU, lower the resolution, then load the page again.'));
+      return this.fail(new SceneError('The graphics device was lost several times', reason?.message ?? 'GPU',
+        'Close other pages that use the GPU, lower the resolution, then reload the page.'));
     }
     await this.#rebuild().catch(error => this.fail(error));
   }
@@ -711,7 +711,7 @@ export class Player extends EventTarget {
   /** A PNG of the image, as shown but always at full resolution; its `time` is the second that it shows. */
   async screenshot() {
     if (!this.file || !this.backend) {
-      throw new SceneError('There is no picture yet', 'screenshot', 'Wait for the scene.');
+      throw new SceneError('No image has been rendered yet', 'screenshot', 'Wait until the scene has loaded.');
     }
     this.#paint(1, { force: true });
     await this.backend.settled();
@@ -769,8 +769,8 @@ export class Player extends EventTarget {
 /** A file that ends before its length: an upload or a copy that broke off. */
 function cutShort({ bytesTotal, length }, source) {
   const where = typeof source === 'string' ? source : source?.name;
-  return new SceneError(`The file is cut short: ${bytesTotal} of ${length} bytes are there, and some of its Gaussians are missing`,
-    where || 'the file', 'Copy or export it again.');
+  return new SceneError(`The file is truncated: ${bytesTotal} of ${length} bytes, some Gaussians are missing`,
+    where || 'the file', 'Copy or export the file again.');
 }
 
 /** Whether WebGL says that it is computed on the CPU. */

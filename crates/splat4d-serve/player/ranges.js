@@ -36,7 +36,7 @@ export class Local {
       throw new SceneError(
         'The file could not be read',
         this.blob.name,
-        'Was it moved or changed? Choose it again.',
+        'If it was moved or changed, choose it again.',
         e,
       );
     }
@@ -81,8 +81,8 @@ export class Remote {
         'The scene could not be fetched',
         this.url,
         local
-          ? 'A browser reads no files beside a page: open it with the file button, or serve the folder.'
-          : 'Check the address and the connection; a server of another site must allow it (CORS).',
+          ? 'Browsers do not read files next to a page opened from disk. Open the scene with the file button, or serve the folder.'
+          : 'Check the address and the connection. A server of another origin must allow access (CORS).',
         e,
       );
     }
@@ -173,7 +173,7 @@ export class Remote {
       const error =
         e instanceof SceneError || stop.signal.aborted
           ? e
-          : new SceneError('The connection failed', this.url, 'The player goes on when it is back.', e);
+          : new SceneError('The connection failed', this.url, 'The player continues when the connection is back.', e);
       for (const job of run) {
         if (!job.done) {
           job.settle();

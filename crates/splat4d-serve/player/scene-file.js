@@ -102,7 +102,7 @@ class Decoder {
     for (const [ticket, w] of [...this.#waiting]) {
       if (w.lane !== lane) continue;
       this.#waiting.delete(ticket);
-      if (lane.proven) w.reject(new Error('the decoder ended unexpectedly'));
+      if (lane.proven) w.reject(new Error('the decoder stopped unexpectedly'));
       else decode(w.job).then(w.resolve, w.reject);
     }
     this.#workers = this.#workers.filter((l) => l !== lane);
@@ -209,15 +209,15 @@ export class SceneFile {
   async #decoded(entry, signal, labels) {
     const { kind, offset, stored, crc, codec, bytes, count, degree, id, missing, from, to } = entry;
     const where = `${this.#where}, section ${id}`;
-    if (missing) throw new SceneError('The file was cut short before this part', where, DAMAGED);
+    if (missing) throw new SceneError('The file is truncated before this section', where, DAMAGED);
     const data = await this.#bytes(offset, stored, signal);
     signal?.throwIfAborted();
     try {
-      if (data.length !== stored) throw new Error('the file ends before it');
+      if (data.length !== stored) throw new Error('the file ends before the section');
       return await this.#decoder.run({ kind, stored: data, crc, codec, bytes, count, degree, labels, from, to });
     } catch (e) {
       if (isAbort(e)) throw e;
-      throw new SceneError(`A part of the scene cannot be read: ${e.message}`, where, DAMAGED, e);
+      throw new SceneError(`A section of the scene cannot be read: ${e.message}`, where, DAMAGED, e);
     }
   }
 
@@ -239,14 +239,14 @@ export class SceneFile {
 
   async #start(head, signal) {
     if (head.length < HEAD || MAGIC.some((b, i) => head[i] !== b)) {
-      this.#refuse('This is no .s4d file', 'Bake or convert the scene to .s4d first.');
+      this.#refuse('Not a .s4d file', 'Bake or convert the scene to .s4d first.');
     }
     const view = new DataView(head.buffer, head.byteOffset, head.byteLength);
     if (view.getUint32(60, true) !== crc32(head.subarray(0, 60)))
       this.#refuse('The header is damaged: its checksum differs');
     const major = view.getUint16(8, true);
     if (major !== MAJOR && major !== GROWING) {
-      this.#refuse(`This file has version ${major}, this player reads ${MAJOR}`, 'Use a newer player.');
+      this.#refuse(`The file has version ${major}, this player reads ${MAJOR}`, 'Use a newer player.');
     }
     const indexBytes = view.getUint32(12, true);
     const length = long(view, 16);
@@ -255,11 +255,11 @@ export class SceneFile {
     const at = this.growing ? long(view, 28) : HEAD;
     this.bytesTotal = Math.min(length, this.#source.size);
     this.truncated = this.#source.size < length;
-    if (indexBytes > MAX_INDEX || !(at >= HEAD && at + indexBytes <= length)) this.#refuse('The index is longer than may be');
+    if (indexBytes > MAX_INDEX || !(at >= HEAD && at + indexBytes <= length)) this.#refuse('The index is longer than allowed');
     this.#head = head;
     const whole = at + indexBytes <= this.bytesTotal;
     const index = whole ? await this.#bytes(at, indexBytes, signal) : [];
-    if (index.length !== indexBytes) this.#refuse('The file is cut short inside its index');
+    if (index.length !== indexBytes) this.#refuse('The file is truncated in its index');
     if (crc32(index) !== view.getUint32(24, true)) this.#refuse('The index is damaged: its checksum differs');
     this.#index(index, at, length);
   }
@@ -267,17 +267,17 @@ export class SceneFile {
   #index(index, at, length) {
     const view = new DataView(index.buffer, index.byteOffset, index.byteLength);
     const jsonBytes = index.length >= 8 ? view.getUint32(0, true) : NO_PALETTE;
-    if (jsonBytes % 4 || jsonBytes > index.length - 8) this.#refuse('The index does not hold its own description');
+    if (jsonBytes % 4 || jsonBytes > index.length - 8) this.#refuse('The index does not contain its description');
     let json;
     try {
       json = JSON.parse(new TextDecoder('utf-8', { fatal: true }).decode(index.subarray(4, 4 + jsonBytes)));
     } catch {
-      this.#refuse("The scene's description is no valid JSON");
+      this.#refuse("The scene's description is not valid JSON");
     }
     const table = 8 + jsonBytes,
       count = view.getUint32(4 + jsonBytes, true);
     if (count > MAX_SECTIONS || index.length !== table + count * ENTRY) {
-      this.#refuse(`The index is no table of ${count} sections`);
+      this.#refuse(`The index is not a table of ${count} sections`);
     }
     this.meta = this.#checkedMeta(json);
     for (let id = 0; id < count; id++) this.sections.push(this.#entry(view, table + id * ENTRY, id, length));
@@ -291,7 +291,7 @@ export class SceneFile {
     for (const page of this.sections) {
       if (page.kind !== 'PAGE') continue;
       const palette = this.sections[page.palette];
-      if (page.palette !== -1 && palette?.kind !== 'PALT') this.#refuse(`Page ${page.id} names no palette`);
+      if (page.palette !== -1 && palette?.kind !== 'PALT') this.#refuse(`Page ${page.id} refers to no palette`);
       // Without its palette a page cannot be drawn.
       if (palette?.missing) page.missing = true;
       if (!page.missing) this.pages.push(page);
@@ -299,9 +299,9 @@ export class SceneFile {
     for (const mask of this.sections) {
       if (mask.kind !== 'MASK') continue;
       const page = this.sections[mask.page];
-      if (page?.kind !== 'PAGE') this.#refuse(`Mask ${mask.id} names no page`);
+      if (page?.kind !== 'PAGE') this.#refuse(`Mask ${mask.id} refers to no page`);
       if (page.count !== mask.count) {
-        this.#refuse(`Mask ${mask.id} is of ${mask.count} Gaussians, its page ${page.id} of ${page.count}`);
+        this.#refuse(`Mask ${mask.id} is for ${mask.count} Gaussians, its page ${page.id} has ${page.count}`);
       }
       if (page.mask !== -1) this.#refuse(`Page ${page.id} has two masks`);
       // A file that was cut short behind a page shows the page without its mask.
@@ -313,7 +313,7 @@ export class SceneFile {
       if (labels.kind !== 'LABL') continue;
       const page = this.sections[labels.page];
       if (page?.kind !== 'PAGE' || page.count !== labels.count) {
-        this.#refuse(`Labels ${labels.id} are of no page of ${labels.count} Gaussians`);
+        this.#refuse(`Labels ${labels.id} refer to no page of ${labels.count} Gaussians`);
       }
       if (page.labels !== -1) this.#refuse(`Page ${page.id} has labels twice`);
       if (!labels.missing) page.labels = labels.id;
@@ -337,33 +337,33 @@ export class SceneFile {
       if (section.flags & 1) refuse('is of a kind that this player does not know', 'Use a newer player.');
       return section;
     }
-    if (codec > 1) refuse(`is packed with method ${codec}, unknown here`, 'Use a newer player.');
-    if (codec === 0 ? stored !== bytes : bytes > DEFLATE_RATIO * stored) refuse('cannot hold what it states');
+    if (codec > 1) refuse(`has the unknown compression method ${codec}`, 'Use a newer player.');
+    if (codec === 0 ? stored !== bytes : bytes > DEFLATE_RATIO * stored) refuse('cannot have the stated size');
     if (kind === 'POST') return section;
-    if (count < 1 || count > MAX_COUNT) refuse(`states ${count} entries, not 1 to ${MAX_COUNT}`);
+    if (count < 1 || count > MAX_COUNT) refuse(`has ${count} entries, expected 1 to ${MAX_COUNT}`);
     if (kind === 'MASK') {
       this.#checkMask(section, u32(56), refuse);
       return section;
     }
     if (kind === 'LABL') {
       Object.assign(section, { page: u32(56), palette: -1 });
-      if (bytes !== count) refuse(`decodes to ${bytes} bytes, not one for each of ${count} Gaussians`);
+      if (bytes !== count) refuse(`decodes to ${bytes} bytes, expected one for each of ${count} Gaussians`);
       return section;
     }
     if (kind === 'PAGE') Object.assign(section, { mask: -1, maskBytes: 0, labels: -1 });
     if (kind === 'PAGE' && section.words !== WORDS) {
-      refuse(`has ${section.words} words a Gaussian, not ${WORDS}`, 'Use a newer player.');
+      refuse(`has ${section.words} words per Gaussian, expected ${WORDS}`, 'Use a newer player.');
     }
-    if (kind === 'PALT' && !(level >= 1 && level <= 3)) refuse(`has degree ${level}, not 1 to 3`);
+    if (kind === 'PALT' && !(level >= 1 && level <= 3)) refuse(`has degree ${level}, expected 1 to 3`);
     const right =
       kind === 'PAGE'
         ? Math.ceil(count / BLOCK) * BLOCK_BYTES + 4 * WORDS * count
         : 12 + 3 * ((level + 1) ** 2 - 1) * count;
-    if (bytes !== right) refuse(`decodes to ${bytes} bytes, not the ${right} that its ${count} entries need`);
+    if (bytes !== right) refuse(`decodes to ${bytes} bytes, expected ${right} for ${count} entries`);
     // Deflate stores what it cannot shrink with few bytes more; twice is nothing that a writer makes.
-    if (stored > 2 * bytes) refuse('is longer packed than unpacked');
+    if (stored > 2 * bytes) refuse('is longer compressed than uncompressed');
     if (kind === 'PAGE' && !(section.from < section.to && Number.isFinite(section.to - section.from))) {
-      refuse('has no valid span of time');
+      refuse('has no valid time range');
     }
     return section;
   }
@@ -374,11 +374,11 @@ export class SceneFile {
     const keys = (bytes - 8) / (8 + Math.ceil(count / 8));
     Object.assign(section, { page, palette: -1, keys });
     if (!(Number.isInteger(keys) && keys >= 1 && keys <= MAX_KEYS)) {
-      refuse(`decodes to ${bytes} bytes, which no number of key times of ${count} Gaussians need`);
+      refuse(`decodes to ${bytes} bytes, which fit no number of key times for ${count} Gaussians`);
     }
-    if (stored > 2 * bytes) refuse('is longer packed than unpacked');
-    if (bytes > SMALL_MASK && bytes > MASK_RATIO * this.bytesTotal) refuse(`unpacks to ${bytes} bytes`);
-    if (!(from <= to && Number.isFinite(to - from))) refuse('has no valid span of time');
+    if (stored > 2 * bytes) refuse('is longer compressed than uncompressed');
+    if (bytes > SMALL_MASK && bytes > MASK_RATIO * this.bytesTotal) refuse(`decompresses to ${bytes} bytes, more than allowed`);
+    if (!(from <= to && Number.isFinite(to - from))) refuse('has no valid time range');
   }
 
   #checkedMeta(json) {

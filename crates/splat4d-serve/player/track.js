@@ -84,7 +84,7 @@ export class Track {
   /** From the JSON of a path file; throws an Error whose message names the key and the trouble. */
   static parse(text, likeness) {
     let value;
-    try { value = JSON.parse(text); } catch (e) { throw new Error(`It is not JSON: ${e.message}.`); }
+    try { value = JSON.parse(text); } catch (e) { throw new Error(`Invalid JSON: ${e.message}.`); }
     const list = value?.keys;
     if (!Array.isArray(list) || !list.length) throw new Error('The list "keys" is missing or empty.');
     const track = new Track();
@@ -93,9 +93,9 @@ export class Track {
       const wrong = what => { throw new Error(`keys[${i}]: ${what}.`); };
       if (!key || typeof key !== 'object') wrong('not an object');
       const odd = Object.keys(key).find(k => !KEYS.includes(k));
-      if (odd) wrong(`the key "${odd}" is not known`);
-      if (!plain(key.time)) wrong('"time" is missing or no number');
-      if (i && key.time <= track.keys[i - 1].time) wrong('its time is not after the one before');
+      if (odd) wrong(`unknown key "${odd}"`);
+      if (!plain(key.time)) wrong('"time" is missing or not a number');
+      if (i && key.time <= track.keys[i - 1].time) wrong('its time is not after that of the previous key');
       track.keys.push({ time: key.time, sceneTime: key.scene_time ?? null, camera: readPose(key, likeness, wrong) });
     });
     return track;
@@ -129,21 +129,21 @@ function readPose(key, likeness, wrong) {
   camera.lens = null;
   const [eye, target] = [vector(key.position), vector(key.look_at)];
   if (key.fov_y != null) {
-    if (!plain(key.fov_y) || key.fov_y < 0.1 || key.fov_y > 170) wrong('"fov_y" is not 0.1 to 170 degrees');
+    if (!plain(key.fov_y) || key.fov_y < 0.1 || key.fov_y > 170) wrong('"fov_y" is not within 0.1 to 170 degrees');
     camera.fov = key.fov_y;
   }
-  if (key.scene_time != null && !plain(key.scene_time)) wrong('"scene_time" is no number');
+  if (key.scene_time != null && !plain(key.scene_time)) wrong('"scene_time" is not a number');
   if (key.world_to_camera && !key.position && !key.look_at) {
     const m = key.world_to_camera.flat?.(1);
     const matrix = Array.isArray(m) && [12, 16].includes(m.length) && m.every(plain);
-    if (!matrix) wrong('"world_to_camera" is no 3x4 or 4x4 matrix');
+    if (!matrix) wrong('"world_to_camera" is not a 3x4 or 4x4 matrix');
     // The rows of camera-from-world are the columns of world-from-camera.
     camera.quat = quatFromRows([0, 1, 2].map(c => [m[c], m[4 + c], m[8 + c]]));
     camera.position = [0, 1, 2].map(c => -(m[c] * m[3] + m[4 + c] * m[7] + m[8 + c] * m[11]));
     return camera;
   }
   if (!eye || !target || key.world_to_camera) wrong('give either "position" and "look_at", or "world_to_camera"');
-  if (norm(add(target, eye, -1)) < 1e-9) wrong('position and look_at are one point');
+  if (norm(add(target, eye, -1)) < 1e-9) wrong('position and look_at are the same point');
   const fov = camera.fov;
   camera.look(eye, target, vector(key.up) ?? camera.up);
   camera.fov = fov;

@@ -43,13 +43,13 @@ export class Interface {
     const p = this.player;
     this.play = tool('play', 'Play', () => p.toggle());
     this.back = tool('back', 'One frame back', () => p.step(-1), { class: 'tool wide' });
-    this.next = tool('next', 'One frame on', () => p.step(1), { class: 'tool wide' });
+    this.next = tool('next', 'One frame forward', () => p.step(1), { class: 'tool wide' });
     this.loopTool = tool('loop', 'Loop', () => this.setLoop(!p.loop), { class: 'tool wide', 'aria-pressed': 'true' });
     this.now = h('b', {}, '0:00.00');
     this.end = h('span', { class: 'of' }, ' / 0:00.00');
     this.timeLabel = h('div', { class: 'time', 'aria-hidden': 'true' }, this.now, this.end);
     this.speed = choice('Speed', SPEEDS.map(s => [s, `${s}×`]), s => { p.speed = +s; }, { class: 'speed' });
-    this.channel = segments('Picture', CHANNELS.map(c => [c, CHANNEL_NAMES[c]]), c => p.setChannel(c),
+    this.channel = segments('Channel', CHANNELS.map(c => [c, CHANNEL_NAMES[c]]), c => p.setChannel(c),
       { class: 'roomy' });
     const opener = (name, label, id) => tool(name, label, () => this.open(this.#panel === id ? null : id),
       { 'aria-expanded': 'false', 'aria-haspopup': 'dialog' });
@@ -58,8 +58,8 @@ export class Interface {
       view: opener('view', 'View and settings', 'view'),
     };
     this.full = tool('full', 'Full screen', () => this.fullscreen());
-    this.xrTool = tool('headset', 'Look through the headset', () => this.xr?.('immersive-vr'), { hidden: true });
-    this.arTool = tool('room', 'Stand it in your room; tap the floor to move it', () => this.xr?.('immersive-ar'), { hidden: true });
+    this.xrTool = tool('headset', 'View in VR', () => this.xr?.('immersive-vr'), { hidden: true });
+    this.arTool = tool('room', 'View in AR; tap the floor to place the scene', () => this.xr?.('immersive-ar'), { hidden: true });
     this.helpTool = tool('help', 'Keys and gestures', () => this.toggleHelp(), { class: 'tool wide' });
     this.#scrub();
     const spare = this.embed ? [] : [this.channel, this.openers.cameras, this.openers.view, this.helpTool];
@@ -139,7 +139,7 @@ export class Interface {
     on('statechange', () => this.#stateChanged());
     on('error', e => this.#error(e.detail.error));
     on('leftout', e => this.quiet || this.toast(
-      `Too large for this device: the ${e.detail.gaussians.toLocaleString('en-GB')} least important Gaussians are left out`, 3 * TOAST));
+      `Too large for this device: ${e.detail.gaussians.toLocaleString('en-GB')} Gaussians of least importance are left out`, 3 * TOAST));
     on('trouble', e => this.quiet || this.toast(e.detail.error.what ?? e.detail.error.message, 3 * TOAST));
     on('poster', e => this.setPoster(e.detail.blob));
     on('viewed', e => { this.toast(`Camera ${e.detail.number + 1} · ${e.detail.name ?? ''}`); this.refresh(); });
@@ -291,8 +291,8 @@ export class Interface {
   showEmpty() {
     this.notice.replaceChildren(h('section', { class: 'card notice drop', 'aria-label': 'Open a scene' },
       h('div', { class: 'mark' }),
-      h('h2', {}, 'Open a moving scene'),
-      h('p', { class: 'note' }, 'Drop a .s4d file here. It stays on this computer.'),
+      h('h2', {}, 'Open a scene'),
+      h('p', { class: 'note' }, 'Drop a .s4d file here. It is not uploaded.'),
       button('Choose a file', () => this.pickFile(), { class: 'main' })));
     this.refresh();
   }
@@ -308,7 +308,7 @@ export class Interface {
   #showHint() {
     if (this.embed || this.hiddenControls || this.player.film || known(this.page)) return;
     const touch = matchMedia('(pointer: coarse)').matches;
-    this.hint.textContent = touch ? 'Drag to turn · pinch to come nearer' : 'Drag to turn · scroll to come nearer';
+    this.hint.textContent = touch ? 'Drag to turn · pinch to zoom' : 'Drag to turn · scroll to zoom';
     this.hint.classList.add('on');
     this.#timers.hint = setTimeout(() => this.#endHint(), HINT);
   }
@@ -397,14 +397,14 @@ export class Interface {
   fullscreen() {
     const host = this.root.getRootNode().host ?? this.root;
     if (document.fullscreenElement) document.exitFullscreen();
-    else host.requestFullscreen?.().catch(() => this.toast('The browser allows no full screen here'));
+    else host.requestFullscreen?.().catch(() => this.toast('The browser does not allow full screen here'));
   }
 
   async screenshot() {
     try {
       const name = (this.title.textContent || 'scene').replace(/[^\w-]+/g, '-').toLowerCase();
       save(await this.player.screenshot(), `${name}-${this.player.time.toFixed(2)}s.png`);
-      this.toast('Picture saved');
+      this.toast('Image saved');
     } catch (error) { this.toast(error.what ?? error.message, 2 * TOAST); }
   }
 
@@ -439,7 +439,7 @@ export class Interface {
     const p = this.player;
     if (p.film) p.stopFilm();
     else if (p.track.keys.length > 1) p.playFilm();
-    else this.toast('A path needs two keys: look somewhere and press K');
+    else this.toast('A path needs two keys: move the camera and press K');
   }
 
   bullet() {
@@ -451,7 +451,7 @@ export class Interface {
   async importPath(file) {
     try {
       this.player.track = await readPath(file, this.player.camera);
-      this.toast(`Path of ${this.player.track.keys.length} keys`);
+      this.toast(`Path with ${this.player.track.keys.length} keys`);
     } catch (error) { this.toast(`${file.name}: ${error.message}`, 4 * TOAST); }
     this.refresh();
   }

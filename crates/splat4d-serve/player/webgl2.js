@@ -95,9 +95,9 @@ export class WebGL2Backend {
     const gl = canvas.getContext('webgl2', options);
     if (!gl)
       throw new SceneError(
-        'This browser offers no WebGL2',
+        'This browser does not support WebGL2',
         '',
-        'Switch on hardware acceleration, or use another browser.',
+        'Turn on hardware acceleration, or use another browser.',
       );
     this.#canvas = canvas;
     this.#gl = gl;
@@ -105,7 +105,7 @@ export class WebGL2Backend {
       event.preventDefault();
       if (this.#destroyed) return;
       this.#wake();
-      onlost?.(new SceneError('The graphics device was taken away', '', 'Reload the page.'));
+      onlost?.(new SceneError('The graphics device was lost', '', 'Reload the page.'));
     };
     canvas.addEventListener('webglcontextlost', this.#lost);
     const full = gl.getExtension('EXT_color_buffer_float');
@@ -134,7 +134,7 @@ export class WebGL2Backend {
     this.#timer = new Timer(gl);
     this.#order = new Order(NEAR, (answer) => this.#ordered(answer));
     this.#schedule = new Schedule(this.#order);
-    check(gl, 'The graphics memory did not suffice to begin');
+    check(gl, 'Too little graphics memory to start');
   }
 
   /// The WebGL2 context (a headset's session needs it).
@@ -174,7 +174,7 @@ export class WebGL2Backend {
       per = (degree + 1) ** 2 - 1,
       rows = Math.ceil((count * per) / WIDTH);
     const row = this.#paletteRows;
-    if (row + rows > this.#maxRows) throw new SceneError('The palettes are too many for this graphics card');
+    if (row + rows > this.#maxRows) throw new SceneError('Too many palettes for this graphics card');
     if (row + rows > this.#paletteHeight) {
       const height = Math.min(Math.max(row + rows, 2 * this.#paletteHeight), this.#maxRows);
       this.#palette = this.#enlarged(this.#palette, gl.RGBA8UI, row, height);

@@ -130,7 +130,7 @@ export class WebGPUBackend {
     }
     const { info = {} } = adapter;
     if (hardware && (info.isFallbackAdapter || SOFTWARE.test(`${info.architecture} ${info.description}`))) {
-      throw new SceneError('WebGPU would be computed by the processor', '', 'Let the player use WebGL2.');
+      throw new SceneError('WebGPU would run on the CPU', '', 'Let the player use WebGL2.');
     }
     // Everything fits the default limits; larger ones only make room for more Gaussians and larger pictures.
     const requiredLimits = {};
@@ -139,7 +139,7 @@ export class WebGPUBackend {
     }
     const requiredFeatures = ['timestamp-query'].filter((f) => adapter.features.has(f));
     const refused = (e) =>
-      new SceneError('The graphics driver refuses WebGPU', e.message, 'Update it, or use WebGL2.', e);
+      new SceneError('The graphics driver rejects WebGPU', e.message, 'Update it, or use WebGL2.', e);
     let device;
     try {
       device = await adapter.requestDevice({ requiredLimits, requiredFeatures });
@@ -161,7 +161,7 @@ export class WebGPUBackend {
     const context = failure ? null : canvas.getContext('webgpu');
     if (!context) {
       device.destroy();
-      throw refused(failure ?? new Error('the canvas has a context of another kind'));
+      throw refused(failure ?? new Error('the canvas already has a context of another type'));
     }
     backend.#attach(canvas, context);
     return backend;
@@ -196,7 +196,7 @@ export class WebGPUBackend {
     });
     device.onuncapturederror = (event) => {
       event.preventDefault();
-      this.#fail('The graphics driver refused a command', event.error.message);
+      this.#fail('The graphics driver rejected a command', event.error.message);
     };
   }
 

@@ -212,7 +212,7 @@ fn scene(shared: &Shared, request: &Parts) -> Response<Body> {
             response
         }
         Wanted::Nothing => {
-            let mut response = text(StatusCode::RANGE_NOT_SATISFIABLE, "the range begins behind the end");
+            let mut response = text(StatusCode::RANGE_NOT_SATISFIABLE, "the range starts after the end");
             response.headers_mut().insert(header::CONTENT_RANGE, value(&format!("bytes */{}", version.length)));
             response
         }
@@ -224,7 +224,7 @@ fn events(shared: &Shared, request: &Parts) -> Response<Body> {
         return whole(Bytes::new(), "text/event-stream");
     }
     let Ok(place) = shared.listeners.clone().try_acquire_owned() else {
-        let mut response = text(StatusCode::SERVICE_UNAVAILABLE, "too many pages are listening");
+        let mut response = text(StatusCode::SERVICE_UNAVAILABLE, "too many pages are connected");
         response.headers_mut().insert(header::RETRY_AFTER, HeaderValue::from_static("5"));
         return response;
     };
@@ -240,7 +240,7 @@ fn matches(list: &HeaderValue, etag: &str) -> bool {
 }
 
 fn missing() -> Response<Body> {
-    text(StatusCode::NOT_FOUND, "there is nothing here")
+    text(StatusCode::NOT_FOUND, "not found")
 }
 
 #[cfg(test)]

@@ -79,7 +79,7 @@ impl Editing {
         }
         let one = |name: &str| request.headers.get(name).and_then(|v| v.to_str().ok());
         if request.headers.get_all(header::ORIGIN).iter().count() != 1 {
-            return Some((StatusCode::FORBIDDEN, "a page says its origin once"));
+            return Some((StatusCode::FORBIDDEN, "duplicate Origin header"));
         }
         if one("sec-fetch-site").is_some_and(|site| site != "same-origin") {
             return Some((StatusCode::FORBIDDEN, "only the player's own page may edit"));
@@ -87,7 +87,7 @@ impl Editing {
         let json =
             one("content-type").is_some_and(|t| t.split(';').next().is_some_and(|t| t.trim() == "application/json"));
         if !json {
-            return Some((StatusCode::UNSUPPORTED_MEDIA_TYPE, "edits are application/json"));
+            return Some((StatusCode::UNSUPPORTED_MEDIA_TYPE, "expected edits as application/json"));
         }
         let length = one("content-length").and_then(|l| l.parse::<usize>().ok());
         if length.is_some_and(|l| l > MAX_BODY) {
@@ -97,7 +97,7 @@ impl Editing {
     }
 }
 
-const TOO_LARGE: (StatusCode, &str) = (StatusCode::PAYLOAD_TOO_LARGE, "a list of edits has at most a megabyte");
+const TOO_LARGE: (StatusCode, &str) = (StatusCode::PAYLOAD_TOO_LARGE, "a list of edits has at most 1 MB");
 
 /// Compares in a time that does not tell where two texts differ.
 fn same(a: &[u8], b: &[u8]) -> bool {
@@ -117,7 +117,7 @@ pub(crate) async fn answer(scene: &Scene, editing: &Editing, request: &Parts, bo
     let Ok(asked) = serde_json::from_slice::<Value>(&asked) else {
         return text(StatusCode::BAD_REQUEST, "invalid JSON");
     };
-    let place = editing.places.clone().acquire_owned().await.expect("it is never closed");
+    let place = editing.places.clone().acquire_owned().await.expect("a bracket or string is not closed");
     let (sender, told) = oneshot::channel();
     let work = editing.answer.clone();
     let spawned = std::thread::Builder::new().name("splat4d-edit".into()).spawn(move || {
@@ -128,7 +128,7 @@ pub(crate) async fn answer(scene: &Scene, editing: &Editing, request: &Parts, bo
     // A panic of the work ends its thread, and with it the channel.
     let done = if spawned.is_ok() { told.await.ok() } else { None };
     match done {
-        None => text(StatusCode::INTERNAL_SERVER_ERROR, "the edit failed; the program's terminal says more"),
+        None => text(StatusCode::INTERNAL_SERVER_ERROR, "the edit failed; the terminal of splat4d shows the reason"),
         Some(Err(error)) => refused(&error),
         Some(Ok(EditAnswer { mut told, scene: fresh })) => {
             if let Some(bytes) = fresh {
@@ -150,7 +150,7 @@ fn refused(error: &Error) -> Response<Body> {
 async fn read(mut body: Incoming) -> Result<Bytes, (StatusCode, &'static str)> {
     let mut all = Vec::new();
     while let Some(frame) = poll_fn(|cx| http_body::Body::poll_frame(Pin::new(&mut body), cx)).await {
-        let frame = frame.map_err(|_| (StatusCode::BAD_REQUEST, "the edits were cut short"))?;
+        let frame = frame.map_err(|_| (StatusCode::BAD_REQUEST, "the edits are truncated"))?;
         if let Ok(data) = frame.into_data() {
             if all.len() + data.len() > MAX_BODY {
                 return Err(TOO_LARGE);

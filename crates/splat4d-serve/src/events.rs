@@ -240,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn who_returns_gets_what_is_new() {
+    fn reconnecting_clients_get_new_events() {
         let hub = Hub::new();
         for i in 0..5 {
             hub.publish(&News::Step(json!({ "iteration": i })));

@@ -38,19 +38,19 @@ impl Guard {
         let known = request.method == Method::GET || request.method == Method::HEAD;
         let posts = posts && request.method == Method::POST;
         if !known && !posts {
-            return Err(refusal(StatusCode::METHOD_NOT_ALLOWED, "only GET and HEAD are answered"));
+            return Err(refusal(StatusCode::METHOD_NOT_ALLOWED, "only GET and HEAD are supported"));
         }
         if request.version < Version::HTTP_11 {
-            return Err(refusal(StatusCode::HTTP_VERSION_NOT_SUPPORTED, "HTTP/1.1 is needed"));
+            return Err(refusal(StatusCode::HTTP_VERSION_NOT_SUPPORTED, "HTTP/1.1 is required"));
         }
         // A full address in the request line is for proxies, which this server is not.
         if request.uri.authority().is_some() {
-            return Err(refusal(StatusCode::BAD_REQUEST, "this is no proxy"));
+            return Err(refusal(StatusCode::BAD_REQUEST, "not a proxy"));
         }
         let mut hosts = request.headers.get_all(header::HOST).iter();
         let host = hosts.next().filter(|_| hosts.next().is_none());
         let Some(host) = host.and_then(|h| h.to_str().ok()?.parse::<Authority>().ok()) else {
-            return Err(refusal(StatusCode::BAD_REQUEST, "one Host is needed"));
+            return Err(refusal(StatusCode::BAD_REQUEST, "expected one Host header"));
         };
         if host.as_str().contains('@') || !self.knows(host.host()) {
             return Err(refusal(
@@ -114,7 +114,7 @@ mod tests {
     }
 
     #[test]
-    fn a_told_host_is_known_and_addresses_are_no_names() {
+    fn a_given_host_is_accepted_and_addresses_are_not_names() {
         let open = Guard::new("Workstation", true);
         for host in ["workstation:4400", "192.168.1.7:4400", "[fe80::1]:4400", "localhost"] {
             assert_eq!(ask(&open, host, None), Ok(()), "{host}");

@@ -75,7 +75,7 @@ impl Page<'_> {
                         ErrorKind::Unsupported,
                         format!("a scene of {} MB does not fit into one page", bytes.len() >> 20),
                     )
-                    .remedy("Keep it as a file beside the page with --link FILE."));
+                    .remedy("Keep it as a separate file with --link FILE."));
                 }
                 out.reserve(bytes.len() / 3 * 4 + bytes.len() / LINE + (1 << 20));
                 out += "<script type=\"text/plain\" id=\"splat4d-scene\">\n";

@@ -78,7 +78,7 @@ impl Scene {
                 };
                 // Before it is opened: that alone waits, where a pipe has no writer.
                 if !std::fs::metadata(&path).map_err(fail)?.is_file() {
-                    return Err(Error::input("is not a file").at(path.display()).remedy("Name a .s4d file."));
+                    return Err(Error::input("is not a file").at(path.display()).remedy("Give a .s4d file."));
                 }
                 let file = File::open(&path).map_err(fail)?;
                 let meta = file.metadata().map_err(fail)?;

@@ -166,7 +166,7 @@ fn the_player_comes_compressed_where_that_is_understood() {
 }
 
 #[test]
-fn a_folder_of_the_player_is_read_at_every_request_and_nothing_beside_it() {
+fn the_player_folder_is_read_at_every_request_and_no_other_file() {
     let folder = tempfile::tempdir().unwrap();
     let player = folder.path().join("player");
     std::fs::create_dir(&player).unwrap();
@@ -254,7 +254,7 @@ fn paths_lead_nowhere_else() {
     ] {
         assert_eq!(get(&server, target).status, 404, "{target}");
     }
-    assert_eq!(ask(&server, "GET", "http://localhost/", &[]).status, 400, "no proxy");
+    assert_eq!(ask(&server, "GET", "http://localhost/", &[]).status, 400, "not a proxy");
 }
 
 /// Requests as broken clients and curious strangers send them.
@@ -538,7 +538,7 @@ fn a_page_with_the_token_edits() {
 }
 
 #[test]
-fn nobody_else_edits() {
+fn edits_need_token_and_origin() {
     let asked = Arc::default();
     let server = editor(&asked);
     let good = br#"{"do": "x"}"#;

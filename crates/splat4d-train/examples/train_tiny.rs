@@ -13,7 +13,7 @@ use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LifeKind, Params, SH, Time};
 use splat4d_train::capture::frames::{Frames, Picture};
 use splat4d_train::init;
-use splat4d_train::methods::{Plan, program};
+use splat4d_train::methods::Plan;
 use splat4d_train::recipe::Recipe;
 use splat4d_train::step::loss::TrainLoss;
 use splat4d_train::step::trainer::{Settings, Trainer};
@@ -96,7 +96,6 @@ fn main() -> Result<()> {
         recipe.set(knob)?;
     }
     let plan = Plan {
-        recipe: recipe.resolve(),
         extent: 3.3,
         center: [0.0; 3],
         clip: [0.0, (TIMES - 1) as f64 / FPS],
@@ -105,22 +104,23 @@ fn main() -> Result<()> {
         fixed_cameras: CAMERAS,
         moments: (0..TIMES).map(|k| (k as f64 / FPS, CAMERAS)).collect(),
         masks: false,
+        ..recipe.plan()
     };
-    let program = program(plan.recipe.run.motion.as_str())?;
-    let seeds = init::seeds(&plan, &made, None, true)?;
-    let scene = init::scene(&plan, program.as_ref(), &seeds, [0.0; 3], truth.up)?;
+    let program = recipe.program()?;
+    let seeds = init::seeds(&plan, &recipe.init, &made, None, true)?;
+    let scene = init::scene(&plan, &recipe.init, program.as_ref(), &seeds, [0.0; 3], truth.up)?;
     let mut trainer = Trainer::new(
         scene,
         program.stages(&plan),
         Arc::new(made),
         Box::new(Renderer::new(RenderConfig::default())),
-        TrainLoss::photometric(plan.recipe.loss.dssim),
+        TrainLoss::photometric(plan.common.loss.dssim),
         Settings {
             seed: 0,
             limits: Limits {
-                cap: plan.recipe.densify.max_cap,
+                cap: plan.common.densify.max_cap,
                 extent: plan.extent,
-                min_opacity: plan.recipe.densify.min_opacity,
+                min_opacity: plan.common.densify.min_opacity,
             },
             background: [0.0; 3],
             sh_degree: 0,

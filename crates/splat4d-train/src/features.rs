@@ -49,10 +49,10 @@ fn truth(capture: &Capture, frame: usize, channels: Option<usize>) -> Result<Fea
     match channels {
         Some(n) if n != found.channels => {
             let (camera, path) = (&capture.cameras[of.camera].name, of.features.as_ref());
-            Err(Error::input(format!("the picture of features has {} channels, others {n}", found.channels))
+            Err(Error::input(format!("the image of features has {} channels, others {n}", found.channels))
                 .at(path.map_or_else(String::new, |p| p.display().to_string()))
                 .at(format!("camera {camera}, frame {}", of.index))
-                .remedy("Write the same channels for all pictures"))
+                .remedy("Write the same channels for all images"))
         }
         _ => Ok(found),
     }
@@ -157,9 +157,9 @@ pub fn learn(
 ) -> Result<Vec<f64>> {
     let frames = featured(capture, &capture.train);
     let Some(&first) = frames.first() else {
-        return Err(Error::input("no training picture of the capture has features")
+        return Err(Error::input("no training image of the capture has features")
             .at(capture.root.display())
-            .remedy("Give cameras of capture.json `features` (pictures of features): docs/labels.md"));
+            .remedy("Give cameras of capture.json `features` (images of features): docs/labels.md"));
     };
     let channels = truth(capture, first, None)?.channels;
     for layer in &mut scene.layers {
@@ -379,6 +379,6 @@ mod tests {
         }
         capture.frames.iter_mut().for_each(|f| f.features = None);
         let said = learn(&mut wall(), &capture, 1, &mut |_, _| {}).unwrap_err().to_string();
-        assert!(said.contains("no training picture") && said.contains("docs/labels.md"), "{said}");
+        assert!(said.contains("no training image") && said.contains("docs/labels.md"), "{said}");
     }
 }

@@ -1,39 +1,59 @@
-//! Files of the user, opened: regular ones only.
+//! Files of the user, opened: regular ones only, and no more of them than their length.
 
 use crate::text;
 use splat4d::{Error, Result};
 use std::fs::File;
+use std::io::Read;
 use std::path::Path;
 
 /// What to do about a file that cannot be read.
 const CHECK: &str = "Check that the file exists and may be read by you.";
 
-/// Opens a file to read. Errors: none is there; a folder, pipe or device, on which reading could wait or never end.
+/// Opens a file to read. Errors: none is there; a folder, pipe or device, on which reading could wait or never end; an empty file.
 pub fn open(path: &Path) -> Result<File> {
-    open_with(path, CHECK)
+    // Files of the kernel, such as /proc/kmsg, claim to be regular and empty; reading them may wait or never end.
+    match length(path, CHECK)? {
+        0 => {
+            Err(Error::input("is empty").at(path.display()).remedy("Give a file that holds something; write it again."))
+        }
+        _ => File::open(path).map_err(|e| cannot_read(path, e, CHECK)),
+    }
 }
 
-fn open_with(path: &Path, remedy: &str) -> Result<File> {
-    let fail = |e| Error::io("cannot be read", e).at(path.display()).remedy(remedy);
+/// The length of a regular file, bytes. Errors: none is there; it is a folder, pipe or device.
+fn length(path: &Path, remedy: &str) -> Result<u64> {
     // Before it is opened: that alone waits, where a pipe has no writer.
-    if !std::fs::metadata(path).map_err(fail)?.is_file() {
+    let file = std::fs::metadata(path).map_err(|e| cannot_read(path, e, remedy))?;
+    if !file.is_file() {
         return Err(Error::input("is not a regular file, but a folder, pipe or device")
             .at(path.display())
             .remedy("Give a file; write what comes through a pipe to one first."));
     }
-    File::open(path).map_err(fail)
+    Ok(file.len())
 }
 
-/// Reads a file. Errors: those of [`open`]; the disk's.
+fn cannot_read(path: &Path, error: std::io::Error, remedy: &str) -> Error {
+    Error::io("cannot be read", error).at(path.display()).remedy(remedy)
+}
+
+/// Reads a file. Errors: those of [`open`], but an empty file is no error; it does not fit into memory; the disk's.
 pub fn read(path: &Path) -> Result<Vec<u8>> {
     read_with(path, CHECK)
 }
 
 /// The same, with what to do about a file that is not there.
 pub(crate) fn read_with(path: &Path, remedy: &str) -> Result<Vec<u8>> {
-    let mut bytes = Vec::new();
-    let length = std::io::Read::read_to_end(&mut open_with(path, remedy)?, &mut bytes);
-    length.map_err(|e| Error::io("cannot be read", e).at(path.display()))?;
+    let (length, mut bytes) = (length(path, remedy)?, Vec::new());
+    let file = File::open(path).map_err(|e| cannot_read(path, e, remedy))?;
+    if length == 0 {
+        return Ok(bytes);
+    }
+    if usize::try_from(length).ok().is_none_or(|n| bytes.try_reserve_exact(n).is_err()) {
+        return Err(Error::input(format!("has {length} bytes, which do not fit into memory"))
+            .at(path.display())
+            .remedy(CHECK));
+    }
+    file.take(length).read_to_end(&mut bytes).map_err(|e| cannot_read(path, e, remedy))?;
     Ok(bytes)
 }
 
@@ -71,6 +91,17 @@ mod tests {
         for path in odd {
             let error = read(&path).unwrap_err().to_string();
             assert!(error.contains("regular file"), "{error}");
+        }
+    }
+
+    /// The kernel's files claim to be regular and empty. One of these has no end, one waits where the reader may open it.
+    #[test]
+    fn files_of_the_kernel_are_read_as_long_as_they_claim_to_be() {
+        for path in ["/proc/self/status", "/proc/self/pagemap", "/proc/kmsg"].map(Path::new) {
+            if path.exists() {
+                assert!(read(path).is_ok_and(|bytes| bytes.is_empty()) || File::open(path).is_err(), "{path:?}");
+                assert!(open(path).unwrap_err().to_string().contains("is empty"), "{path:?}");
+            }
         }
     }
 }

@@ -68,7 +68,7 @@ pub fn learn(
 ) -> Result<Vec<f64>> {
     let frames = labelled(capture, &capture.train, MOST_PICTURES);
     if frames.is_empty() || capture.labels.is_empty() {
-        return Err(Error::input("no training picture of the capture has labels")
+        return Err(Error::input("no training image of the capture has labels")
             .at(capture.root.display())
             .remedy("Give capture.json `labels` (names) and its cameras `labels` (masks): docs/labels.md"));
     }
@@ -291,11 +291,11 @@ mod tests {
     }
 
     #[test]
-    fn a_capture_without_masks_is_told_so() {
+    fn missing_masks_are_reported() {
         let folder = tempfile::tempdir().unwrap();
         let mut capture = capture(folder.path());
         capture.frames.iter_mut().for_each(|f| f.labels = None);
         let error = learn(&mut wall(), &capture, 1, &mut |_, _| {}).unwrap_err().to_string();
-        assert!(error.contains("no training picture") && error.contains("docs/labels.md"), "{error}");
+        assert!(error.contains("no training image") && error.contains("docs/labels.md"), "{error}");
     }
 }

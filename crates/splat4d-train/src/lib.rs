@@ -28,10 +28,8 @@
 //! | module | content |
 //! |---|---|
 //! | `settings.rs`, `settings/` | `settings!`: typed settings with defaults, ranges, units and documentation, declared next to what they set |
-//! | `recipe.rs`, `recipe/` | all settings of a run; TOML, `--set`, old names without tables |
 //! | `event.rs` | events that the trainer emits |
-//! | `files.rs`, `path_text.rs` | opens regular files only; paths that are not UTF-8 as text |
-//! | `output/` | files and folders that commands write: atomic writes (`write.rs`), one owner per folder by lock and heartbeat (`owner.rs`), the list of our files (`list.rs`), what a command may find and `--force` (`folder.rs`), separation from inputs (`place.rs`), runs without a list (`legacy.rs`) |
+//! | `path_text.rs`, `files.rs` | paths that are not UTF-8 as text; opens regular files only |
 //! | `keypoints/` | SIFT keypoints and the image filters that they need |
 //! | `capture/` | layouts read into one `Capture`, chosen by `layout.rs`; file lookup (`lookup.rs`), masks, findings (`account.rs`), pose conventions (`convention.rs`), depth, flow and tracks, photos or videos without times (`sequence.rs`), a model next to other poses (`beside.rs`), the image store with a byte budget, captures far from the origin (`offset.rs`), panoramas |
 //! | `capture/foreign/`, `capture/colmap/`, `capture/transforms/`, `capture/evidence/` | exports of Metashape, RealityScan, Polycam, Record3D; unregistered COLMAP images and 4DGaussians' multipleview; frames and times of `transforms*.json`; whether poses can be right |
@@ -43,9 +41,11 @@
 //! | `learner.rs`, `learner/` | `Learner`: scene, moments, statistics, and what cameras learn (exposure, poses, focal lengths, time offsets), which change together or not at all |
 //! | `upkeep/` | maintenance between steps, one operation per file: ADC with splits in time, MCMC, relocation, guided sampling, pruning, merging, nodes, opacity reset, Morton order, the split into static and dynamic layers |
 //! | `upkeep/worth/` | importance of every Gaussian in space and time, key masks |
-//! | `methods/`, `methods/control/` | how each motion model is learned: one list of `Program`s, each with its `Stage`s; the automatic choice (`auto.rs`), the filter around any model, losses on nodes |
+//! | `methods/`, `methods/control/` | how each motion model is learned: a `Program` with its `Stage`s; settings of all models (`common.rs`); the automatic choice (`auto.rs`), the filter around any model, losses on nodes |
 //! | `init/` | first Gaussians: points, depth maps and their velocities, points added along surfaces (`fill.rs`), visual hulls, random points in the common volume |
 //! | `step/` | one step: the fixed chain (`chain.rs`), channels for losses, pixel weights (`emphasis.rs`), image losses, the engines on CPU and device (`engine.rs`, `resident.rs`), the trainer, the search of time offsets (`clocks.rs`), the schedule (`pace.rs`) |
+//! | `recipe.rs`, `recipe/` | all settings of a run, and the programs and plans built from them (`parts.rs`); TOML, `--set`, old names without tables |
+//! | `output/` | files and folders that commands write: atomic writes (`write.rs`), one owner per folder by lock and heartbeat (`owner.rs`), the list of our files (`list.rs`), what a command may find and `--force` (`folder.rs`), separation from inputs (`place.rs`), runs without a list (`legacy.rs`) |
 //! | `run/` | the run on disk: open, start and resume, from checkpoint to checkpoint, rollback, points and flow found in images, checks of priors, memory estimate, `--minutes`, identity, metrics |
 //! | `run/chunks/` | long captures in chunks: budget, plan, shared layer, training of a chunk, ties to neighbours, join |
 //! | `blended.rs`, `labels.rs`, `features.rs` | values of Gaussians as images blend them; labels from masks by expectation-maximisation; feature channels by conjugate gradients |

@@ -6,9 +6,10 @@
 //! follow from `run.iterations` (see [`Recipe::resolve`]). Names without a table (`max_cap` for `densify.max_cap`), which
 //! recipes had before they had tables, are read as well.
 
+mod chunks;
 mod flat;
+pub(crate) mod parts;
 mod quality;
-mod replans;
 mod run;
 #[cfg(test)]
 mod tests;
@@ -20,16 +21,16 @@ use crate::learner::RefineSettings;
 use crate::loss::{LossSettings, TransportSettings};
 use crate::methods::{
     AppearanceSettings, ControlSettings, DeformSettings, FilterSettings, HexplaneSettings, LifeSettings,
-    Native4dSettings, RateSettings, SpacetimeSettings, SsmSettings, TrackedSettings,
+    Native4dSettings, RateSettings, SpacetimeSettings, SsmSettings, TrackedSettings, still,
 };
-use crate::run::chunks::ChunkSettings;
 use crate::settings::Table;
+use crate::step::replans::Replans;
 use crate::upkeep::{
-    AdcSettings, DensifySettings, FloaterSettings, GuidedSettings, McmcSettings, MergeSettings, NodeSettings,
+    AdcSettings, DensifySettings, FloaterSettings, GuidedSettings, LEAST, McmcSettings, MergeSettings, NodeSettings,
     OpacityResetSettings, PruneSettings, RelocateSettings, SplitSettings,
 };
+pub use chunks::ChunkSettings;
 pub use quality::Quality;
-pub use replans::{Replan, Replans};
 pub use run::{MotionName, RunSettings};
 pub use text::Idle;
 
@@ -94,6 +95,13 @@ impl Recipe {
     pub fn with(mut self, change: impl FnOnce(&mut Self)) -> Self {
         change(&mut self);
         self
+    }
+
+    /// The largest number of Gaussians, of the least that small captures have: what grows or shrinks with many Gaussians
+    /// goes by it. At least 1, and 1 for scenes that move, for which nothing else was measured.
+    pub(crate) fn crowd(&self) -> f64 {
+        let many = self.run.motion == still::NAME && self.densify.max_cap > LEAST;
+        if many { self.densify.max_cap as f64 / LEAST as f64 } else { 1.0 }
     }
 
     /// Lets schedules that stand as they follow from the length follow from another one: what a run saved of them is set

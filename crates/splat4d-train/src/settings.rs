@@ -250,7 +250,7 @@ macro_rules! settings {
                     $(stringify!($field) => {
                         self.$field = $crate::settings::read(value, $crate::settings::settings!(@rule $($rule)?))?;
                     })*
-                    other => unreachable!("{} has no knob `{other}`: it was looked up", stringify!($name)),
+                    other => unreachable!("{} has no setting `{other}`: it was looked up", stringify!($name)),
                 }
                 Ok(())
             }

@@ -113,13 +113,12 @@ fn a_model_from_outside_trains_and_its_file_plays() {
         recipe.set(knob).unwrap();
     }
     let plan = Plan {
-        recipe: recipe.resolve(),
         extent: 4.4,
         clip: [0.0, (TIMES - 1) as f64 / FPS],
         fps: FPS,
         times: TIMES,
         fixed_cameras: CAMERAS,
-        ..Plan::default()
+        ..recipe.plan()
     };
     // The grass as it stands at rest, grey.
     let mut seeds = Seeds::default();
@@ -128,14 +127,14 @@ fn a_model_from_outside_trains_and_its_file_plays() {
         let place = rest[splat4d::scene::GEOMETRY].read::<3>(row, 0).map(f64::from);
         seeds.push(place, [0.5; 3], None);
     }
-    let scene = init::scene(&plan, &SwayProgram, &seeds, [1.0; 3], truth.up).unwrap();
+    let scene = init::scene(&plan, &recipe.init, &SwayProgram, &seeds, [1.0; 3], truth.up).unwrap();
     assert!(scene.layers[0].motion.capabilities().moves, "a model that says nothing may do anything");
     let mut trainer = Trainer::new(
         scene,
         SwayProgram.stages(&plan),
         made.clone(),
         Box::new(Renderer::new(RenderConfig::default())),
-        TrainLoss::photometric(plan.recipe.loss.dssim),
+        TrainLoss::photometric(plan.common.loss.dssim),
         Settings {
             seed: 0,
             limits: Limits { cap: 1000, extent: plan.extent, min_opacity: 0.005 },

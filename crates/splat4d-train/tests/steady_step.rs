@@ -8,7 +8,7 @@ use splat4d::scene::params::{LOG_SCALE, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LIFE, Planes, Time};
 use splat4d_train::capture::frames::{Frames, Picture};
 use splat4d_train::init;
-use splat4d_train::methods::{Plan, program};
+use splat4d_train::methods::Plan;
 use splat4d_train::recipe::Recipe;
 use splat4d_train::step::loss::TrainLoss;
 use splat4d_train::step::trainer::{Settings, Trainer};
@@ -90,7 +90,6 @@ fn trainer() -> Result<Trainer<'static>> {
         recipe.set(knob)?;
     }
     let plan = Plan {
-        recipe: recipe.resolve(),
         extent: 3.3,
         center: [0.0; 3],
         clip: [0.0, 0.1],
@@ -99,10 +98,11 @@ fn trainer() -> Result<Trainer<'static>> {
         fixed_cameras: 3,
         moments: (0..TIMES).map(|k| (0.1 * k as f64, 3)).collect(),
         masks: false,
+        ..recipe.plan()
     };
-    let program = program(plan.recipe.run.motion.as_str())?;
-    let seeds = init::seeds(&plan, &grey, None, true)?;
-    let mut scene = init::scene(&plan, program.as_ref(), &seeds, [0.0; 3], [0.0, 1.0, 0.0])?;
+    let program = recipe.program()?;
+    let seeds = init::seeds(&plan, &recipe.init, &grey, None, true)?;
+    let mut scene = init::scene(&plan, &recipe.init, program.as_ref(), &seeds, [0.0; 3], [0.0, 1.0, 0.0])?;
     // Some are alive at one of the times only, so that the active set is a list and not everything.
     let params = &mut scene.layers[0].params;
     let rng = Rng::new(3, "lives", 0);

@@ -241,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn a_gaussian_is_less_certain_the_fewer_pictures_show_it() {
+    fn uncertainty_rises_with_fewer_images() {
         let scene = scene();
         let (front, side) =
             (camera(), Camera { cam_from_world: Se3::look_at([4.0, 0.0, 0.0], [0.0; 3], [0.0, 1.0, 0.0]), ..camera() });

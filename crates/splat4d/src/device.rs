@@ -275,7 +275,7 @@ fn trusted(backend: &mut dyn Backend) -> Result<()> {
     }
     Err(Error::new(
         ErrorKind::Unsupported,
-        "the GPU's driver fails a self-test: its picture or its gradients are not the CPU's",
+        "the GPU's driver fails a self-test: its image or its gradients differ from the CPU's",
     )
     .remedy("Update the driver, or use the CPU."))
 }

@@ -122,7 +122,7 @@ mod tests {
     use std::io;
 
     #[test]
-    fn what_the_user_named_wrongly_is_told_from_what_the_machine_cannot() {
+    fn user_errors_and_machine_failures_are_distinguished() {
         let io = |kind: io::ErrorKind| Error::io("cannot be read", kind.into()).is_users();
         assert!(io(io::ErrorKind::NotFound) && io(io::ErrorKind::IsADirectory));
         assert!(!io(io::ErrorKind::PermissionDenied) && !io(io::ErrorKind::StorageFull) && !io(io::ErrorKind::Other));

@@ -64,7 +64,7 @@ pub(crate) fn error(
         let camera = &frame.source;
         if [truth.width, truth.height] != [camera.width, camera.height] {
             return Err(Error::input(format!(
-                "the flow has {}x{} pixels, its picture {}x{}",
+                "the flow has {}x{} pixels, its image {}x{}",
                 truth.width, truth.height, camera.width, camera.height
             ))
             .at(path.display())
@@ -115,7 +115,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn codes_become_pixels_and_other_pictures_are_refused() {
+    fn codes_become_pixels_and_other_images_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("cam00_0003.png");
         let codes = |u: f64, v: f64, b: u16| image::Rgb([(ZERO + STEPS * u) as u16, (ZERO + STEPS * v) as u16, b]);
@@ -128,7 +128,7 @@ mod tests {
         assert_eq!(found.vectors, [Some([3.5, -2.25]), None, Some([-400.0, 0.0])]);
         image::GrayImage::new(3, 1).save(&path).unwrap();
         assert!(read(&path).err().unwrap().to_string().contains("16-bit"));
-        std::fs::write(&path, "no picture").unwrap();
+        std::fs::write(&path, "no image").unwrap();
         assert!(read(&path).is_err());
     }
 }

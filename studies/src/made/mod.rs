@@ -95,7 +95,7 @@ fn write_truth(scene: &Scene, folder: &Path) -> anyhow::Result<()> {
 /// The error of a name that nothing has.
 pub(crate) fn unknown(name: &str) -> Error {
     let names: Vec<&str> = NAMES.iter().map(|n| n.0).collect();
-    Error::input(format!("there is no made-up capture `{name}`")).remedy(format!("Use one of: {}", names.join(", ")))
+    Error::input(format!("there is no synthetic capture `{name}`")).remedy(format!("Use one of: {}", names.join(", ")))
 }
 
 fn images(camera: usize) -> String {

@@ -153,7 +153,7 @@ impl Entry {
                 .remedy("Use letters, digits, hyphens and underscores."));
         }
         if self.downscale.quick == 0 || self.downscale.full == 0 {
-            return Err(Error::input("pictures cannot be reduced by 0").remedy("Give 1 for full size."));
+            return Err(Error::input("images cannot be reduced by 0").remedy("Give 1 for full size."));
         }
         self.hold_out.as_deref().map(str::parse::<HoldOut>).transpose()?;
         Ok(())

@@ -43,7 +43,7 @@ Examples:
 
 Steps are fixed (studies/suite.toml), so that results of machines with more or less to do compare. What was found is in
 DIR/results.json (after every capture: the same command goes on where it was stopped) and DIR/suite.md, runs are in
-DIR/runs. A cell is measured anew when the program, its recipe or its capture's place has changed.";
+DIR/runs. A cell is measured again when the program, its recipe or its capture's place has changed.";
 
 /// Train the recipe on a list of captures, each in so many steps, and compare
 #[derive(Debug, clap::Args)]
@@ -55,7 +55,7 @@ pub(crate) struct Args {
     /// Folder for what is found
     #[arg(short, long, value_name = "DIR", default_value = "runs/suite")]
     output: PathBuf,
-    /// Size of pictures and number of steps
+    /// Size of images and number of steps
     #[arg(long, value_enum, default_value = "quick")]
     tier: Tier,
     /// Only these captures [default: all of the list]

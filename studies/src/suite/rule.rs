@@ -96,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn a_broken_rule_is_told() {
+    fn a_broken_rule_is_reported() {
         let found = |steps: usize, psnr: f64, db: f64| Found {
             capture: "knight".into(),
             steps,

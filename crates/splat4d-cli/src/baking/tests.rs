@@ -85,7 +85,7 @@ fn cooked(motion: &Leaps, baking: &Baking) -> Cooked {
 }
 
 #[test]
-fn a_file_keeps_to_its_bytes_and_says_what_it_would_need() {
+fn a_file_keeps_its_size_limit_and_reports_the_size_it_would_need() {
     let bytes = 40_000;
     let Cooked { packed, likeness, needs } =
         cooked(&Leaps::default(), &Baking { bytes: Some(bytes), ..Baking::default() });

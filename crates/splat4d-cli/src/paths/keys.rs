@@ -50,13 +50,12 @@ impl Track {
 
     pub(super) fn parse(text: &str, up: [f64; 3]) -> Result<Self> {
         let value = json(text)?;
-        let fps =
-            match value.get("fps").filter(|v| !v.is_null()) {
-                None => None,
-                Some(v) => Some(v.as_f64().filter(|f| (0.1..=1000.0).contains(f)).ok_or_else(|| {
-                    Error::input(format!("\"fps\" is {v}")).remedy("Give frames a second, 0.1 to 1000.")
-                })?),
-            };
+        let fps = match value.get("fps").filter(|v| !v.is_null()) {
+            None => None,
+            Some(v) => Some(v.as_f64().filter(|f| (0.1..=1000.0).contains(f)).ok_or_else(|| {
+                Error::input(format!("\"fps\" is {v}")).remedy("Give frames per second, 0.1 to 1000.")
+            })?),
+        };
         let list = value.get("keys").and_then(Value::as_array).filter(|k| !k.is_empty() && k.len() <= MAX_KEYS);
         let list = list.ok_or_else(|| {
             Error::input("the list \"keys\" is missing, empty or too long")
@@ -142,7 +141,7 @@ fn read_key(value: &Value, scene_up: [f64; 3]) -> Result<Pose> {
     if let Some(key) = object.keys().find(|k| !KEYS.contains(&k.as_str())) {
         let near = nearest(key, &KEYS)
             .map_or_else(|| format!("Known: {}.", KEYS.join(", ")), |n| format!("Did you mean \"{n}\"?"));
-        return Err(Error::input(format!("the key \"{key}\" is not known")).remedy(near));
+        return Err(Error::input(format!("unknown key \"{key}\"")).remedy(near));
     }
     let number = |key: &str| match object.get(key).filter(|v| !v.is_null()) {
         None => Ok(None),
@@ -156,8 +155,9 @@ fn read_key(value: &Value, scene_up: [f64; 3]) -> Result<Pose> {
             Error::input(format!("\"{key}\" is {v}, not three finite numbers")).remedy("Write [x, y, z].")
         }),
     };
-    let time = number("time")?
-        .ok_or_else(|| Error::input("\"time\" is missing").remedy("Give the film's second of this key."))?;
+    let time = number("time")?.ok_or_else(|| {
+        Error::input("\"time\" is missing").remedy("Give the time of this key in the film, in seconds.")
+    })?;
     let fov_y = number("fov_y")?;
     if let Some(fov) = fov_y.filter(|f| !(0.1..=170.0).contains(f)) {
         return Err(Error::input(format!("\"fov_y\" is {fov}")).remedy("Give degrees, 0.1 to 170."));
@@ -167,13 +167,13 @@ fn read_key(value: &Value, scene_up: [f64; 3]) -> Result<Pose> {
         (None, Some(eye), Some(target)) => {
             let up = vector("up")?.unwrap_or(scene_up);
             if norm(sub(target, eye)) < 1e-9 || norm(up) < 1e-9 {
-                return Err(Error::input("position and look_at are one point, or up is zero")
+                return Err(Error::input("position and look_at are the same point, or up is zero")
                     .remedy("Look at a point away from the camera."));
             }
             Se3::look_at(eye, target, up)
         }
         _ => {
-            return Err(Error::input("the pose is incomplete or told twice")
+            return Err(Error::input("the pose is incomplete or given twice")
                 .remedy("Give either \"position\" and \"look_at\", or \"world_to_camera\"."));
         }
     };
@@ -245,7 +245,7 @@ mod tests {
             (r#"{"keys": [{"position": [0,0,3], "look_at": [0,0,0]}]}"#, "time"),
             (r#"{"keys": [{"time": 0, "position": [0,0,3], "lookat": [0,0,0]}]}"#, "\"look_at\""),
             (r#"{"keys": [{"time": 0, "position": [0,0,3]}]}"#, "incomplete"),
-            (r#"{"keys": [{"time": 0, "position": [0,0,3], "look_at": [0,0,3]}]}"#, "one point"),
+            (r#"{"keys": [{"time": 0, "position": [0,0,3], "look_at": [0,0,3]}]}"#, "the same point"),
             (r#"{"keys": [{"time": 0, "position": [0,0], "look_at": [0,0,3]}]}"#, "three"),
             (r#"{"keys": [{"time": 0, "position": [0,0,3], "look_at": [0,0,0], "fov_y": 0}]}"#, "fov_y"),
             (r#"{"fps": -1, "keys": [{"time": 0, "position": [0,0,3], "look_at": [0,0,0]}]}"#, "fps"),

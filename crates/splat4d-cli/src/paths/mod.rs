@@ -62,7 +62,7 @@ impl std::str::FromStr for Route {
             "train" => Ok(Self::Train),
             _ if text.starts_with("camera=") => Ok(Self::Camera(text["camera=".len()..].to_owned())),
             _ if text.to_ascii_lowercase().ends_with(".json") => Ok(Self::Keys(text.into())),
-            _ => Err("give orbit, test, train, camera=NAME or a key frame file FILE.json".into()),
+            _ => Err("expected orbit, test, train, camera=NAME or a key frame file FILE.json".into()),
         }
     }
 }
@@ -208,7 +208,7 @@ fn known_cameras(views: &[View]) -> String {
         }
     }
     match names.len() {
-        0 => "This file knows no cameras; use --path orbit or a key frame file.".into(),
+        0 => "This file has no cameras. Use --path orbit or a key frame file.".into(),
         n if n > 24 => format!("There are {n}, for instance {}.", names[..24].join(", ")),
         _ => format!("There are {}.", names.join(", ")),
     }

@@ -27,7 +27,7 @@ pub(super) fn run(
     console: &Console,
 ) -> Result<ModelScores> {
     if of.fitted.is_empty() {
-        return Err(Error::input(format!("{} forecasts no nodes that could be corrected", of.model.name()))
+        return Err(Error::input(format!("{} has no nodes that could be corrected", of.model.name()))
             .remedy("Choose another --model with --assimilate"));
     }
     let mut filter = Filter::new(&work.scene, &work.observed, work.clock);

@@ -26,6 +26,17 @@ pub struct Series {
     pub points: Points,
 }
 
+/// What a curve's stroke has in addition to its colour: from the seventh on, colours come again with dashes.
+fn dashes(i: usize) -> &'static str {
+    if i < COLORS { "" } else { ";stroke-dasharray:6 4" }
+}
+
+/// A curve's mark in the legend.
+fn mark(i: usize) -> String {
+    let color = format!("var(--c{})", i % COLORS);
+    if i < COLORS { color } else { format!("repeating-linear-gradient(90deg,{color} 0 5px,transparent 5px 8px)") }
+}
+
 /// Text that is safe inside HTML and attributes.
 pub(crate) fn escape(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
@@ -92,7 +103,7 @@ pub(crate) fn lines(series: &[Series], x_label: &str, unit: &str) -> Option<Stri
             let _ = write!(path, "{}{:.1} {:.1}", if k == 0 { "M" } else { "L" }, px(*x), py(*y));
         }
         let color = i % COLORS;
-        let _ = write!(svg, r#"<path class="line" style="stroke:var(--c{color})" d="{path}"/>"#);
+        let _ = write!(svg, r#"<path class="line" style="stroke:var(--c{color}){}" d="{path}"/>"#, dashes(*i));
         if let [(x, y)] = points.as_slice() {
             let _ =
                 write!(svg, r#"<circle style="fill:var(--c{color})" cx="{:.1}" cy="{:.1}" r="3"/>"#, px(*x), py(*y));
@@ -120,7 +131,7 @@ pub(crate) fn lines(series: &[Series], x_label: &str, unit: &str) -> Option<Stri
     if !named.is_empty() {
         svg.push_str(r#"<div class="legend">"#);
         for (i, name, _) in named {
-            let _ = write!(svg, r#"<span><i style="background:var(--c{})"></i>{}</span>"#, i % COLORS, escape(name));
+            let _ = write!(svg, r#"<span><i style="background:{}"></i>{}</span>"#, mark(*i), escape(name));
         }
         svg.push_str("</div>");
     }
@@ -264,6 +275,14 @@ mod tests {
         assert!(one.contains("<circle") && one.contains("a&lt;b") && !one.contains("NaN"));
         let many = lines(&series((0..100_000).map(|i| (f64::from(i), 1.0)).collect()), "step", "dB").unwrap();
         assert!(many.len() < 40_000, "a long run stays small: {}", many.len());
+        let seven: Vec<Series> =
+            (0..7).map(|i| Series { name: i.to_string(), points: vec![(0.0, f64::from(i))] }).collect();
+        let seven = lines(&seven, "step", "dB").unwrap();
+        assert_eq!(
+            (seven.matches("dasharray").count(), seven.matches("repeating").count()),
+            (1, 1),
+            "the seventh differs"
+        );
         assert!(bars(&[], 0.0, "x").is_none());
         assert!(!bars(&[("cam".into(), 3.0, "3 dB".into())], 3.0, "x").unwrap().contains("NaN"));
     }

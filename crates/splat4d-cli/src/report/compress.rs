@@ -3,7 +3,7 @@
 
 use super::chart::{Series, bars, escape, lines, short};
 use super::{panels, pictures};
-use crate::files::{grouped, human_bytes, human_seconds};
+use crate::files::{self, grouped, human_bytes, human_seconds};
 use crate::measure::Side;
 use crate::playable;
 use crate::run_folder::{COMPRESS as FILE, Run};
@@ -91,7 +91,7 @@ pub(super) fn section(out: &mut String, run: &Run) {
         return;
     }
     let Ok(told) = serde_json::from_value::<Compressed>(run.compressed.clone()) else {
-        let _ = writeln!(out, "<div class=\"warn\">{FILE} is not as this version of splat4d writes it.</div>");
+        let _ = writeln!(out, "<div class=\"warn\">{FILE} was written by another version of splat4d.</div>");
         return;
     };
     let level = told.level.map(|l| format!(", level {l}")).unwrap_or_default();
@@ -104,11 +104,11 @@ pub(super) fn section(out: &mut String, run: &Run) {
     sides(out, &told);
     panels(
         out,
-        "Where the bytes are, and how it was done",
+        "File size by part, and stages",
         [
             ("Bytes of scene.s4d", parts(&playable::of_run(&run.path))),
             ("Stages", stages(&told.stages)),
-            ("PSNR over size, as tried, dB", tried(&told.tried)),
+            ("PSNR over size, all trials, dB", tried(&told.tried)),
         ],
     );
     both_pictures(out, run, &told);
@@ -121,8 +121,8 @@ fn guard(out: &mut String, told: &Compressed) {
         let class = if passed { "note" } else { "warn" };
         let _ = writeln!(
             out,
-            "<p class=\"{class}\">{loss_db:.2} dB lost on the training views, {verdict} the {limit_db:.2} dB \
-             allowed.</p>"
+            "<p class=\"{class}\">{loss_db:.2} dB lost on the training views, {verdict} the limit of {limit_db:.2} \
+             dB.</p>"
         );
     }
     for warning in &told.warnings {
@@ -144,12 +144,12 @@ fn sides(out: &mut String, told: &Compressed) {
     let table: [Line<'_>; 15] = [
         ("Gaussians", &|s| Some(grouped(s.gaussians)), less(fair.gaussians as f64, after.gaussians as f64)),
         (
-            "alive at a frame, mean",
+            "active per frame, mean",
             &|s| Some(grouped(s.active_mean.round() as usize)),
             less(fair.active_mean, after.active_mean),
         ),
         (
-            "alive at a frame, most",
+            "active per frame, maximum",
             &|s| Some(grouped(s.active_max)),
             less(fair.active_max as f64, after.active_max as f64),
         ),
@@ -167,8 +167,8 @@ fn sides(out: &mut String, told: &Compressed) {
         ("flicker, 1/255", &|s| plain(3, s.flicker), gain(3, |s| s.flicker)),
         ("frames/s, end to end", &|s| plain(1, Some(s.fps)), more(fair.fps, after.fps)),
         ("frames/s, blending alone", &|s| plain(1, Some(s.raster_fps)), more(fair.raster_fps, after.raster_fps)),
-        ("pairs of pixel and Gaussian, million", &|s| plain(2, Some(1e-6 * s.pairs)), less(fair.pairs, after.pairs)),
-        ("bytes to first picture, ms", &|s| plain(1, Some(s.decode_ms)), less(fair.decode_ms, after.decode_ms)),
+        ("pixel-Gaussian pairs, million", &|s| plain(2, Some(1e-6 * s.pairs)), less(fair.pairs, after.pairs)),
+        ("bytes to first image, ms", &|s| plain(1, Some(s.decode_ms)), less(fair.decode_ms, after.decode_ms)),
     ];
     let columns: Vec<(&str, &Side)> = [
         ("before", Some(&told.before)),
@@ -195,18 +195,19 @@ fn sides(out: &mut String, told: &Compressed) {
         }
         out.push_str("</tr>");
     }
-    let against = if told.unpruned.is_some() { "the scene trained as many steps without pruning" } else { "before" };
+    let against =
+        if told.unpruned.is_some() { "the scene trained for the same steps without pruning" } else { "before" };
     let _ = write!(
         out,
-        "</table></div>\n<p class=\"note\">The change is against {against}. Frames a second are of this \
-         machine's CPU at the same size from the same cameras, all columns measured in turns; end to end is looking up \
-         who is alive, motion, drawing and 8-bit colours.</p>\n"
+        "</table></div>\n<p class=\"note\">The last column compares with {against}. Frames per second: this \
+         machine's CPU, same size and cameras, columns measured in turns. End to end includes the active set, \
+         motion, rendering and conversion to 8-bit colours.</p>\n"
     );
 }
 
 /// Bytes by kind of section, from the file's own index.
 fn parts(file: &Path) -> Option<String> {
-    let bytes = std::fs::read(file).ok()?;
+    let bytes = files::read(file).ok()?;
     let index = Index::parse(&bytes, Some(bytes.len() as u64)).ok()?;
     let mut by_kind: BTreeMap<Kind, u64> = BTreeMap::new();
     for entry in &index.sections {
@@ -280,8 +281,8 @@ fn both_pictures(out: &mut String, run: &Run, told: &Compressed) {
     if !shown.is_empty() {
         let _ = write!(
             out,
-            "<h2>Before and after</h2>\n<div class=\"views\">{shown}</div>\n<p class=\"note\">Difference: the \
-             mean of the channels, from none (dark) to {} of full scale and more (bright).</p>\n",
+            "<h2>Before and after</h2>\n<div class=\"views\">{shown}</div>\n<p class=\"note\">Difference: mean of \
+             the channels, from 0 (dark) to {} of full scale or more (bright).</p>\n",
             pictures::DIFFERENCE_WORDS
         );
     }

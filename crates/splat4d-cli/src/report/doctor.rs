@@ -37,9 +37,14 @@ fn page(report: &Report) -> String {
     }
     body.push_str("<h2>Findings, worst first</h2>\n");
     for f in &report.findings {
-        let text = format!("{} {} {}", f.what, f.looks, f.remedy);
         let class = if f.grade == Grade::Note { "note" } else { "warn" };
-        let _ = writeln!(body, "<div class=\"{class}\"><b>{}</b> {}</div>", word(f.grade), escape(text.trim()));
+        let _ = write!(body, "<div class=\"{class}\"><b>{}</b> {}", word(f.grade), escape(&f.what));
+        for (label, text) in
+            [("Effect", f.looks), ("Remedy", f.remedy.as_str())].into_iter().filter(|(_, t)| !t.is_empty())
+        {
+            let _ = write!(body, "<br><b>{label}:</b> {}", escape(text));
+        }
+        body.push_str("</div>\n");
     }
     if !report.leave_out.is_empty() {
         let _ = writeln!(body, "<h2>Leave out</h2>\n<p>{}</p>", escape(&report.leave_out.join(", ")));
@@ -50,7 +55,10 @@ fn page(report: &Report) -> String {
             let _ = writeln!(body, "<p class=\"note\">{}</p>", escape(left));
         }
     }
-    body.push_str("<h2>Cameras</h2>\n<div class=\"grid3\">");
+    body.push_str(
+        "<h2>Cameras</h2>\n<p class=\"note\">Images are medians over time, in which moving subjects are faint. Pixels are \
+         those of an image of 1920 pixels.</p>\n<div class=\"grid3\">",
+    );
     for camera in &report.cameras {
         let p = &camera.picture;
         let picture = RgbImage::from_raw(p.width as u32, p.height as u32, p.data.clone()).filter(|p| p.width() > 0);
@@ -67,8 +75,8 @@ fn page(report: &Report) -> String {
                 let _ = write!(body, "<tr><th>{name}</th><td>{}</td></tr>", escape(&value));
             }
         };
-        row("poses", camera.epipolar.map(|v| format!("{v:.2} px of 1920")));
-        row("clock", camera.offset.map(|[v, s]| format!("{:+.1} ± {:.1} ms", 1e3 * v, 1e3 * s)));
+        row("pose error", camera.epipolar.map(|v| format!("{v:.2} px of 1920")));
+        row("time offset", camera.offset.map(|[v, s]| format!("{:+.1} ± {:.1} ms", 1e3 * v, 1e3 * s)));
         row("exposure", camera.exposure.map(|e| e.map(|v| format!("{v:+.2}")).join(" ") + " stops"));
         row("sharpness", camera.sharpness.map(|v| format!("{v:.2} times the others'")));
         row("moved", camera.moved.map(|v| format!("{v:.2} px of 1920")));
@@ -93,9 +101,9 @@ fn pairs(report: &Report) -> String {
     }
     let number = |v: f64, digits: usize| if v.is_finite() { format!("{v:+.digits$}") } else { "–".to_owned() };
     let mut out = format!(
-        "<details><summary>{} pairs of pictures that show the same, the worst poses first</summary>\n<table>\
-         <tr><th>cameras</th><th>features</th><th>poses, px of 1920</th><th>second is brighter, stops (red green blue)</th>\
-         <th>as sharp</th></tr>\n",
+        "<details><summary>{} pairs of images with common features, worst poses \
+         first</summary>\n<table><tr><th>cameras</th><th>features</th><th>pose error, px at 1920</th><th>brightness \
+         of the second, stops (red green blue)</th><th>sharpness ratio</th></tr>\n",
         report.pairs.len()
     );
     for p in &report.pairs {
@@ -126,11 +134,11 @@ pub(crate) fn word(grade: Grade) -> &'static str {
 pub(crate) fn about(report: &Report) -> Vec<String> {
     let mut out = Vec::new();
     if let Some(share) = report.seen_by_three {
-        out.push(format!("Of the space in which something moves three cameras see {:.0} %.", 100.0 * share));
+        out.push(format!("Three cameras see {:.0} % of the space in which something moves.", 100.0 * share));
     }
     if let Some(training) = &report.training {
         out.push(format!(
-            "Training learns the motion model {} and takes about {} MB of memory.",
+            "Training uses the motion model {} and needs about {} MB of memory.",
             training.motion,
             training.memory.div_ceil(1 << 20)
         ));

@@ -3,6 +3,7 @@
 //! folder's files; missing files are missing in the page.
 
 pub mod chart;
+pub(crate) mod compare;
 pub(crate) mod compress;
 pub(crate) mod doctor;
 mod pictures;
@@ -16,11 +17,12 @@ pub(crate) use refined::refined_in_words;
 use serde_json::Value;
 use splat4d::Result;
 use splat4d_train::path_text::in_command;
+use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::PathBuf;
 
 const STYLE: &str = include_str!("style.css");
-/// Held-out views shown: every camera class and moment gets a glance, the page stays below 2 MB.
+/// Held-out views shown; the page stays below 2 MB.
 const VIEWS: usize = 8;
 /// Curves of single cameras; more would be a tangle.
 const CAMERA_CURVES: usize = 5;
@@ -49,7 +51,12 @@ fn page(run: &Run) -> String {
     conditions(&mut body, run);
     costs(&mut body, run);
     again(&mut body, run);
-    let title = escape(&run.name());
+    document(&run.name(), &body)
+}
+
+/// A whole page of a body.
+pub(crate) fn document(title: &str, body: &str) -> String {
+    let title = escape(title);
     format!(
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" \
          content=\"width=device-width, initial-scale=1\"><title>{title} · splat4d</title>\n<style>\n{STYLE}</style></head>\
@@ -68,7 +75,30 @@ fn header(out: &mut String, run: &Run) {
     if let Some(seconds) = run.number("seconds") {
         words.push(format!("trained in {} minutes", human_seconds(seconds)));
     }
-    let _ = writeln!(out, "<header><h1>{}</h1><p>{}</p></header>", escape(&run.name()), escape(&words.join(" · ")));
+    let (name, words) = (escape(&run.name()), escape(&words.join(" · ")));
+    let _ = writeln!(out, "<header><h1>{name}</h1><p>{words}</p>{}</header>", verdict(run));
+}
+
+/// The result in a sentence, and what to do with it.
+fn verdict(run: &Run) -> String {
+    let Some(psnr) = run.score("PSNR") else { return String::new() };
+    let mut out = format!("<p class=\"verdict\">Held-out views: {psnr:.2} dB PSNR");
+    if let Some(dynamic) = run.score("PSNR-dynamic") {
+        let _ = write!(out, ", dynamic regions {dynamic:.2} dB");
+        if let Some(still) = run.baseline("PSNR-dynamic") {
+            let (by, word) = ((dynamic - still).abs(), if dynamic < still { "worse" } else { "better" });
+            let _ = write!(out, ", {by:.2} dB {word} than a static scene");
+        }
+    }
+    out += ".</p><p>";
+    let place = escape(&in_command(&run.path));
+    if run.number("playback_bytes").is_some() {
+        let _ = write!(out, "Play it: <code>splat4d view {place}</code>. ");
+    }
+    if run.score("PSNR-dynamic").is_some() && run.baseline("PSNR-dynamic").is_none() {
+        let _ = write!(out, "Compare with a static scene: <code>splat4d eval {place} --baseline</code>.");
+    }
+    out + "</p>"
 }
 
 fn cards(out: &mut String, run: &Run) {
@@ -85,7 +115,7 @@ fn cards(out: &mut String, run: &Run) {
     for (class, key, digits, unit, name) in [
         ("main", "PSNR", 2, "dB", "PSNR, held-out views"),
         ("", "PSNR-aligned", 2, "dB", "PSNR, held-out cameras aligned"),
-        ("", "PSNR-cc", 2, "dB", "PSNR, each camera's colours corrected"),
+        ("", "PSNR-cc", 2, "dB", "PSNR, colours corrected per camera"),
         ("main", "PSNR-dynamic", 2, "dB", "PSNR of dynamic regions"),
         ("", "PSNR-foreground", 2, "dB", "PSNR of the foreground"),
         ("", "SSIM", 4, "", "SSIM"),
@@ -100,7 +130,7 @@ fn cards(out: &mut String, run: &Run) {
         }
     }
     if let (Some(ours), Some(still)) = (run.score("PSNR-dynamic"), run.baseline("PSNR-dynamic")) {
-        card("main", format!("{:+.2}", ours - still), "dB", "dynamic regions, over a static scene");
+        card("main", format!("{:+.2}", ours - still), "dB", "dynamic regions, against a static scene");
     }
     if let Some(n) = run.number("gaussians").or(run.metrics.last().map(|m| m.gaussians)) {
         card("", grouped(n as usize), "", "Gaussians");
@@ -108,7 +138,7 @@ fn cards(out: &mut String, run: &Run) {
     if let Some(bytes) = run.number("peak_memory").filter(|b| *b > 0.0) {
         let text = human_bytes(bytes as u64);
         let (value, unit) = text.split_once(' ').unwrap_or((&text, ""));
-        card("", value.into(), unit, "memory at most");
+        card("", value.into(), unit, "peak memory");
     }
     if let Some(seconds) = run.number("seconds") {
         card("", human_seconds(seconds), "min", "training time");
@@ -121,7 +151,7 @@ fn cards(out: &mut String, run: &Run) {
     }
     out.push_str("</div>\n");
     if run.results.is_some() && !["LPIPS", "LPIPS-vgg", "LPIPS-alex"].iter().any(|k| run.score(k).is_some()) {
-        out.push_str("<p class=\"note\">LPIPS was not computed: name its weights with --lpips-weights.</p>\n");
+        out.push_str("<p class=\"note\">LPIPS was not computed: give its weights with --lpips-weights.</p>\n");
     }
 }
 
@@ -130,7 +160,7 @@ fn findings(out: &mut String, run: &Run) {
     if findings.is_empty() {
         return;
     }
-    out.push_str("<h2>Worth knowing</h2>\n");
+    out.push_str("<h2>Findings</h2>\n");
     for finding in findings {
         let _ = writeln!(out, "<div class=\"warn\">{}</div>", escape(&finding));
     }
@@ -138,15 +168,15 @@ fn findings(out: &mut String, run: &Run) {
 
 fn film(out: &mut String, run: &Run) {
     if let Some(film) = pictures::film(&run.path) {
-        let _ = writeln!(out, "<h2>Through space and time</h2>\n{film}");
+        let _ = writeln!(out, "<h2>Orbit film</h2>\n{film}");
     }
 }
 
 fn views(out: &mut String, run: &Run) {
     let Some(folder) = run.pictures() else { return };
     let mut shown = String::new();
-    // One camera after the other would show one moment only: take views spread over the list of all.
-    for i in pictures::spread(run.views.len(), VIEWS) {
+    let place_of = |kind: &str, file: &str| Some(folder.strip_prefix(&run.path).ok()?.join(kind).join(file));
+    for i in worst(&run.views, VIEWS) {
         let view = &run.views[i];
         let pictures: Vec<Option<String>> = ["gt", "renders", "errors"]
             .iter()
@@ -162,8 +192,13 @@ fn views(out: &mut String, run: &Run) {
             _ => view.file.clone(),
         };
         let score = view.psnr.map(|p| format!("render, {p:.2} dB")).unwrap_or_else(|| "render".into());
-        for (picture, caption) in pictures.iter().zip([format!("truth, {place}"), score, "error".into()]) {
+        let captions = [("gt", format!("truth, {place}")), ("renders", score), ("errors", "error".into())];
+        for (picture, (kind, caption)) in pictures.iter().zip(captions) {
             let image = picture.as_ref().map(|p| format!("<img alt=\"{}\" src=\"{p}\">", escape(&caption)));
+            // The file itself, as long as the page lies in its run.
+            let image = image.zip(place_of(kind, &view.file)).map(|(image, place)| {
+                format!("<a href=\"{}\">{image}</a>", escape(&place.to_string_lossy().replace('\\', "/")))
+            });
             let _ = write!(
                 shown,
                 "<figure>{}<figcaption>{}</figcaption></figure>",
@@ -176,8 +211,8 @@ fn views(out: &mut String, run: &Run) {
     if !shown.is_empty() {
         let _ = write!(
             out,
-            "<h2>Views that training never saw</h2>\n<div class=\"views\">{shown}</div>\n<p class=\"note\">Error: the \
-             mean difference of the channels, from none (dark) to a quarter of full scale and more (bright).</p>\n"
+            "<h2>Held-out views, the worst of each camera first</h2>\n<div class=\"views\">{shown}</div>\n<p class=\"note\">Error: mean difference \
+             of the channels, from 0 (dark) to a quarter of full scale or more (bright).</p>\n"
         );
     }
 }
@@ -192,7 +227,27 @@ fn curves(out: &mut String, run: &Run) {
         ("Loss", lines(&series("", |m| m.loss), "step", "loss")),
         ("Gaussians", lines(&series("", |m| m.gaussians), "step", "Gaussians")),
     ];
-    panels(out, "How it learned", charts);
+    panels(out, "Training curves", charts);
+}
+
+/// Views to show: the worst of each camera, worst first, then the next worst of each.
+fn worst(views: &[ViewScore], count: usize) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..views.len()).collect();
+    order.sort_by(|&a, &b| {
+        let score = |i: usize| views[i].psnr.unwrap_or(f64::INFINITY);
+        score(a).total_cmp(&score(b))
+    });
+    let mut seen: BTreeMap<Option<&str>, usize> = BTreeMap::new();
+    let mut ranked: Vec<(usize, usize)> = order
+        .into_iter()
+        .map(|i| {
+            let rank = seen.entry(views[i].camera.as_deref()).or_default();
+            *rank += 1;
+            (*rank, i)
+        })
+        .collect();
+    ranked.sort_by_key(|r| r.0);
+    ranked.into_iter().take(count).map(|r| r.1).collect()
 }
 
 fn scores(out: &mut String, run: &Run) {
@@ -221,7 +276,7 @@ fn scores(out: &mut String, run: &Run) {
         rows.truncate(CAMERA_BARS);
     }
     let lowest = rows.iter().map(|r| r.1).fold(f64::INFINITY, f64::min);
-    let title = if all > CAMERA_BARS { "PSNR by camera, the weakest" } else { "PSNR by camera" };
+    let title = if all > CAMERA_BARS { "PSNR by camera, lowest first" } else { "PSNR by camera" };
     let by_camera = bars(&rows, (lowest - 5.0).max(0.0), title);
 
     let mut times: Vec<f64> = run.views.iter().filter_map(|v| v.time).collect();
@@ -242,11 +297,11 @@ fn scores(out: &mut String, run: &Run) {
         series.retain(|s| s.points.len() > 1 || s.name == "all");
     }
     let by_time = if times.len() > 1 { lines(&series, "seconds", "dB") } else { None };
-    panels(out, "Where and when it is good", [(title, by_camera), ("PSNR by time, dB", by_time)]);
+    panels(out, "Quality by camera and time", [(title, by_camera), ("PSNR by time, dB", by_time)]);
     if corrected {
         out.push_str(
-            "<p class=\"note\">In brackets: after the one affine colour matrix that suits all held-out views of the \
-             camera best. The rest of the error is no matter of white balance.</p>\n",
+            "<p class=\"note\">In brackets: after the best affine colour matrix for all held-out views of the \
+             camera. The remaining error is not caused by white balance.</p>\n",
         );
     }
 }
@@ -266,11 +321,11 @@ fn lives(out: &mut String, run: &Run) {
     let rows: Vec<(String, f64, String)> = counts.iter().enumerate().map(row).collect();
     // A scene in which all live for ever has nothing to tell.
     if counts.iter().filter(|n| **n > 0.0).count() > 1 {
-        let chart = bars(&rows, 0.0, "Gaussians by the share of the clip in which they can be seen");
+        let chart = bars(&rows, 0.0, "Gaussians by the share of the clip in which they are visible");
         panels(
             out,
-            "How long Gaussians live",
-            [("Share of all, by the part of the clip in which one can be seen", chart)],
+            "Lifespan of Gaussians",
+            [("Share of all Gaussians, by the part of the clip in which they are visible", chart)],
         );
     }
 }
@@ -301,7 +356,7 @@ fn conditions(out: &mut String, run: &Run) {
     if !rows.is_empty() {
         let head = ["views", "background", "step", "PSNR", "corrected", "SSIM", "instructions", "device"];
         let head = head.map(|h| format!("<th>{h}</th>")).concat();
-        let _ = write!(out, "<h2>What was measured</h2>\n<table><tr>{head}</tr>{rows}</table>\n");
+        let _ = write!(out, "<h2>Measurements</h2>\n<table><tr>{head}</tr>{rows}</table>\n");
     }
 }
 
@@ -331,29 +386,25 @@ fn costs(out: &mut String, run: &Run) {
         let _ = write!(table, "<tr><th>{}</th><td>{}</td></tr>", escape(name), escape(&value));
     };
     if total > 0.0 {
-        row("A step takes", format!("{} ms on average", short(total)));
+        row("Time per step", format!("{} ms on average", short(total)));
     }
     for (key, name) in [("evaluation_seconds", "Evaluation"), ("orbit_seconds", "Orbit film")] {
         if let Some(seconds) = run.number(key) {
             row(name, format!("{seconds:.1} s"));
         }
     }
-    for (key, name) in [("memory_estimate", "Memory, estimated before"), ("peak_memory", "Memory, at most")] {
+    for (key, name) in [("memory_estimate", "Memory, estimated"), ("peak_memory", "Peak memory")] {
         if let Some(bytes) = run.number(key).filter(|b| *b > 0.0) {
             row(name, human_bytes(bytes as u64));
         }
     }
     if let Some(seams) = run.info.get("seams").filter(|s| s.is_object()) {
         let flicker = |key: &str| seams.get(key).and_then(Value::as_f64).unwrap_or(f64::NAN);
-        let words = format!("{}/255, in their midst {}/255", short(flicker("across")), short(flicker("inside")));
-        row("Flicker where chunks meet", words);
+        let words = format!("{}/255, within chunks {}/255", short(flicker("across")), short(flicker("inside")));
+        row("Flicker at chunk boundaries", words);
     }
     let table = (!table.is_empty()).then(|| format!("<table>{table}</table>"));
-    panels(
-        out,
-        "What it cost",
-        [("A training step by stage", bars(&rows, 0.0, "time by stage")), ("Time and memory", table)],
-    );
+    panels(out, "Totals", [("Training step by stage", bars(&rows, 0.0, "time by stage")), ("Totals", table)]);
 }
 
 fn again(out: &mut String, run: &Run) {
@@ -388,8 +439,8 @@ fn again(out: &mut String, run: &Run) {
     if !lines.is_empty() {
         let _ = write!(
             out,
-            "<h2>Do it again</h2>\n<pre>{}</pre>\n<p class=\"note\">The same recipe gives the same bits with any number of \
-             threads on processors with the same instructions.</p>\n",
+            "<h2>Reproduce</h2>\n<pre>{}</pre>\n<p class=\"note\">The same recipe gives the same bits with any \
+             number of threads on processors with the same SIMD level.</p>\n",
             escape(&lines)
         );
     }
@@ -410,8 +461,8 @@ fn panels<const N: usize>(out: &mut String, title: &str, charts: [(&str, Option<
         })
         .collect();
     if !shown.is_empty() {
-        let columns = N.clamp(2, 3);
-        let _ = write!(out, "<h2>{}</h2>\n<div class=\"grid{columns}\">{shown}</div>\n", escape(title));
+        // Two columns: charts of one width have letters of one size.
+        let _ = write!(out, "<h2>{}</h2>\n<div class=\"grid2\">{shown}</div>\n", escape(title));
     }
 }
 

@@ -1,7 +1,7 @@
 //! Pictures inside the page: held-out views beside their truth and error, as small JPEGs in data URIs.
 
 use crate::draw::color_rgb;
-use crate::files::base64;
+use crate::files::{self, base64};
 use crate::video::Rgb;
 use image::RgbImage;
 use image::codecs::jpeg::JpegEncoder;
@@ -59,7 +59,7 @@ pub(super) fn reduced(picture: RgbImage) -> Option<String> {
 
 /// The orbit film: inside the page if small, else linked beside it.
 pub(super) fn film(run: &Path) -> Option<String> {
-    film_file(&orbit(run)?, "The scene, seen from a camera that moves around it")
+    film_file(&orbit(run)?, "The scene, from a camera on an orbit")
 }
 
 /// A film's file: inside the page if small, else linked beside it.
@@ -69,7 +69,7 @@ pub(super) fn film_file(path: &Path, alt: &str) -> Option<String> {
     let name = path.file_name()?.to_string_lossy().into_owned();
     let source = if small {
         let kind = if video { "video/mp4" } else { "image/png" };
-        format!("data:{kind};base64,{}", base64(&std::fs::read(path).ok()?))
+        format!("data:{kind};base64,{}", base64(&files::read(path).ok()?))
     } else {
         name
     };

@@ -35,7 +35,10 @@ pub(crate) struct Told {
     pub scene: &'static str,
 }
 
-/// What a model's forecast is worth; numbers by horizon begin with the first predicted frame.
+/// The model that every other is compared with: the last observed frame stays.
+const BASELINE: &str = "freeze";
+
+/// Scores of a model's forecast; numbers by horizon begin with the first predicted frame.
 #[derive(Clone, Debug, Default, Serialize)]
 pub(crate) struct ModelScores {
     pub name: String,
@@ -74,7 +77,8 @@ pub(crate) fn write(folder: &Path, run: &str, told: &Told, films: &[(String, Pat
 fn page(run: &str, told: &Told, films: &[(String, PathBuf)]) -> String {
     let mut body = String::new();
     let words = format!(
-        "{} frames observed, {} predicted, {} of them with pictures · {} nodes on {} moving Gaussians · scene of {}",
+        "{} frames observed, {} predicted, {} of them with images · {} nodes on {} moving Gaussians · the exported \
+         scene uses {}",
         told.observed_frames,
         told.horizon,
         told.pictured,
@@ -85,10 +89,10 @@ fn page(run: &str, told: &Told, films: &[(String, PathBuf)]) -> String {
     let _ = writeln!(body, "<header><h1>{}, predicted</h1><p>{}</p></header>", escape(run), escape(&words));
     if told.pictured < told.horizon {
         let beyond = told.horizon - told.pictured;
-        let _ = writeln!(body, "<p class=\"note\">{beyond} predicted frames have no picture to compare with.</p>");
+        let _ = writeln!(body, "<p class=\"note\">{beyond} predicted frames have no image to compare with.</p>");
     }
     let all: Vec<&ModelScores> = told.models.iter().chain(&told.assimilated).chain(&told.oracle).collect();
-    table(&mut body, &all);
+    table(&mut body, &all, told.models.len());
     let seconds = |i: usize| (i + 1) as f64 / told.fps;
     let series = |of: &dyn Fn(&ModelScores) -> Vec<Option<f64>>| -> Vec<Series> {
         let one = |m: &&ModelScores| Series {
@@ -101,27 +105,27 @@ fn page(run: &str, told: &Told, films: &[(String, PathBuf)]) -> String {
     let errors = |e: &Option<Vec<f64>>| e.iter().flatten().map(|x| Some(*x)).collect::<Vec<_>>();
     panels(
         &mut body,
-        "By horizon",
+        "By forecast horizon",
         [
             ("PSNR of dynamic regions, dB", curve(&|m| m.psnr_dynamic_by_horizon.clone(), "dB")),
             ("PSNR, dB", curve(&|m| m.psnr_by_horizon.clone(), "dB")),
-            ("Distance of known points from the truth, scene units", curve(&|m| errors(&m.track_error), "units")),
-            ("Distance of nodes from the oracle's, scene units", curve(&|m| errors(&m.node_error), "units")),
+            ("Error of tracked points, scene units", curve(&|m| errors(&m.track_error), "units")),
+            ("Distance of nodes to the oracle's, scene units", curve(&|m| errors(&m.node_error), "units")),
         ],
     );
     if !films.is_empty() {
-        body.push_str("<h2>Truth, left, and prediction</h2>\n");
+        body.push_str("<h2>Truth (left) and prediction</h2>\n");
         for (camera, path) in films {
-            if let Some(film) = pictures::film_file(path, "Truth beside prediction") {
+            if let Some(film) = pictures::film_file(path, "Truth (left) and prediction") {
                 let _ = writeln!(body, "<p class=\"note\">camera {}</p>\n{film}", escape(camera));
             }
         }
     }
     body.push_str(
-        "<p class=\"note\">Where things move: pixels that differ from the last observed picture of the camera. Skill: 1 minus the \
-         mean squared error there over the baseline's; 0 is no better, below 0 is worse. Wins: share of the views nearer to \
-         the truth than the baseline's. Back-test: node error of forecasts from three moments of the observed part, \
-         by which the scene's model was chosen; nothing later had a say in it.</p>\n",
+        "<p class=\"note\">Dynamic regions: pixels that differ from the last observed image of the camera. Skill: 1 \
+         minus the ratio of the mean squared error there to the baseline's; 0 means equal, below 0 means worse. \
+         Wins: share of views nearer to the truth than the baseline's. Back-test: node error of forecasts from three \
+         times of the observed part. It selects the model of the exported scene; later frames are not used.</p>\n",
     );
     format!(
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" \
@@ -131,7 +135,8 @@ fn page(run: &str, told: &Told, films: &[(String, PathBuf)]) -> String {
     )
 }
 
-fn table(out: &mut String, models: &[&ModelScores]) {
+/// Columns without a value are left out; of the first `compared` rows the best is marked, and the baseline named.
+fn table(out: &mut String, models: &[&ModelScores], compared: usize) {
     let heads = [
         "model",
         "PSNR, dB",
@@ -141,17 +146,21 @@ fn table(out: &mut String, models: &[&ModelScores]) {
         "wins over freeze",
         "over velocity",
         "back-test",
-        "last known points off by",
-        "spread: error / σ",
-        "fitted in",
-        "left the scene",
+        "error of points, last frame",
+        "error / predicted σ",
+        "fitting time",
+        "diverged",
     ];
-    let head = heads.map(|h| format!("<th>{h}</th>")).concat();
+    let score = |m: &ModelScores| m.psnr_dynamic.or(m.psnr);
+    let scored = models.iter().take(compared).enumerate().filter_map(|(i, m)| Some((i, score(m)?)));
+    let best = scored.max_by(|a, b| a.1.total_cmp(&b.1)).map(|b| b.0);
     let number = |x: Option<f64>, digits: usize| x.map_or_else(String::new, |x| format!("{x:.digits$}"));
     let percent = |x: Option<f64>| x.map_or_else(String::new, |x| format!("{:.0} %", 100.0 * x));
-    let row = |m: &&ModelScores| {
-        let cells = [
-            m.name.clone(),
+    let cells = |(i, m): (usize, &&ModelScores)| {
+        let role = if Some(i) == best { " · best" } else { "" };
+        let baseline = if m.name == BASELINE { " · baseline" } else { "" };
+        [
+            format!("{}{baseline}{role}", m.name),
             number(m.psnr, 2),
             number(m.psnr_dynamic, 2),
             number(m.skill_over_freeze, 3),
@@ -163,9 +172,16 @@ fn table(out: &mut String, models: &[&ModelScores]) {
             number(m.calibration.map(|c| c.ratio), 2),
             human_seconds(m.seconds_fit),
             m.diverged.map_or_else(String::new, |h| format!("at frame {h}")),
-        ];
-        format!("<tr>{}</tr>", cells.map(|c| format!("<td>{}</td>", escape(&c))).concat())
+        ]
     };
-    let rows: String = models.iter().map(row).collect();
+    let rows: Vec<[String; 12]> = models.iter().enumerate().map(cells).collect();
+    let filled: Vec<usize> = (0..heads.len()).filter(|&k| rows.iter().any(|r| !r[k].is_empty())).collect();
+    let head: String = filled.iter().map(|&k| format!("<th>{}</th>", heads[k])).collect();
+    let line = |(i, row): (usize, &[String; 12])| {
+        let class = if Some(i) == best { " class=\"best\"" } else { "" };
+        let cells: String = filled.iter().map(|&k| format!("<td>{}</td>", escape(&row[k]))).collect();
+        format!("<tr{class}>{cells}</tr>")
+    };
+    let rows: String = rows.iter().enumerate().map(line).collect();
     let _ = writeln!(out, "<div class=\"panel\"><table><tr>{head}</tr>{rows}</table></div>");
 }

@@ -20,8 +20,8 @@ pub(crate) fn refined_in_words(refined: &Value) -> Option<String> {
         let (turned, shifted) = (sorted("degrees"), sorted("share"));
         let (worst, far) = (turned.first()?, shifted.first()?);
         words.push(format!(
-            "cameras turned by {:.2}° at the median, most by {:.2}° ({}); moved by {:.2} % of the rig's radius, most by \
-             {:.2} % ({})",
+            "cameras rotated by {:.2}° (median), at most {:.2}° ({}); moved by {:.2} % of the rig's radius (median), \
+             at most {:.2} % ({})",
             number(turned[turned.len() / 2], "degrees"),
             number(worst, "degrees"),
             worst["camera"].as_str()?,
@@ -34,7 +34,7 @@ pub(crate) fn refined_in_words(refined: &Value) -> Option<String> {
         let by_focal = sorted("focal");
         let worst = by_focal.first()?;
         words.push(format!(
-            "focal lengths changed by {:.2} % at the median, most by {:.2} % ({})",
+            "focal lengths changed by {:.2} % (median), at most {:.2} % ({})",
             100.0 * number(by_focal[by_focal.len() / 2], "focal"),
             100.0 * number(worst, "focal"),
             worst["camera"].as_str()?,
@@ -44,7 +44,7 @@ pub(crate) fn refined_in_words(refined: &Value) -> Option<String> {
         let by_time = sorted("offset");
         let worst = by_time.first()?;
         words.push(format!(
-            "clocks shifted by {:.1} ms at the median, most by {:.1} ms ({})",
+            "time offsets changed by {:.1} ms (median), at most {:.1} ms ({})",
             1e3 * number(by_time[by_time.len() / 2], "offset"),
             1e3 * number(worst, "offset"),
             worst["camera"].as_str()?,
@@ -64,13 +64,13 @@ pub(super) fn section(out: &mut String, run: &Run) {
     rows.sort_by(|a, b| far(b).total_cmp(&far(a)));
     let _ = writeln!(
         out,
-        "<h2>Where cameras were found</h2>\n<p class=\"note\">{}</p>\n<table><tr><th>camera</th><th>turned, °</th><th>moved, % \
-         of the radius</th><th>focal length, %</th><th>clock, ms</th></tr>",
+        "<h2>Refined cameras</h2>\n<p class=\"note\">{}</p>\n<table><tr><th>camera</th><th>rotated, °</th><th>moved, \
+         % of the radius</th><th>focal length, %</th><th>time offset, ms</th></tr>",
         escape(&words)
     );
     for row in rows.into_iter().take(super::CAMERA_BARS) {
         let name = row["camera"].as_str().unwrap_or_default();
-        let name = row["frame"].as_u64().map_or_else(|| name.to_owned(), |frame| format!("{name}, picture {frame}"));
+        let name = row["frame"].as_u64().map_or_else(|| name.to_owned(), |frame| format!("{name}, frame {frame}"));
         let _ = writeln!(
             out,
             "<tr><td>{}</td><td>{:.3}</td><td>{:.3}</td><td>{:.3}</td><td>{:.2}</td></tr>",

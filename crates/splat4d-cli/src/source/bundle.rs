@@ -37,8 +37,8 @@ pub(crate) fn open(folder: &Path, fps: f64) -> Result<Option<Source>> {
     let beside = file.parent().unwrap_or(Path::new("."));
     if let Some(network) = NETWORKS.iter().find(|name| beside.join(name).is_file()) {
         source.warnings.say(format!(
-            "{network} lies beside the Gaussians: a network that is not read here moves or makes them, so that this is not \
-             the scene as it was trained. Export it as a sequence of .ply files"
+            "{network} is next to the Gaussians: a network that splat4d does not read moves or generates them, so \
+             this is not the scene as trained. Export it as a sequence of .ply files"
         ));
     }
     Ok(Some(source))
@@ -130,7 +130,7 @@ fn read_sog(folder: &Path) -> Result<(Params, splat4d::format::Warnings)> {
 /// The file beside `index` that it names. Errors: the name leads out of the folder.
 fn within(index: &Path, name: &str) -> Result<PathBuf> {
     if Path::new(name).components().any(|c| !matches!(c, Component::Normal(_))) {
-        return Err(Error::input(format!("names the file `{name}`, which lies elsewhere"))
+        return Err(Error::input(format!("refers to the file `{name}`, which is outside its folder"))
             .at(index.display())
             .remedy("Export the scene again."));
     }

@@ -115,7 +115,7 @@ enum Measured {
 }
 
 fn rounds(text: &str) -> std::result::Result<usize, String> {
-    text.parse().ok().filter(|n| (1..=1000).contains(n)).ok_or_else(|| "give a number from 1 to 1000".into())
+    text.parse().ok().filter(|n| (1..=1000).contains(n)).ok_or_else(|| "expected a number from 1 to 1000".into())
 }
 
 /// Instruction levels as the command line names them.
@@ -151,7 +151,7 @@ pub(crate) fn run(args: &Args, threads: Option<u16>, console: &Console) -> anyho
     }
     // What cannot work is said before anything takes time.
     if (args.sweep || args.beside.is_some()) && args.device != Measured::Gpu {
-        let error = Error::new(ErrorKind::BadInput, "--sweep and --beside are of a GPU");
+        let error = Error::new(ErrorKind::BadInput, "--sweep and --beside need a GPU");
         return Err(error.remedy("Add --device gpu.").into());
     }
     let earlier = args.against.as_deref().map(rows::read).transpose()?;

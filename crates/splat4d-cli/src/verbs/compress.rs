@@ -160,7 +160,7 @@ fn place(args: &Args, source: &Path, console: &Console) -> Result<PathBuf> {
 
 fn number(text: &str, fits: impl Fn(f64) -> bool, need: &str) -> Result<f64, String> {
     let value: Option<f64> = text.parse().ok().filter(|v| fits(*v));
-    value.ok_or_else(|| format!("give {need}"))
+    value.ok_or_else(|| format!("expected {need}"))
 }
 
 fn share(text: &str) -> Result<f64, String> {

@@ -258,12 +258,12 @@ fn asked(args: &Args) -> Result<(Option<(Pattern, PathBuf)>, Target)> {
         return Err(Error::input("--time or --fps is out of range").remedy("Give a plain, sensible number."));
     }
     if args.world && !matches!(target, Target::Dialect(_)) {
-        return Err(Error::input(format!("a {} stores the offset beside its positions", target.name()))
+        return Err(Error::input(format!("a {} stores the offset separately from its positions", target.name()))
             .at(args.output.display())
             .remedy("Leave --world out, or write .ply."));
     }
     if target == Target::Playback && (args.time.is_some() || args.frames) {
-        return Err(Error::input("a playback file holds the whole take")
+        return Err(Error::input("a playback file contains the whole clip")
             .at(args.output.display())
             .remedy("Leave --time or --frames out."));
     }
@@ -303,7 +303,7 @@ pub(crate) fn write(args: &Args, mut source: Source, console: &Console) -> anyho
     if matches!(target, Target::Dialect(_)) && !args.world && scene.offset != [0.0; 3] {
         let [x, y, z] = scene.offset;
         console.warn(&format!(
-            "positions are relative to the scene's offset ({x} {y} {z}); .ply can hold those of the world: --world."
+            "positions are relative to the scene's offset ({x} {y} {z}); .ply can store world positions: --world."
         ));
     }
     if let Some((pattern, _)) = pattern {
@@ -315,7 +315,7 @@ pub(crate) fn write(args: &Args, mut source: Source, console: &Console) -> anyho
         None => {
             let start = scene.clip[0];
             console.warn(&format!(
-                "{} holds one time: {start} s, the clip's start. Choose another with --time, or use {}.",
+                "{} stores one time: {start} s, the start of the clip. Choose another with --time, or use {}.",
                 target.name(),
                 either(&[&["--frames"], &written(|d| d.moves)[..]].concat())
             ));
@@ -332,7 +332,7 @@ pub(crate) fn write(args: &Args, mut source: Source, console: &Console) -> anyho
         None => scene,
     };
     if whole.is_empty() {
-        return Err(Error::input("nothing is alive at that time: the file would be empty")
+        return Err(Error::input("no Gaussian is active at that time: the file would be empty")
             .at(args.input.display())
             .remedy(format!("Choose a --time from {} to {} s.", scene.clip[0], scene.clip[1]))
             .into());
@@ -439,7 +439,7 @@ fn write_frames(
     owned.finished();
     console.clear();
     console.say(&format!(
-        "{} files, {fps} a second, from {} to {} s, {} together",
+        "{} files, {fps} per second, from {} to {} s, {} in total",
         times.len(),
         times[0],
         times[times.len() - 1],
@@ -459,7 +459,7 @@ fn rotate(scene: &mut Scene<f32>, up: Option<Up>, target: Target, console: &Cons
     };
     let Some(wanted) = up.map_or(custom, Up::direction) else { return IDENTITY };
     let Some(r) = rotation_between(scene.up, wanted) else {
-        console.warn("the scene does not say which way is up: its axes stay as they are.");
+        console.warn("the scene has no up direction: its axes are not changed.");
         return IDENTITY;
     };
     if 3.0 - (r[0][0] + r[1][1] + r[2][2]) <= NO_ROTATION {
@@ -468,7 +468,7 @@ fn rotate(scene: &mut Scene<f32>, up: Option<Up>, target: Target, console: &Cons
     let axis = |v: [f64; 3]| format!("({:.3} {:.3} {:.3})", v[0], v[1], v[2]);
     let old = axis(scene.up);
     scene.rotate(&r);
-    console.say(&format!("turned: up was {old}, is {}; --up keep leaves axes as they are", axis(wanted)));
+    console.say(&format!("axes turned: up was {old}, is now {}; --up keep does not turn them", axis(wanted)));
     r
 }
 
@@ -504,7 +504,7 @@ impl Writer {
                 let mut warnings = dialect.write(scene, &self.options, &mut out)?;
                 if !scene.labels.is_empty() {
                     warnings
-                        .say(format!("{} labels are left out: the format has no place for them", scene.labels.len()));
+                        .say(format!("{} labels are left out: the format does not support them", scene.labels.len()));
                 }
                 warnings
             }

@@ -105,7 +105,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let title = title(&source, &args.scene);
     edits.check(&title)?;
     if edits.steps.is_empty() && args.count.is_none() {
-        return Err(Error::input("there is nothing to do")
+        return Err(Error::input("nothing to do")
             .remedy("Give a list of edits, or an option such as --delete; see --help.")
             .into());
     }
@@ -144,7 +144,7 @@ fn tell(text: &str, scene: &splat4d::layers::Scene<f32>, context: &dyn Context, 
     console.clear();
     console.say(&format!("{text}: {} of {} Gaussians", grouped(all), grouped(scene.len())));
     for (t, n) in times.iter().zip(&seen) {
-        console.say(&format!("{t:>9.3} s  {} can be seen", grouped(*n)));
+        console.say(&format!("{t:>9.3} s  {} visible", grouped(*n)));
     }
     console.emit(&json!({"type": "count", "selection": text, "gaussians": all, "of": scene.len(),
         "seen": times.iter().zip(&seen).map(|(t, n)| json!([t, n])).collect::<Vec<_>>()}));

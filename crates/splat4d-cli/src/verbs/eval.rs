@@ -5,14 +5,14 @@ use crate::deadline::Deadline;
 use crate::device::{self, Device};
 use crate::finish;
 use crate::run_folder::{Run, cameras_json};
-use crate::source::read_scene;
+use crate::source::{Source, not_empty, read_scene};
 use serde_json::{Value, json};
 use splat4d::ErrorKind;
 use splat4d_train::eval::run::{EvalOptions, Measured};
-use splat4d_train::output::OutputFolder;
-use splat4d_train::recipe::MotionName;
-use splat4d_train::run::{self, TrainOptions};
-use std::path::PathBuf;
+use splat4d_train::output::{Input, Mixes, OutputFolder, Request};
+use splat4d_train::recipe::{MotionName, Recipe};
+use splat4d_train::run::{self, TrainOptions, open_capture};
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 const EXAMPLES: &str = "\
@@ -23,6 +23,7 @@ Examples:
   splat4d eval runs/mutant --background both   on white and on black
   splat4d eval runs/mutant --split val         validation views
   splat4d eval runs/take --truth calibrated    distance of its cameras from ground truth
+  splat4d eval other.ply --capture my-take     any scene on a capture's held-out views
 
 Results are in RUN/results.json and RUN/per_view.json (keys as in 3DGS), images in RUN/test/ours_N. --split and \
 --background only compute scores; results of another split or background have their own entry and folder, such as \
@@ -78,9 +79,24 @@ impl Split {
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
-    /// The run
+    /// The run; with --capture any scene: a file, numbered files, a run
     #[arg(value_name = "RUN", required_unless_present = "model")]
     run: Option<PathBuf>,
+    /// Score any scene on the held-out views of this capture
+    #[arg(long, value_name = "CAPTURE", conflicts_with_all = ["baseline", "no_film", "truth", "model"], help_heading = "Any scene")]
+    capture: Option<PathBuf>,
+    /// Views to measure with --capture, as `train` takes them [default: the capture's convention]
+    #[arg(long, value_name = "VIEWS", requires = "capture", help_heading = "Any scene")]
+    hold_out: Option<String>,
+    /// Divide the images' size by this with --capture
+    #[arg(long, value_name = "K", requires = "capture", help_heading = "Any scene")]
+    downscale: Option<usize>,
+    /// Folder for the scores and images of --capture [default: they are only printed]
+    #[arg(short, long, value_name = "FOLDER", requires = "capture", help_heading = "Any scene")]
+    output: Option<PathBuf>,
+    /// Replace an earlier output of this command in the folder
+    #[arg(long, requires = "output", help_heading = "Any scene")]
+    force: bool,
     /// Train a static scene with the same recipe and steps (once, in RUN/baseline) and compare
     #[arg(long)]
     baseline: bool,
@@ -113,6 +129,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let lpips_weights = args.measure.lpips_weights.clone();
     let measure = finish::Measure { lpips_weights, device: device::chosen(args.device, "measuring", console) };
     let path = args.run.as_ref().or(args.model.as_ref()).expect("clap asks for a run");
+    if let Some(capture) = &args.capture {
+        return on_capture(args, path, capture, &measure, console);
+    }
     let run = Run::open(path)?;
     run.scene_file()?;
     let folder = OutputFolder::amend(path, "eval")?;
@@ -136,6 +155,58 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     finish::all(path, &measure, &Deadline::default(), console)
 }
 
+/// Scores any scene on the views of a capture.
+fn on_capture(
+    args: &Args,
+    path: &Path,
+    capture: &Path,
+    measure: &finish::Measure,
+    console: &Console,
+) -> anyhow::Result<()> {
+    let mut recipe = Recipe::default();
+    let wanted = [
+        ("hold_out", args.hold_out.as_ref().map(|v| format!("{v:?}"))),
+        ("downscale", args.downscale.map(|k| k.to_string())),
+    ];
+    for (name, value) in wanted {
+        value.map_or(Ok(()), |value| recipe.set(&format!("{name}={value}")))?;
+    }
+    let source = Source::open(path)?.finite();
+    not_empty(&source.scene, path)?;
+    source.warnings.lines().iter().for_each(|w| console.warn(&format!("{w}.")));
+    if let Some(run) = &source.run {
+        recipe.appearance.antialias = run.recipe()?.appearance.antialias;
+    }
+    let folder = args.output.as_ref().map(|output| {
+        let inputs = [
+            Input { may_hold: source.run.is_some(), ..Input::new(path, "the scene") },
+            Input::new(capture, "the capture"),
+        ];
+        let asked = format!("{} on {}", path.display(), capture.display());
+        let request =
+            Request { command: "eval", inputs: &inputs, asked: &asked, force: args.force, mixes: Mixes::Anything };
+        OutputFolder::begin(output, &request).map(|(folder, _)| folder)
+    });
+    let folder = folder.transpose()?;
+    let split = args.split.unwrap_or(Split::Test).measured();
+    let backgrounds = args.background.map_or(&[][..], Background::colors);
+    let out = folder.as_ref().map(OutputFolder::path);
+    finish::foreign_scores(
+        source.scene,
+        &open_capture(capture, &recipe)?,
+        &recipe,
+        out,
+        split,
+        backgrounds,
+        measure,
+        console,
+    )?;
+    if let Some(folder) = folder {
+        folder.finished();
+    }
+    Ok(())
+}
+
 /// Trains the still scene unless it is there, and measures it.
 fn baseline(out: &OutputFolder, run: &Run, measure: &finish::Measure, console: &Console) -> anyhow::Result<()> {
     let path = out.path();
@@ -156,9 +227,10 @@ fn baseline(out: &OutputFolder, run: &Run, measure: &finish::Measure, console: &
         console.clear();
         if outcome.interrupted {
             return Err(splat4d::Error::new(ErrorKind::Interrupted, "the still scene is unfinished")
-                .remedy("Run `splat4d eval --baseline` again; it trains anew.")
+                .remedy("Run `splat4d eval --baseline` again; it trains again.")
                 .into());
         }
+        crate::interrupt::ends("the still scene is kept, and the same command makes what is missing");
     }
     let scene = read_scene(&Run::open(&folder)?.scene_file()?)?;
     let evaluation = finish::scores(&folder, &scene, measure, console)?;

@@ -119,8 +119,8 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     if args.sequence.is_none() && args.tracks.is_none() {
         let given = [("--fps", args.fps), ("--from", args.from), ("--to", args.to)];
         if let Some((name, _)) = given.iter().find(|(_, v)| v.is_some()) {
-            return Err(Error::input(format!("{name} is of a sequence or of tracks"))
-                .remedy("Add --sequence FOLDER or --tracks FILE, or choose one moment with --time.")
+            return Err(Error::input(format!("{name} applies to a sequence or to tracks"))
+                .remedy("Add --sequence FOLDER or --tracks FILE, or choose one time with --time.")
                 .into());
         }
     }
@@ -130,13 +130,13 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     if args.html || named("html") || named("htm") {
         if args.label.is_some() {
             return Err(Error::input("a page shows the whole file")
-                .remedy("Make a file of what has the label first: splat4d edit RUN --crop 'label(NAME)' -o part.s4d.")
+                .remedy("First write a file with that label only: splat4d edit RUN --crop 'label(NAME)' -o part.s4d.")
                 .into());
         }
         return page(path, args, console);
     }
     if args.link.is_some() {
-        return Err(Error::input("--link is of a page").remedy("Add -o NAME.html.").into());
+        return Err(Error::input("--link needs a page").remedy("Add -o NAME.html.").into());
     }
     let mut source = Source::open(path)?;
     if let Some(name) = args.label.as_ref().filter(|_| args.tracks.is_none()) {
@@ -176,7 +176,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         owned.finished();
         console.clear();
         let (from, to) = (times[0], times[times.len() - 1]);
-        console.say(&format!("{} files, {fps} a second, from {from} to {to} s", times.len()));
+        console.say(&format!("{} files, {fps} per second, from {from} to {to} s", times.len()));
         console.written(folder);
         return Ok(());
     }
@@ -191,7 +191,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let n = write(time, out)?;
     if n == 0 {
         console.warn(&format!(
-            "nothing is alive at {time} s: the file is empty. The scene lasts from {} to {} s.",
+            "no Gaussian is active at {time} s: the file is empty. The scene lasts from {} to {} s.",
             scene.clip[0], scene.clip[1]
         ));
     }
@@ -224,21 +224,21 @@ fn followed(source: &Source, args: &Args, [points, out]: [&PathBuf; 2], console:
     let views = source.views()?;
     let asked = asked::read(&files::read_text(points)?, &views, scene.clip).map_err(|e| e.at(points.display()))?;
     if asked.len().saturating_mul(times.len()).saturating_mul(3) > MOST_NUMBERS {
-        return Err(Error::input(format!("{} points at {} moments are too many", asked.len(), times.len()))
-            .remedy("Ask for fewer points, or take fewer moments with --fps, --from or --to.")
+        return Err(Error::input(format!("{} points at {} times are too many", asked.len(), times.len()))
+            .remedy("Give fewer points, or fewer times with --fps, --from or --to.")
             .into());
     }
     let answer = Answer::of(scene, asked, &views, &times, &mut |done, of| console.phase("following", done, of));
     console.clear();
     if answer.missing() > 0 {
         console.warn(&format!(
-            "at {} of {} points nothing is there to follow: they are left out",
+            "{} of {} points are not on any Gaussian: they are left out",
             answer.missing(),
             answer.len()
         ));
     }
     files::write(out, if json { answer.to_json() } else { answer.to_csv() }.as_bytes())?;
-    console.say(&format!("{} points at {} moments", files::grouped(answer.len()), times.len()));
+    console.say(&format!("{} points at {} times", files::grouped(answer.len()), times.len()));
     console.emit(&json!({
         "type": "exported", "points": answer.len(), "moments": times.len(), "missing": answer.missing(),
     }));
@@ -268,18 +268,18 @@ fn tracks(scene: &Scene<f32>, args: &Args, out: &Path, console: &Console) -> any
         members.retain(|m| of[m.layer][m.row as usize] == wanted);
     }
     if members.len().saturating_mul(times.len()).saturating_mul(3) > MOST_NUMBERS {
-        return Err(Error::input(format!("{} tracks of {} moments are too many", members.len(), times.len()))
-            .remedy("Take fewer with --every N, --near X,Y,Z, --fps, --from or --to.")
+        return Err(Error::input(format!("{} tracks of {} times are too many", members.len(), times.len()))
+            .remedy("Select fewer with --every N, --near X,Y,Z, --fps, --from or --to.")
             .into());
     }
     if members.is_empty() {
-        console.warn(&format!("nothing is alive at {} s: the file holds no track", times[0]));
+        console.warn(&format!("no Gaussian is active at {} s: the file has no tracks", times[0]));
     }
     let followed = Tracks::follow(scene, &members, &times);
     let offset = if args.world { scene.offset } else { [0.0; 3] };
     let text = if json { followed.to_json(scene, offset) } else { followed.to_csv(scene, offset) };
     files::write(out, text.as_bytes())?;
-    console.say(&format!("{} tracks of {} moments", files::grouped(members.len()), times.len()));
+    console.say(&format!("{} tracks of {} times", files::grouped(members.len()), times.len()));
     console.emit(&json!({"type": "exported", "tracks": members.len(), "moments": times.len()}));
     console.written(out);
     Ok(())
@@ -301,6 +301,11 @@ fn page(path: &Path, args: &Args, console: &Console) -> anyhow::Result<()> {
             .remedy("Use --link NAME.s4d.")
             .into());
     }
+    // A playback file may lie beside its page as it is.
+    let is_read = |link: &&PathBuf| link.canonicalize().ok().is_some_and(|l| path.canonicalize().is_ok_and(|p| p == l));
+    if let Some(link) = args.link.as_ref().filter(|link| !is_read(link)) {
+        keep(path, run.as_ref(), link, &[])?;
+    }
     let address = args.link.as_ref().map(|link| address(link, out)).transpose()?;
     let scene = Playable::open(path, console)?;
     let bytes = scene.bytes()?;
@@ -314,7 +319,7 @@ fn page(path: &Path, args: &Args, console: &Console) -> anyhow::Result<()> {
     console.say(&format!("a page of {}", files::human_bytes(html.len() as u64)));
     console.written(out);
     if args.link.is_some() {
-        console.say("put both on a web server: browsers do not let a page from disk read another file");
+        console.say("put both on a web server: browsers do not let a page opened from disk read another file");
     }
     Ok(())
 }
@@ -327,9 +332,9 @@ fn address(link: &Path, page: &Path) -> anyhow::Result<String> {
     };
     let (at, below) = (folder(page)?, folder(link)?);
     let (Ok(below), Some(name)) = (below.strip_prefix(&at), link.file_name()) else {
-        return Err(Error::input("does not lie in the page's folder")
+        return Err(Error::input("is not in the page's folder")
             .at(link.display())
-            .remedy("Give --link a file beside the page, or in a folder below it.")
+            .remedy("Give --link a file in the page's folder or below it.")
             .into());
     };
     let parts = below.iter().chain([name]).map(|part| percent(&part.to_string_lossy()));

@@ -12,12 +12,17 @@ use splat4d_import::take::{self, CameraReport, Report, Request, Rig};
 use splat4d_import::video::Selection;
 use splat4d_import::write::Format;
 use splat4d_train::event::Progress;
-use splat4d_train::output::{Input, OutputFolder, check_apart};
+use splat4d_train::output::{Input, OutputFolder, check_apart, written};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::open_capture;
 use std::fmt::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
+
+/// The file that a capture is told by.
+const CAPTURE: &str = "capture.json";
+/// What an import writes into its folder, besides its corrections.
+const WRITTEN: [&str; 5] = [CAPTURE, "points.ply", "images", "masks", "import"];
 
 const EXAMPLES: &str = "\
 Examples:
@@ -123,18 +128,28 @@ fn height(text: &str) -> Result<(String, f64), String> {
     Ok((name.trim().to_owned(), metres))
 }
 
+/// Refuses a folder that holds what an import writes, but no import: nobody's images, masks or points are replaced.
+fn check_ours(folder: &Path) -> splat4d::Result<()> {
+    if folder.join(corrections::FILE).is_file() {
+        return Ok(());
+    }
+    let listed = written(folder);
+    let foreign = |name: &&&str| folder.join(name).exists() && !listed.iter().any(|file| file.starts_with(name));
+    let Some(name) = WRITTEN.iter().find(foreign) else { return Ok(()) };
+    let what = match *name {
+        CAPTURE => "the folder contains a capture of another program".to_owned(),
+        name => format!("holds {name}, and there is no record that splat4d wrote it"),
+    };
+    Err(Error::input(what).at(folder.display()).remedy("Give another folder with -o."))
+}
+
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let folder = &args.output;
-    let foreign = folder.join("capture.json").is_file() && !folder.join(corrections::FILE).is_file();
-    if foreign {
-        return Err(Error::input("there is a capture already, and it is not from here")
-            .at(folder.display())
-            .remedy("Give another folder with -o.")
-            .into());
-    }
-    let inputs: Vec<Input<'_>> =
-        args.videos.iter().chain(&args.masks).map(|v| Input::new(v, "what is imported,")).collect();
-    check_apart(folder, &inputs)?;
+    check_ours(folder)?;
+    let read = args.videos.iter().chain(&args.masks).map(|v| Input::new(v, "what is imported,"));
+    // A capture may lie beside the videos, in the folder of their calibration.
+    let calibration = args.calibration.iter().map(|c| Input { may_hold: true, ..Input::new(c, "the calibration") });
+    check_apart(folder, &read.chain(calibration).collect::<Vec<_>>())?;
     let _owned = OutputFolder::amend(folder, "import")?;
     let request = Request {
         inputs: args.videos.clone(),
@@ -162,7 +177,8 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         masks: args.masks.clone(),
         synchronous: args.synchronous,
     };
-    let stop = interrupt::flag("stopping: what is stored is kept");
+    let stop = interrupt::flag("stopping: stored results are kept");
+    interrupt::ends("stored results are kept, and the same command continues from there");
     let mut tell = |event: &splat4d_train::event::Event| console.event(event);
     let made = take::import(&request, &mut Progress(&mut tell), &|| stop.load(Ordering::SeqCst));
     console.clear();
@@ -208,7 +224,7 @@ fn told(report: &Report, looked: Option<&(Looked, PathBuf)>, console: &Console) 
     let silent: Vec<&str> = report.cameras.iter().filter(|c| c.offset.is_none()).map(|c| c.name.as_str()).collect();
     if report.cameras.len() > 1 && !silent.is_empty() && !report.still {
         console.warn(&format!(
-            "nothing tells how the clocks of these cameras differ, their files' are taken: {} (tell it in {})",
+            "the time offsets of these cameras are unknown, those of their files are used: {} (correct them in {})",
             silent.join(", "),
             corrections::FILE
         ));

@@ -6,8 +6,9 @@ mod playback;
 use crate::chunked;
 use crate::console::Console;
 use crate::files::{self, grouped, human_bytes, human_seconds};
-use crate::run_folder::Run;
+use crate::run_folder::{Origin, Run};
 use crate::source::{Source, bundle, cloud};
+use crate::verbs::status;
 use serde_json::{Value, json};
 use splat4d::Error;
 use splat4d::format::sog;
@@ -19,7 +20,7 @@ use splat4d::text::in_line;
 use splat4d_import::shipped;
 use splat4d_train::capture::{self, Aspect, Capture, Finding, Frame, Reach, Severity, Timing};
 use splat4d_train::event::Event;
-use splat4d_train::output::{Input, check_apart};
+use splat4d_train::output::check_apart;
 use splat4d_train::path_text::{in_command, to_text};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::chunks::Outlook;
@@ -109,7 +110,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let foreign = sog || levels || (path.is_dir() && bundle::is_scene(path));
     let is_capture = !Run::is(path) && !foreign && (path.is_dir() || marker);
     if args.doctor && !is_capture {
-        return Err(Error::input("the doctor looks at captures, and this is none")
+        return Err(Error::input("the doctor checks captures only")
             .at(path.display())
             .remedy("Give a capture's folder, or leave --doctor out.")
             .into());
@@ -170,7 +171,7 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
         frame.tracks = frame.tracks.take().filter(|_| recipe.loss.tracks > 0.0);
     }
     if args.doctor {
-        check_apart(&args.output, &[Input::new(&capture.root, "the capture")])?;
+        check_apart(&args.output, &Origin::of(&capture).inputs().collect::<Vec<_>>())?;
         // Before the pictures are looked at, which takes a while.
         files::make_folder(&args.output)?;
         return doctor::of(&capture, &args.output, console);
@@ -196,17 +197,17 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
     line(&mut text, "capture", &format!("{} ({:?})", capture.name, capture.kind));
     line(&mut text, "cameras", &format!("{fixed} fixed, {moving} moving"));
     let plural = if times.len() == 1 { "" } else { "s" };
-    let pictures = format!("{} at {} moment{plural}", grouped(capture.frames.len()), grouped(times.len()));
+    let pictures = format!("{} at {} time{plural}", grouped(capture.frames.len()), grouped(times.len()));
     line(&mut text, "pictures", &pictures);
     let all: Vec<String> = sizes.iter().map(|s| format!("{}x{}", s[0], s[1])).collect();
     line(&mut text, "size", &all.join(", "));
-    let span = format!("{first:.3} to {last:.3} s, {} frames a second", capture.fps);
+    let span = format!("{first:.3} to {last:.3} s, {} frames per second", capture.fps);
     line(
         &mut text,
         "time",
         &match capture.timing {
-            Timing::Moment => "one moment: a photo set, no times are stated".to_owned(),
-            Timing::Numbers => format!("{span}; by the numbers in picture names, no times are stated"),
+            Timing::Moment => "one time: a photo set, no times are given".to_owned(),
+            Timing::Numbers => format!("{span}; from the numbers in image names, no times are given"),
             _ => span,
         },
     );
@@ -222,11 +223,11 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
     let points = capture.points.as_ref().map_or("none".into(), |p| grouped(p.points.len()));
     line(&mut text, "initial points", &points);
     if !priors.is_empty() {
-        line(&mut text, "beside pictures", &priors.join(", "));
+        line(&mut text, "priors", &priors.join(", "));
     }
     let reach = capture.reach();
     if let Some(reach) = &reach {
-        line(&mut text, "views hold", &in_words(reach));
+        line(&mut text, "valid views", &in_words(reach));
     }
     line(&mut text, "memory", &format!("about {} with the default recipe", human_bytes(memory)));
     if let Some(outlook) = &outlook {
@@ -335,11 +336,12 @@ fn priors(capture: &Capture) -> Vec<String> {
 fn in_words(reach: &Reach) -> String {
     let [x, y, z] = reach.center;
     let mut out = format!(
-        "to about {:.0}° from a training camera, seen from ({x:.2}, {y:.2}, {z:.2}), {:.2} to {:.2} units from there",
+        "within about {:.0}° of a training camera, seen from ({x:.2}, {y:.2}, {z:.2}), at distances of {:.2} to \
+         {:.2} units",
         reach.degrees, reach.distances[0], reach.distances[1]
     );
     if reach.held[1] > 0 {
-        let _ = write!(out, "; of {} held-out cameras {} stand farther away", reach.held[0], reach.held[1]);
+        let _ = write!(out, "; {1} of {0} held-out cameras are farther away", reach.held[0], reach.held[1]);
     }
     out
 }
@@ -367,8 +369,9 @@ fn of_run(path: &Path) -> anyhow::Result<Told> {
     if let Some(capture) = run.capture() {
         line(&mut text, "capture", &capture.display().to_string());
         if !capture.exists() {
-            troubles
-                .push("The capture has moved away: the run can be rendered, but neither resumed nor measured.".into());
+            troubles.push(
+                "The capture is not there any more: the run can be rendered, but neither resumed nor measured.".into(),
+            );
         }
     }
     let recipe = run.recipe()?;
@@ -377,25 +380,27 @@ fn of_run(path: &Path) -> anyhow::Result<Told> {
     let choices = if changed.is_empty() { "all defaults".to_owned() } else { changed.join(" ") };
     line(&mut text, "recipe", &format!("{recipe}; {choices}"));
     let total = run.number("iterations").or_else(|| run.recipe().ok().map(|r| r.run.iterations as f64));
-    let done = run.iteration().unwrap_or(0);
-    let finished = Run::is_finished(path);
-    let state = if finished { "finished" } else { "unfinished" };
-    line(
-        &mut text,
-        "progress",
-        &format!("{state}, step {} of {}", grouped(done), grouped(total.unwrap_or(0.0) as usize)),
-    );
+    let status = status::of(path)?;
+    let finished = status.finished;
+    // Each chunk has the recipe's steps.
+    let (done, total) = if status.chunked { (status.steps(), None) } else { (run.iteration().unwrap_or(0), total) };
+    let of = total.map(|n| format!(" of {}", grouped(n as usize))).unwrap_or_default();
+    line(&mut text, "progress", &format!("{}, step {}{of}", status.progress(), grouped(done)));
     if !finished {
-        troubles.push(format!("It is unfinished: splat4d train --resume {} continues it.", in_command(path)));
+        troubles.push(match status.chunked {
+            true => format!("It is unfinished: splat4d status {} lists its parts.", in_command(path)),
+            false => format!("It is unfinished: splat4d train --resume {} continues it.", in_command(path)),
+        });
     }
-    if let Some(seconds) = run.number("seconds") {
+    if let Some(seconds) = run.number("seconds").or(status.chunked.then(|| status.seconds())) {
         line(&mut text, "time", &human_seconds(seconds));
     }
-    if let Some(bytes) = run.number("peak_memory").filter(|b| *b > 0.0) {
-        line(&mut text, "memory", &format!("{} at most", human_bytes(bytes as u64)));
+    let bytes = run.number("peak_memory").map(|b| b as u64).max(status.peak_memory());
+    if let Some(bytes) = bytes.filter(|b| *b > 0) {
+        line(&mut text, "memory", &format!("{} at most", human_bytes(bytes)));
     }
     if let Some(n) = run.number("rollbacks").filter(|n| *n > 0.0) {
-        troubles.push(format!("Training went back {n} times because a number was not finite: look at the poses."));
+        troubles.push(format!("Training rolled back {n} times because a value was not finite: check the poses."));
     }
     if let Some(results) = run.results.as_ref().and_then(Value::as_object) {
         let scores: Vec<String> = results.iter().filter_map(|(k, v)| Some(format!("{k} {:.4}", v.as_f64()?))).collect();
@@ -515,19 +520,24 @@ fn of_scene(scene: &Scene<f32>) -> Told {
     let sound = (n - damaged).max(1) as f64;
     let mut troubles = Vec::new();
     if n == 0 {
-        troubles.push("It holds no Gaussians.".into());
+        troubles.push("It contains no Gaussians.".into());
     }
     if damaged > 0 {
         troubles.push(format!(
-            "{} Gaussians hold NaN or infinity: they are not drawn. Train or export again.",
+            "{} Gaussians contain NaN or infinity: they are not rendered. Train or export again.",
             grouped(damaged)
         ));
     }
     if zero_quats > 0 {
-        troubles.push(format!("{} Gaussians have a zero rotation: they are not drawn as meant.", grouped(zero_quats)));
+        troubles
+            .push(format!("{} Gaussians have a zero rotation: they are not rendered correctly.", grouped(zero_quats)));
     }
     if opacity[0] as f64 > MANY_FAINT * sound && n >= FEW {
-        troubles.push(format!("{} of {} Gaussians are too faint to be seen.", grouped(opacity[0]), grouped(n)));
+        troubles.push(format!(
+            "{} of {} Gaussians are too transparent to be visible.",
+            grouped(opacity[0]),
+            grouped(n)
+        ));
     }
     if huge as f64 > MANY_HUGE * sound && n >= FEW {
         troubles.push(format!("{} Gaussians are larger than the whole scene: floaters, or a sky.", grouped(huge)));
@@ -538,22 +548,18 @@ fn of_scene(scene: &Scene<f32>) -> Told {
         line(&mut text, "layer", &format!("{name}: {} by {motion}, life {life}, SH degree {degree}", grouped(*rows)));
     }
     if scene.head != Head::Identity {
-        line(
-            &mut text,
-            "colours",
-            "by a small network, pixel by pixel (features = full); only render and eval draw them",
-        );
+        line(&mut text, "colours", "by a small network per pixel (features = full); only render and eval support it");
     }
     if scene.clip[1] > scene.clip[0] {
         line(
             &mut text,
             "clip",
-            &format!("{:.3} to {:.3} s, {} frames a second", scene.clip[0], scene.clip[1], scene.fps),
+            &format!("{:.3} to {:.3} s, {} frames per second", scene.clip[0], scene.clip[1], scene.fps),
         );
     }
     if scene.offset != [0.0; 3] {
         let [x, y, z] = scene.offset;
-        line(&mut text, "offset", &format!("{x} {y} {z}: add it to positions for those of the world"));
+        line(&mut text, "offset", &format!("{x} {y} {z}: add it to positions to get world coordinates"));
     }
     let finite = low[0] <= high[0];
     if finite {

@@ -65,7 +65,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         let cameras = resized(&starts, &picture).map_err(|e| e.at(path.display()))?;
         let name = path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned());
         let located = localise(&source.scene, &picture, &cameras, question, &mut |done, all| {
-            console.phase(&format!("looking for {name}"), done, all);
+            console.phase(&format!("localising {name}"), done, all);
         })?;
         console.clear();
         let row = row(&located, &name, found.len());
@@ -109,7 +109,7 @@ fn starts(args: &Args, source: &Source) -> Result<Vec<View>> {
         },
         (None, Some(run)) => run.views()?,
         (None, None) => {
-            return Err(Error::input("a scene file does not say where to begin")
+            return Err(Error::input("a scene file has no start camera")
                 .at(args.scene.display())
                 .remedy("Add --start CAMERA.json, or give the run folder."));
         }
@@ -142,10 +142,10 @@ fn resized(starts: &[View], picture: &Planes<f32>) -> Result<Vec<Camera>> {
     if cameras.is_empty() {
         let other = starts.first().map(|v| format!("{}x{}", v.camera.width, v.camera.height)).unwrap_or_default();
         return Err(Error::input(format!(
-            "the picture is {}x{}, and no camera to begin from has that shape (such as {other})",
+            "the image is {}x{}, and no start camera has that aspect ratio (such as {other})",
             picture.width, picture.height
         ))
-        .remedy("Crop or scale the picture, or give its own camera with --start."));
+        .remedy("Crop or scale the image, or give its own camera with --start."));
     }
     Ok(cameras)
 }
@@ -168,8 +168,8 @@ fn in_words(located: &Located, name: &str) -> String {
     let [x, y, z] = located.camera.center();
     let axis = located.camera.cam_from_world.rotation[2];
     format!(
-        "{name}: at ({x:.4}, {y:.4}, {z:.4}), looking along ({:.4}, {:.4}, {:.4}), at {:.3} s; residual {:.4}, {:.0} % of \
-         what one plain colour leaves",
+        "{name}: at ({x:.4}, {y:.4}, {z:.4}), looking along ({:.4}, {:.4}, {:.4}), at {:.3} s; residual {:.4}, {:.0} \
+         % of that of a plain colour",
         axis[0],
         axis[1],
         axis[2],

@@ -2,6 +2,7 @@
 
 pub(crate) mod bake;
 pub(crate) mod bench;
+pub(crate) mod compare;
 pub(crate) mod completions;
 pub(crate) mod compress;
 pub(crate) mod convert;
@@ -15,5 +16,6 @@ pub(crate) mod label;
 pub(crate) mod localise;
 pub(crate) mod predict;
 pub(crate) mod render;
+pub(crate) mod status;
 pub mod train;
 pub(crate) mod view;

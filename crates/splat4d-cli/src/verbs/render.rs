@@ -124,17 +124,18 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
 fn one(args: &Args, path: &Path, camera: &Path, console: &Console) -> anyhow::Result<()> {
     let (camera, background) = camera_file::read(camera)?;
     let Some(output) = args.output.as_ref().or(args.raw.as_ref()) else {
-        return Err(Error::input("there is nowhere to write to").remedy("Add -o NAME.png, --raw NAME or both.").into());
+        return Err(Error::input("no output was given").remedy("Add -o NAME.png, --raw NAME or both.").into());
     };
     if args.output.as_ref().is_some_and(|o| o.extension().is_none_or(|e| !e.eq_ignore_ascii_case("png"))) {
-        return Err(Error::input("one picture is written as .png")
+        return Err(Error::input("one image is written as .png")
             .at(output.display())
             .remedy("Use -o NAME.png.")
             .into());
     }
     args.raw_format.suits(args.channel)?;
     let source = Source::open(path)?;
-    for file in args.output.iter().chain(&args.raw) {
+    let raw = args.raw.as_deref().map(|prefix| raw_files(prefix, args)).unwrap_or_default();
+    for file in args.output.iter().chain(&raw) {
         source.keep(path, file, &[])?;
     }
     let depth = args.channel == Channel::Depth || args.raw.is_some();
@@ -147,33 +148,44 @@ fn one(args: &Args, path: &Path, camera: &Path, console: &Console) -> anyhow::Re
         files::write(out, &painter.rgb(args.channel, range).png())?;
         console.written(out);
     }
-    if let Some(raw) = args.raw.as_ref().filter(|_| args.channel.is_field() || args.raw_format != RawFormat::Npy) {
-        let mut name = stem(raw);
-        name.push(format!(".{}.{}", args.channel.name(), args.raw_format.ending()));
-        let path = PathBuf::from(name);
-        files::write(&path, &args.raw_format.bytes(args.channel, &painter.raw())?)?;
-        console.written(&path);
-    } else if let Some(raw) = &args.raw {
-        let image = &painter.image;
-        raw_array(raw, ".npy", &[camera.height, camera.width, 3], &image.color.interleaved(), console)?;
-        raw_array(raw, ".alpha.npy", &[camera.height, camera.width], plane(&image.alpha), console)?;
-        raw_array(raw, ".depth.npy", &[camera.height, camera.width], plane(&image.depth), console)?;
+    match &raw[..] {
+        [] => {}
+        [color, alpha, depth] => {
+            let (image, size) = (&painter.image, [camera.height, camera.width]);
+            raw_array(color, &[size[0], size[1], 3], &image.color.interleaved(), console)?;
+            raw_array(alpha, &size, plane(&image.alpha), console)?;
+            raw_array(depth, &size, plane(&image.depth), console)?;
+        }
+        files => {
+            files::write(&files[0], &args.raw_format.bytes(args.channel, &painter.raw())?)?;
+            console.written(&files[0]);
+        }
     }
     Ok(())
+}
+
+/// The files of `--raw PREFIX` for one camera: those of colour, opacity and depth, or one of the channel.
+fn raw_files(prefix: &Path, args: &Args) -> Vec<PathBuf> {
+    let named = |ending: &str| {
+        let mut name = stem(prefix);
+        name.push(ending);
+        PathBuf::from(name)
+    };
+    if args.channel.is_field() || args.raw_format != RawFormat::Npy {
+        return vec![named(&format!(".{}.{}", args.channel.name(), args.raw_format.ending()))];
+    }
+    [".npy", ".alpha.npy", ".depth.npy"].map(named).into()
 }
 
 fn plane(planes: &Planes<f32>) -> &[f32] {
     &planes.data
 }
 
-fn raw_array(prefix: &Path, ending: &str, shape: &[usize], data: &[f32], console: &Console) -> anyhow::Result<()> {
-    let mut name = stem(prefix);
-    name.push(ending);
-    let path = PathBuf::from(name);
+fn raw_array(path: &Path, shape: &[usize], data: &[f32], console: &Console) -> anyhow::Result<()> {
     let mut bytes = Vec::new();
     format::npy::write_f32(shape, data, &mut bytes)?;
-    files::write(&path, &bytes)?;
-    console.written(&path);
+    files::write(path, &bytes)?;
+    console.written(path);
     Ok(())
 }
 
@@ -191,7 +203,7 @@ fn channel<'a>(
     console: &'a Console,
 ) -> anyhow::Result<Painter<'a>> {
     let views = if args.channel == Channel::Uncertainty { source.views()? } else { Vec::new() };
-    let mut phase = |done, of| console.phase("asking the training pictures", done, of);
+    let mut phase = |done, of| console.phase("evaluating the training images", done, of);
     let painter = painter.of_channel(args.channel, &views, &mut phase)?.on(args.device, console);
     console.clear();
     Ok(painter)
@@ -221,9 +233,12 @@ fn film(args: &Args, path: &Path, console: &Console) -> anyhow::Result<()> {
         fps: args.fps.or(told).unwrap_or(FPS),
     };
     if clock.to < clock.from {
-        return Err(Error::input(format!("the time range ends ({} s) before it begins ({} s)", clock.to, clock.from))
-            .remedy(format!("The scene lasts from {} to {} s.", scene.clip[0], scene.clip[1]))
-            .into());
+        return Err(Error::input(format!(
+            "invalid time range: its end ({} s) is before its start ({} s)",
+            clock.to, clock.from
+        ))
+        .remedy(format!("The scene lasts from {} to {} s.", scene.clip[0], scene.clip[1]))
+        .into());
     }
     let stage = source.stage(&views);
     let shots = shots(&route, &clock, &views, &stage, args.size)?;
@@ -234,10 +249,10 @@ fn film(args: &Args, path: &Path, console: &Console) -> anyhow::Result<()> {
         && output.extension().is_some()
     {
         return Err(Error::input(format!(
-            "the views have several sizes ({}x{} and {}x{}), a film has one",
+            "the views have several sizes ({}x{} and {}x{}), a film needs one",
             size[0], size[1], other.camera.width, other.camera.height
         ))
-        .remedy("Add --size, or write a folder of pictures (-o FOLDER).")
+        .remedy("Add --size, or write a folder of images (-o FOLDER).")
         .into());
     }
     let background = args.background.unwrap_or(scene.background);
@@ -278,7 +293,7 @@ fn film(args: &Args, path: &Path, console: &Console) -> anyhow::Result<()> {
         console.written(raw);
     }
     console.detail(&format!(
-        "{} frames of {}x{}, drawn on {} at {:.1} frames/s, coding apart",
+        "{} frames of {}x{}, rendered on {} at {:.1} frames/s, encoding excluded",
         shots.len(),
         size[0],
         size[1],
@@ -344,31 +359,31 @@ fn default_output(path: &Path, route: &Route, run: bool) -> PathBuf {
 }
 
 fn number(text: &str) -> Result<f64, String> {
-    text.trim().parse::<f64>().ok().filter(|x| x.is_finite()).ok_or_else(|| "give a number".to_owned())
+    text.trim().parse::<f64>().ok().filter(|x| x.is_finite()).ok_or_else(|| "expected a number".to_owned())
 }
 
 fn second(text: &str) -> Result<f64, String> {
-    number(text).map_err(|_| "give seconds of the scene, for instance 0.5".into())
+    number(text).map_err(|_| "expected seconds of the scene, for instance 0.5".into())
 }
 
 fn factor(text: &str) -> Result<f64, String> {
     match number(text) {
         Ok(f) if (0.001..=1000.0).contains(&f) => Ok(f),
-        _ => Err("give a factor from 0.001 to 1000; 4 is four times slower than life".into()),
+        _ => Err("expected a factor from 0.001 to 1000; 4 is four times slower than real time".into()),
     }
 }
 
 fn length(text: &str) -> Result<f64, String> {
     match number(text) {
         Ok(s) if (0.01..=36_000.0).contains(&s) => Ok(s),
-        _ => Err("give the film's length in seconds, 0.01 to 36000".into()),
+        _ => Err("expected the film's length in seconds, 0.01 to 36000".into()),
     }
 }
 
 fn fps(text: &str) -> Result<f64, String> {
     match number(text) {
         Ok(f) if (0.1..=1000.0).contains(&f) => Ok(f),
-        _ => Err("give frames a second, 0.1 to 1000".into()),
+        _ => Err("expected frames per second, 0.1 to 1000".into()),
     }
 }
 
@@ -377,6 +392,6 @@ fn color(text: &str) -> Result<Color, String> {
     match parts.as_deref() {
         Ok([r, g, b]) => Ok([*r as f32, *g as f32, *b as f32]),
         Ok([v]) => Ok([*v as f32; 3]),
-        _ => Err("give red, green and blue, 0 to 1, for instance 1,1,1".into()),
+        _ => Err("expected red, green and blue, 0 to 1, for instance 1,1,1".into()),
     }
 }

@@ -33,6 +33,8 @@ const WAIT: Duration = Duration::from_millis(200);
 /// What an owner's record calls this verb, and `join`.
 const TRAIN: &str = "train";
 const JOIN: &str = "join";
+/// What the first Ctrl-C is answered with in training.
+const SAVING: &str = "stopping: a checkpoint is being saved";
 
 const EXAMPLES: &str = "\
 Examples:
@@ -185,9 +187,10 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let clock = Stopwatch::start();
     args.measure.check()?;
     if !args.view && args.place.is_told() {
-        return Err(Error::input("--port, --host and --no-open belong to --view").remedy("Add --view.").into());
+        return Err(Error::input("--port, --host and --no-open need --view").remedy("Add --view.").into());
     }
-    let stop = interrupt::flag("stopping: a checkpoint is being saved");
+    let stop = interrupt::flag(SAVING);
+    interrupt::ends("training had not begun, and the same command begins it");
     let watch = |title: &str| {
         if args.view { Watch::start(title, &args.place, console) } else { Watch::nobody() }
     };
@@ -210,6 +213,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         let device = device::to_train(args.device, console);
         let clock = clock.clone();
         let options = TrainOptions { device, snapshots: snapshots(&watch), clock, ..TrainOptions::default() };
+        interrupt::asks(SAVING);
         let trained = run::resume_with(run, &options, &stop, &mut |event| listen(event, &watch));
         (folder, run.clone(), watch, trained)
     } else {
@@ -284,9 +288,9 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             false => capture.clone(),
         };
         if args.chunk.is_some() {
-            return Err(Error::input("the take fits one chunk, and has no parts")
+            return Err(Error::input("the capture fits into one chunk")
                 .at("--chunk")
-                .remedy("Train it without --chunk, or ask for shorter chunks with --chunk-frames")
+                .remedy("Train it without --chunk, or set shorter chunks with --chunk-frames")
                 .into());
         }
         let (folder, found) = place()?;
@@ -306,8 +310,9 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             run_folder::hear(&folder, event);
             listen(event, &watch);
         };
+        interrupt::asks(SAVING);
         let trained = if found == Found::Unfinished {
-            console.say(&format!("{} holds what the same command left unfinished: it is continued", run.display()));
+            console.say(&format!("{} contains an unfinished run of the same command: it is continued", run.display()));
             run::resume_with(&run, &options, &stop, &mut hear)
         } else {
             // The recipe first: whatever comes to pass from here on, the folder is known for what it is.
@@ -334,6 +339,10 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         .remedy(format!("Continue with: splat4d train --resume {}", in_command(&run)))
         .into());
     }
+    let name = in_command(&run);
+    interrupt::ends(format!(
+        "the scene is trained and saved: splat4d eval {name} makes the scores, the film and the report"
+    ));
     console.say(&format!("wrote {}", run.join("scene.safetensors").display()));
     finish::say_refined(&run, console)?;
     if labelling::has_any(&Run::open(&run)?.open_capture()?.0) {
@@ -353,7 +362,8 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     console.next("view", &run);
     console.emit(&json!({"type": "done", "run": run.to_string_lossy()}));
     if watch.is_on() && console.terminal() {
-        console.say("the player stays until Ctrl-C");
+        console.say("the player keeps running until Ctrl-C");
+        interrupt::asks("stopping");
         serving::wait(&stop);
     }
     Ok(())
@@ -377,6 +387,7 @@ fn in_chunks(
         ..TrainOptions::default()
     };
     let wanted = args.chunk.unwrap_or(Wanted::All);
+    interrupt::asks(SAVING);
     let outcome = chunked::work(run, chunked, wanted, &options, stop, console, &mut |event| {
         watch.hear(event);
         console.event(event);
@@ -390,6 +401,7 @@ fn in_chunks(
     match args.chunk {
         Some(_) => console.emit(&json!({"type": "done", "run": run.to_string_lossy()})),
         None => {
+            interrupt::ends(format!("all parts are kept: splat4d join {} joins them", in_command(run)));
             // The other workers are done with it, or wait for the same.
             let _owner = Owner::wait(run, JOIN, &mut |_| !stop.load(Ordering::Relaxed))?;
             let deadline = Deadline::of(clock, args.minutes);
@@ -506,11 +518,11 @@ fn describe(capture: &Capture, memory: u64, console: &Console) {
     };
     let size = capture.frames.first().map_or([0, 0], |f| [f.view.width, f.view.height]);
     let span = match capture.timing {
-        Timing::Moment => "at one moment".to_owned(),
+        Timing::Moment => "at one time".to_owned(),
         _ => format!("over {:.2} s", last - first),
     };
     console.say(&format!(
-        "{}: {} camera{}, {} pictures of {}x{} {span}{}",
+        "{}: {} camera{}, {} images of {}x{} {span}{}",
         capture.name,
         capture.cameras.len(),
         if capture.cameras.len() == 1 { "" } else { "s" },
@@ -536,8 +548,8 @@ fn describe(capture: &Capture, memory: u64, console: &Console) {
 fn minutes(text: &str) -> Result<f64, String> {
     /// A week: longer is a slip.
     const MOST: f64 = 7.0 * 24.0 * 60.0;
-    let value: f64 = text.parse().map_err(|_| "give minutes, for instance 10 or 2.5".to_owned())?;
-    if value > 0.0 && value <= MOST { Ok(value) } else { Err(format!("give minutes above 0, at most {MOST}")) }
+    let value: f64 = text.parse().map_err(|_| "expected minutes, for instance 10 or 2.5".to_owned())?;
+    if value > 0.0 && value <= MOST { Ok(value) } else { Err(format!("expected minutes above 0, at most {MOST}")) }
 }
 
 /// The examples, and the knobs that most runs are told by.
@@ -545,7 +557,7 @@ fn long_help() -> String {
     let knobs = Recipe::knobs();
     let lines: String = IMPORTANT
         .iter()
-        .map(|key| line(knobs.iter().find(|k| k.key() == *key).expect("IMPORTANT names knobs of the recipe")))
+        .map(|key| line(knobs.iter().find(|k| k.key() == *key).expect("IMPORTANT lists settings of the recipe")))
         .collect();
     format!("{EXAMPLES}\n\nSettings (--set KEY=VALUE, or a TOML file for --recipe; --help-knobs: all):\n{lines}")
 }
@@ -603,7 +615,7 @@ mod tests {
     }
 
     #[test]
-    fn typed_knobs_win_over_the_quality_and_another_length_has_its_own_schedules() {
+    fn explicit_settings_override_quality_and_length_sets_schedules() {
         let steps = |r: &Recipe| [r.run.iterations, r.densify.max_cap, r.capture.downscale];
         let draft = steps(&typed(&["--quality", "draft"]));
         assert_eq!(draft, steps(&Recipe::default().of_quality(Quality::Draft)));
@@ -623,7 +635,7 @@ mod tests {
     }
 
     #[test]
-    fn knobs_are_listed_by_topic() {
+    fn settings_are_listed_by_topic() {
         let all = knob_list("").unwrap();
         assert!(Recipe::knobs().iter().all(|k| all.contains(&k.key())));
         let merge = knob_list("merge").unwrap();

@@ -30,7 +30,7 @@ fn npy(path: &Path) -> Npy {
 }
 
 #[test]
-fn every_channel_is_a_picture_and_numbers() {
+fn every_channel_is_an_image_and_numbers() {
     let work = tempfile::tempdir().unwrap();
     let [file, camera] = birds(work.path());
     let (png, raw) = (work.path().join("a.png"), work.path().join("a"));
@@ -77,7 +77,7 @@ fn every_channel_is_a_picture_and_numbers() {
 }
 
 #[test]
-fn what_has_a_label_goes_out_alone() {
+fn a_label_is_exported_alone() {
     let work = tempfile::tempdir().unwrap();
     let [file, _] = birds(work.path());
     let at = |name: &str| work.path().join(name);
@@ -142,7 +142,7 @@ fn masks_teach_a_run_its_labels_and_points_are_followed() {
     std::fs::write(&points, format!("camera,x,y,time\n{name},{width},1,0\n")).unwrap();
     let message = ask().refused();
     assert!(
-        message.contains("points.csv") && message.contains("line 2") && message.contains("not in a picture"),
+        message.contains("points.csv") && message.contains("line 2") && message.contains("outside the image"),
         "{message}"
     );
 }

@@ -72,7 +72,7 @@ fn a_list_and_options_make_a_new_file() {
 }
 
 #[test]
-fn what_is_wrong_is_told_and_the_old_file_stays() {
+fn mistakes_are_reported_and_the_old_file_stays() {
     let work = tempfile::tempdir().unwrap();
     let at = |name: &str| work.path().join(name).to_str().unwrap().to_owned();
     write(Path::new(&at("birds.safetensors")), "birds");

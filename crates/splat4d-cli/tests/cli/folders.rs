@@ -146,6 +146,79 @@ fn no_output_replaces_what_is_read() {
     }
 }
 
+/// A capture whose images, points and a mask lie elsewhere: they are as safe as those in its folder.
+#[test]
+fn no_output_replaces_what_a_capture_reads_from_elsewhere() {
+    let work = tempfile::tempdir().unwrap();
+    let at = |name: &str| work.path().join(name);
+    let mut sample = Capture::new(&at("sets"));
+    sample.black_masks = true;
+    let capture = sample.write();
+    let (images, masks, points) = (at("photos"), at("cut"), at("sets/points.ply"));
+    std::fs::rename(capture.join("images"), &images).unwrap();
+    std::fs::rename(capture.join("masks"), &masks).unwrap();
+    write_ply(&points, 0.0);
+    let text = std::fs::read_to_string(capture.join("capture.json")).unwrap();
+    let absolute = format!("\"{}/cam", masks.display());
+    let text = text.replace("\"images/", "\"../../photos/").replace("\"masks/cam", &absolute);
+    let text = text.replacen("\"fps\"", "\"points\":\"../points.ply\",\"fps\"", 1);
+    std::fs::write(capture.join("capture.json"), text).unwrap();
+    std::fs::write(capture.join("x.npy"), "mine").unwrap();
+    std::fs::write(capture.join("x.s4d"), "mine").unwrap();
+    #[cfg(unix)]
+    {
+        std::fs::create_dir(at("pool")).unwrap();
+        std::fs::rename(images.join("cam0/0000.png"), at("pool/0.png")).unwrap();
+        std::os::unix::fs::symlink(at("pool/0.png"), images.join("cam0/0000.png")).unwrap();
+    }
+    // A run of it that is as good as trained.
+    let run = at("run");
+    std::fs::create_dir(&run).unwrap();
+    write_ply(&at("a.ply"), 0.0);
+    splat4d(&["convert", str(&at("a.ply")), str(&run.join("scene.safetensors"))]).run().ok();
+    std::fs::write(run.join("recipe.toml"), Recipe::default().to_toml()).unwrap();
+    let info = serde_json::json!({"version": "0", "capture": str(&capture.canonicalize().unwrap())});
+    std::fs::write(run.join("run.json"), info.to_string()).unwrap();
+    let camera = at("camera.json");
+    let lens =
+        r#"{"width": 8, "height": 6, "fx": 8, "fy": 8, "cx": 4, "cy": 3, "position": [0, 1, 4], "look_at": [0, 0, 0]}"#;
+    std::fs::write(&camera, lens).unwrap();
+    let image = |file: &Path| {
+        let said = splat4d(&["render", str(&run), "--camera", str(&camera), "-o", str(file)]).run().refused();
+        assert!(said.contains("is a file of a folder of the capture's images"), "{said}");
+    };
+    image(&images.join("cam1/0000.png"));
+    image(&masks.join("cam1/0000.png"));
+    #[cfg(unix)]
+    image(&at("pool/0.png"));
+    let [inside, around, new] = [images.join("cam1/new"), images.clone(), at("photos/cam2/frames")];
+    for (words, how) in [
+        (&["train", str(&capture), "-o", str(&inside)][..], "lies inside a folder of the capture's images"),
+        (&["train", str(&capture), "--force", "-o", str(&around)], "contains a folder of the capture's images"),
+        (&["train", str(&capture), "--force", "-o", str(&at("sets"))], "contains the capture"),
+        (&["info", str(&capture), "--doctor", "-o", str(&inside)], "lies inside a folder of the capture's images"),
+        (&["export", str(&run), "--sequence", str(&new)], "lies inside a folder of the capture's images"),
+        (&["render", str(&run), "--path", "orbit", "-o", str(&new)], "lies inside a folder of the capture's images"),
+        (&["compress", str(&run), "-o", str(&new)], "lies inside a folder of the capture's images"),
+        (&["export", str(&run), "-o", str(&points)], "is a file of the capture"),
+        (
+            &["export", str(&run), "-o", str(&at("p.html")), "--link", str(&capture.join("x.s4d"))],
+            "a file of the capture",
+        ),
+        (&["render", str(&run), "--camera", str(&camera), "--raw", str(&capture.join("x"))], "a file of the capture"),
+    ] {
+        let said = splat4d(words).run().refused();
+        assert!(said.contains(how), "{words:?}: {said}");
+    }
+    // The frames that are read are those that would be written.
+    let frames = at("frames");
+    splat4d(&["convert", str(&at("a.ply")), str(&frames), "--frames"]).run().ok();
+    for read in ["frames/frame_00000.ply", "frames/frame_%05d.ply"] {
+        let said = splat4d(&["convert", str(&at(read)), str(&frames), "--frames"]).run().refused();
+        assert!(said.contains("what is read"), "{said}");
+    }
+}
+
 #[test]
 fn a_sequence_keeps_its_gaps_and_takes_over_no_tail() {
     let work = tempfile::tempdir().unwrap();

@@ -37,7 +37,7 @@ fn filmed_by(cameras: &[(&str, usize)], frames: usize, to: &Path) {
 }
 
 #[test]
-fn pictures_alone_become_a_capture_with_clocks_and_poses() {
+fn images_alone_become_a_capture_with_clocks_and_poses() {
     let dir = tempfile::tempdir().unwrap();
     let (films, take) = (dir.path().join("films"), dir.path().join("take"));
     filmed(&films);
@@ -233,7 +233,7 @@ fn a_calibration_places_cameras_and_clocks_are_found() {
         splat4d(&["import", "-o", str(&take), "--calibration", str(file)]).args(&args).run().refused()
     };
     let why = refused(&at("wrong.toml"));
-    assert!(why.contains("contradicts the pictures"), "{why}");
+    assert!(why.contains("contradicts the images"), "{why}");
     let strange: Vec<String> = (0..names.len()).map(|k| format!("strange{}", 3 * k)).collect();
     let strange: Vec<&str> = strange.iter().map(String::as_str).collect();
     std::fs::write(at("strange.toml"), toml(&told, &strange)).unwrap();
@@ -331,7 +331,7 @@ fn colmap_is_called_where_it_is_asked_for_and_its_model_is_taken() {
 
 /// Of three cameras geometry does not tell clocks, and these are silent: what is left is a guess.
 #[test]
-fn clocks_that_nothing_confirms_are_refused_and_can_be_told() {
+fn unconfirmed_time_offsets_are_refused_and_can_be_given() {
     let dir = tempfile::tempdir().unwrap();
     let (films, take) = (dir.path().join("films"), dir.path().join("take"));
     filmed_by(&CAMERAS[1..4], 8, &films);
@@ -343,10 +343,13 @@ fn clocks_that_nothing_confirms_are_refused_and_can_be_told() {
         splat4d(&all).args(&SMALL).args(more).run()
     };
     let refused = import(&[]).refused();
-    assert!(refused.contains("nothing tells how the clocks") && refused.contains("cam08"), "{refused}");
+    assert!(
+        refused.contains("the time offsets of these cameras are unknown") && refused.contains("cam08"),
+        "{refused}"
+    );
     assert!(refused.contains("--synchronous") && refused.contains("keep_offset"), "{refused}");
     assert!(!take.join("capture.json").exists());
-    assert!(take.join("import/report.json").is_file() && take.join("images/cam08").is_dir(), "what was found is kept");
+    assert!(take.join("import/report.json").is_file() && take.join("images/cam08").is_dir(), "results so far are kept");
     // The times of the files, on the user's word.
     import(&["--synchronous"]).ok();
     let report = json_of(&take.join("import/report.json"));
@@ -367,7 +370,7 @@ fn clocks_that_nothing_confirms_are_refused_and_can_be_told() {
 }
 
 #[test]
-fn a_moment_from_all_sides_needs_no_clock() {
+fn images_of_one_time_need_no_time_offsets() {
     let dir = tempfile::tempdir().unwrap();
     let (films, take) = (dir.path().join("films"), dir.path().join("take"));
     for (name, _) in CAMERAS {
@@ -375,7 +378,7 @@ fn a_moment_from_all_sides_needs_no_clock() {
         std::fs::copy(bundled().join(format!("images/{name}/0004.jpg")), films.join(name).join("0004.jpg")).unwrap();
     }
     let told = splat4d(&["import", str(&films), "-o", str(&take), "--no-doctor"]).run().ok();
-    assert!(told.contains("do not matter") && !told.contains("nothing tells how"), "{told}");
+    assert!(told.contains("do not matter") && !told.contains("are unknown"), "{told}");
     assert_eq!(Capture::open(&take, &CaptureOptions::default()).unwrap().frames.len(), CAMERAS.len());
 }
 
@@ -388,13 +391,13 @@ fn what_cannot_be_imported_is_explained() {
         |input: &Path, more: &[&str]| splat4d(&["import", str(input), "-o", str(&take)]).args(more).run().refused();
     assert!(refused(&at("nothing.mp4"), &[]).contains("nothing.mp4"));
     std::fs::create_dir(at("empty")).unwrap();
-    assert!(refused(&at("empty"), &[]).contains("neither a video nor a picture"));
+    assert!(refused(&at("empty"), &[]).contains("neither a video nor an image"));
     std::fs::write(at("zero.mp4"), []).unwrap();
     assert!(refused(&at("zero.mp4"), &[]).contains("empty"));
     let films = at("films");
     filmed(&films);
     let one = films.join("cam06");
-    assert!(refused(&one, &["--rig", "fixed"]).contains("nothing from two sides"));
+    assert!(refused(&one, &["--rig", "fixed"]).contains("one fixed camera"));
     assert!(refused(&films, &["--from", "3", "--to", "2"]).contains("come after"));
     assert!(refused(&films, &["--apart", "cam06"]).contains("left,right=2.4"));
     assert!(refused(&films, &["--apart", "cam06,cam99=2"]).contains("cam99"));
@@ -427,10 +430,20 @@ fn what_cannot_be_imported_is_explained() {
     let (before, own) = text.split_once("name = \"cam19\"").unwrap();
     let own = own.replacen("use = true", "use = false", 1);
     std::fs::write(&path, format!("{before}name = \"cam19\"{own}")).unwrap();
-    assert!(refused(&far, &["--rig", "fixed"]).contains("nothing from two sides"));
+    assert!(refused(&far, &["--rig", "fixed"]).contains("one fixed camera"));
     // A capture that is somebody's own stays.
     let own = at("own");
     std::fs::create_dir(&own).unwrap();
     std::fs::write(own.join("capture.json"), "{}").unwrap();
     assert!(splat4d(&["import", str(&films), "-o", str(&own)]).run().refused().contains("a capture already"));
+    // So do their images, and a calibration that the capture would contain.
+    let own = at("photos");
+    std::fs::create_dir_all(own.join("images/cam06")).unwrap();
+    std::fs::write(own.join("images/cam06/000000.jpg"), "mine").unwrap();
+    let said = splat4d(&["import", str(&films), "-o", str(&own)]).run().refused();
+    assert!(said.contains("holds images") && said.contains("no record"), "{said}");
+    assert_eq!(std::fs::read(own.join("images/cam06/000000.jpg")).unwrap(), b"mine");
+    std::fs::write(take.join("rig.toml"), "x = 1").unwrap();
+    let said = refused(&films, &["--calibration", str(&take.join("rig.toml"))]);
+    assert!(said.contains("contains the calibration"), "{said}");
 }

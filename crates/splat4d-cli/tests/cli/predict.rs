@@ -32,7 +32,7 @@ fn predict(run: &Path, args: &[&str]) -> Answer {
 }
 
 #[test]
-fn a_run_goes_on_and_is_compared_with_what_came() {
+fn a_run_is_forecast_and_compared_with_later_frames() {
     let work = tempfile::tempdir().unwrap();
     let (_, run) = seen(work.path(), SHARE);
     let actions = work.path().join("actions.csv");
@@ -79,7 +79,7 @@ fn what_cannot_be_predicted_is_refused_with_a_remedy() {
     assert!(actions("push.x,push.z\n1,2\n").contains("push.x"));
     assert!(actions("grip\n1,2\n").contains("line 2"));
     assert!(predict(&run, &["--model", "oracle"]).refused().contains("koopman"));
-    assert!(predict(&run, &["--oracle", str(&run)]).refused().contains("saw more of it"));
+    assert!(predict(&run, &["--oracle", str(&run)]).refused().contains("trained on more of it"));
     for flags in [["--horizon", "0"], ["--nodes", "999"], ["--seeds", "0"]] {
         predict(&run, &flags).refused();
     }

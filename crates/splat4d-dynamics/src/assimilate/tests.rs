@@ -62,7 +62,7 @@ impl Frames for Seen {
 }
 
 #[test]
-fn a_wrong_forecast_is_corrected_by_pictures() {
+fn a_wrong_forecast_is_corrected_by_images() {
     let scene = scene();
     let ticks: Vec<f64> = (0..10).map(|i| f64::from(i) / FPS).collect();
     let observed = observe(&scene, &ticks, 8).unwrap();

@@ -55,7 +55,7 @@ fn nothing_that_stands_still_is_moved() {
 }
 
 #[test]
-fn a_forecast_does_not_know_what_came_later() {
+fn a_forecast_does_not_use_later_frames() {
     let (paths, truth, _) = world("bounce", 40);
     let mut other = paths.clone();
     other.moments.extend(truth.into_iter().map(|m| m.iter().map(|p| Pose::at(p.x.map(|x| 7.0 * x))).collect()));

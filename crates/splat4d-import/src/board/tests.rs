@@ -92,7 +92,7 @@ fn tags_of_all_families_are_read_from_askew() {
 }
 
 #[test]
-fn what_is_no_tag_is_none() {
+fn other_patterns_are_not_tags() {
     let family = family("36h11");
     let camera = Camera::with_fov_y(Se3::look_at([0.0, 0.0, -2.0], [0.0; 3], [0.0, -1.0, 0.0]), 0.7, 320, 240);
     let mut picture = drawn(&camera, &[]);
@@ -112,7 +112,7 @@ fn what_is_no_tag_is_none() {
 }
 
 #[test]
-fn the_same_number_twice_in_a_picture_is_left_out() {
+fn the_same_number_twice_in_an_image_is_left_out() {
     let family = family("5x5");
     let put =
         |id: usize, x: f64| Put { family, id, corner: [x, -0.2, 0.0], right: [0.4, 0.0, 0.0], down: [0.0, 0.4, 0.0] };

@@ -283,6 +283,6 @@ pub(super) fn whole_size(sides: &[f64]) -> Result<[usize; 2]> {
     const MOST: f64 = 32_768.0;
     match sides {
         [w, h] if [w, h].iter().all(|s| **s >= 1.0 && **s <= MOST) => Ok([w.round() as usize, h.round() as usize]),
-        _ => Err(Error::input(format!("the picture size is {sides:?}")).remedy("Give pixels across and down.")),
+        _ => Err(Error::input(format!("the image size is {sides:?}")).remedy("Give pixels across and down.")),
     }
 }

@@ -51,8 +51,9 @@ pub fn shape(camera: &Calibrated, video: [usize; 2]) -> Result<Shape> {
     Err(Error::input(sizes(size, video)).remedy(advice))
 }
 
-const ADVICE: &str = "Pictures of another shape were cut or padded, which changes the principal point: give the video as it was \
-                      when the camera was calibrated, or correct size and principal point in the calibration.";
+const ADVICE: &str = "Images of another shape were cut or padded, which changes the principal point: give the video \
+                      as it was when the camera was calibrated, or correct size and principal point in the \
+                      calibration.";
 
 fn sizes(size: [usize; 2], video: [usize; 2]) -> String {
     format!("the video has {}x{} pixels, the calibration is for {}x{}", video[0], video[1], size[0], size[1])
@@ -84,8 +85,8 @@ pub fn fitted(
             scale = std::array::from_fn(|k| (stored[k] as f64 - expected[k]) / [w, h][k]);
             shift = std::array::from_fn(|k| if found[k] > 0.0 { expected[k] * bars[k] / found[k] } else { 0.0 });
             note = Some(format!(
-                "pictures were made smaller and have black bars ({:.0} px at the sides, {:.0} above and below), by which the \
-                 calibration was corrected; cut them off, for training learns them",
+                "images are smaller and have black bars ({:.0} px at the sides, {:.0} above and below); the \
+                 calibration was corrected accordingly",
                 found[0], found[1]
             ));
         } else if blocks(size) == blocks(video) {
@@ -101,10 +102,10 @@ pub fn fitted(
     let k = &camera.intrinsics;
     if !(0.0..=w).contains(&k.cx) || !(0.0..=h).contains(&k.cy) {
         return Err(Error::input(format!(
-            "its principal point ({:.0}, {:.0}) lies outside of pictures of {}x{}",
+            "its principal point ({:.0}, {:.0}) lies outside of images of {}x{}",
             k.cx, k.cy, size[0], size[1]
         ))
-        .remedy("It was calibrated with larger pictures: write their size into the calibration (size, image_width)."));
+        .remedy("It was calibrated with larger images: write their size into the calibration (size, image_width)."));
     }
     let [sx, sy] = scale;
     let intrinsics = Intrinsics { fx: k.fx * sx, fy: k.fy * sy, cx: k.cx * sx + shift[0], cy: k.cy * sy + shift[1] };

@@ -323,7 +323,7 @@ fn bad_opencv_files_are_explained() {
     refused(&with("901.250000000000", ".Nan"), "NaN");
     refused(&with("901.250000000000", "-901.25"), "focal length");
     refused(&with("rows: 3", "rows: 4"), "stated number of values");
-    refused(&with("image_width: 1280", "image_width: 0"), "picture size");
+    refused(&with("image_width: 1280", "image_width: 0"), "image size");
     refused(&with("rows: 5", "rows: 6"), "distortion_coefficients");
     let six = good.replacen("rows: 5", "rows: 6", 1).replacen(&list(&[c.intrinsics.fx])[..4], "901.", 1);
     let six = six.replacen("0.005600000000 ]", "0.0056, 0.1 ]", 1);
@@ -362,7 +362,7 @@ fn tables_of_pose2sim_and_anipose_are_read() {
     refused(&[("a.toml", good.replacen("matrix", "nomatrix", 1))], "camera left: its camera matrix is missing");
     refused(&[("a.toml", good.replacen("901.250000000000", "nan", 1))], "NaN");
     refused(&[("a.toml", good.replace("\"right\"", "\"left\""))], "twice");
-    refused(&[("a.toml", good.replacen("size = [ 1280.0, 720 ]", "size = [ 1280.0 ]", 1))], "picture size");
+    refused(&[("a.toml", good.replacen("size = [ 1280.0, 720 ]", "size = [ 1280.0 ]", 1))], "image size");
     refused(&[("a.toml", good.replacen("distortions = [", "distortions = [ 1.0, 2.0,", 1))], "7 distortion terms");
     refused(&[("a.toml", good.replacen("[cam_1]", "[cam_1", 1))], "TOML");
     // Caliscope names cameras by number, their videos port_N.
@@ -399,13 +399,13 @@ fn qualisys_files_are_read_in_metres() {
     refused(&[("a.xml", good.replacen("<intrinsic", "<intrinsics", 1))], "<intrinsic> is missing");
     refused(&[("a.xml", good.replacen("focalLengthU=\"", "focalLengthU=\"nan", 1))], "focalLengthU");
     refused(&[("a.xml", good.replace("right\"", "left\""))], "twice");
-    refused(&[("a.xml", good.replacen("right=\"1279\"", "right=\"-5\"", 1))], "picture size");
+    refused(&[("a.xml", good.replacen("right=\"1279\"", "right=\"-5\"", 1))], "image size");
     let off = folder(&[("a.xml", good.replacen("active=\"1\"", "active=\"0\"", 1))]).unwrap();
     assert_eq!((off.cameras.len(), off.notes.len()), (1, 1));
 }
 
 #[test]
-fn transforms_captures_and_colmap_are_read_without_pictures() {
+fn transforms_captures_and_colmap_are_read_without_images() {
     let truth = truth();
     let good = transforms(&truth);
     same(&folder(&[("transforms.json", good.clone())]).unwrap(), &truth);

@@ -1,6 +1,6 @@
 //! What a camera's own pictures say.
 
-use super::check::{GAMMA, SHARPNESS, Told, grade, unit, worse};
+use super::finding::{GAMMA, SHARPNESS, Told, grade, unit, worse};
 use super::look::Seen;
 use super::{Grade, Report};
 use crate::sync::median;
@@ -39,7 +39,7 @@ pub(super) fn alone(capture: &Capture, camera: usize, s: &Seen, report: &mut Rep
         report.cameras[camera].focus = Some(ratio);
         if let Some(g) = grade(ratio.max(1.0 / ratio.max(f64::MIN_POSITIVE)), SHARPNESS.map(|s| 1.0 / s)) {
             let what = format!(
-                "Camera {name} changes its focus: from first to last its pictures get {ratio:.2} times as sharp."
+                "Camera {name} changes its focus: from first to last its images get {ratio:.2} times as sharp."
             );
             let words = (
                 "Texture that is soft in one part of the take, and a lens that is not one.",
@@ -64,7 +64,7 @@ pub(super) fn alone(capture: &Capture, camera: usize, s: &Seen, report: &mut Rep
         }
         let doubled = s.clock.doubled.len();
         if let Some(g) = grade(doubled as f64 / s.row.max(1) as f64, FRAMES) {
-            let what = format!("Camera {name}: {doubled} of {} pictures show the one before again.", s.row);
+            let what = format!("Camera {name}: {doubled} of {} images repeat the previous one.", s.row);
             told.add(
                 (g, "doubled"),
                 who,
@@ -79,8 +79,7 @@ pub(super) fn alone(capture: &Capture, camera: usize, s: &Seen, report: &mut Rep
     if steps.len() >= 4 && capture.cameras[camera].fixed {
         let flicker = median(&mut steps);
         if let Some(g) = grade(flicker, FLICKER) {
-            let what =
-                format!("Camera {name} flickers: brightness jumps by {flicker:.2} stops from picture to picture.");
+            let what = format!("Camera {name} flickers: brightness jumps by {flicker:.2} stops from frame to frame.");
             told.add(
                 (g, "flicker"),
                 who,
@@ -94,18 +93,18 @@ pub(super) fn alone(capture: &Capture, camera: usize, s: &Seen, report: &mut Rep
         let usual = median(&mut s.detail.clone());
         let soft = s.detail.iter().filter(|d| **d < SHARPNESS[0] * usual).count();
         if soft > 0 {
-            let what = format!("Camera {name}: {soft} of {} pictures are blurred, against its others.", s.detail.len());
+            let what = format!("Camera {name}: {soft} of {} images are blurred, against its others.", s.detail.len());
             told.add(
                 (Grade::Warning, "blurred"),
                 who,
                 (soft as f64, "frames"),
                 what,
-                ("Softness that comes and goes.", "Shorter exposure, fixed focus; leave these pictures out."),
+                ("Softness that comes and goes.", "Shorter exposure, fixed focus; leave these images out."),
             );
         }
     }
     if let Some(g) = grade(s.blocks, BLOCKS) {
-        let what = format!("Camera {name} is compressed hard: its pictures have edges every 8 pixels.");
+        let what = format!("Camera {name} is compressed hard: its images have edges every 8 pixels.");
         told.add(
             (g, "compression"),
             who,
@@ -139,13 +138,13 @@ pub(super) fn alone(capture: &Capture, camera: usize, s: &Seen, report: &mut Rep
         }
     }
     if s.sizes.len() > 1 {
-        let what = format!("Camera {name} has pictures of {} sizes.", s.sizes.len());
+        let what = format!("Camera {name} has images of {} sizes.", s.sizes.len());
         told.add(
             (Grade::Note, "sizes"),
             who,
             (s.sizes.len() as f64, "sizes"),
             what,
-            ("", "Check that its lens is told for each of them."),
+            ("", "Check that its intrinsics are given for each size."),
         );
     }
 }

@@ -1,6 +1,6 @@
 //! What cameras say of each other: poses, exposure, white balance and sharpness, by features that two of them see.
 
-use super::check::{GAMMA, MATCHES, SHARPNESS, Told, grade, unit};
+use super::finding::{AGREE, GAMMA, MATCHES, SHARPNESS, Told, grade, unit};
 use super::look::{Seen, Stand, detail};
 use super::{Options, PairReport, Report};
 use crate::sfm::pictures::{Feature, Sight};
@@ -27,8 +27,6 @@ const EXPOSURE: [f64; 2] = [0.15, 0.5];
 /// are farther apart most, degrees.
 const SURE: usize = 20;
 const APART: f64 = 60.0;
-/// So many of a camera's pairs must agree on its error at least, of so many that tell it; chance only makes errors larger.
-pub(super) const AGREE: usize = 2;
 const TELL: usize = 3;
 /// Median over lower quartile of the size of a normal error: 0.6745 / 0.3186.
 const QUARTILE_TO_MEDIAN: f64 = 2.117;
@@ -197,7 +195,7 @@ pub(super) fn between(
     if pairs.is_empty() {
         report
             .left
-            .push("No two pictures have enough in common: poses, exposure and sharpness were not compared.".into());
+            .push("No two images have enough in common: poses, exposure and sharpness were not compared.".into());
         return;
     }
     let told = |p: &Pair| PairReport {
@@ -234,7 +232,7 @@ pub(super) fn between(
             && let Some(g) = grade(off, EPIPOLAR).min(grade(own, OWN_PIXELS))
         {
             let what = format!(
-                "Camera {}: what it shows lies {off:.1} px (of 1920) beside where its pose and lens say.",
+                "Camera {}: its features are {off:.1} px (at 1920 px) from where its pose and lens project them.",
                 name(camera)
             );
             let words = (
@@ -249,7 +247,7 @@ pub(super) fn between(
                 let what = format!("Camera {} is {:.2} stops {way} than the others.", name(camera), green.abs());
                 let words = (
                     "Brightness that changes with the view, and fog that explains it.",
-                    "Lock exposure, correct its pictures, or keep exposure learnt.",
+                    "Lock exposure, correct its images, or keep exposure learnt.",
                 );
                 told.add((g, "exposure"), Some(name(camera)), (green, "stops"), what, words);
             }
@@ -264,7 +262,7 @@ pub(super) fn between(
                 );
                 let words = (
                     "Colours that change with the view.",
-                    "Lock white balance, correct its pictures, or keep exposure learnt.",
+                    "Lock white balance, correct its images, or keep exposure learnt.",
                 );
                 told.add((g, "white-balance"), Some(name(camera)), (tint, "stops"), what, words);
             }

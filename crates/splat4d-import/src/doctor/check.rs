@@ -1,6 +1,7 @@
 //! The checks. Thresholds are of the project's own study of captures ("Doctor": what is seen in results) where no other source
 //! is named: the first of two is a warning, the second is bad. Those of flicker, dark and clipped pictures are chosen by eye.
 
+use super::finding::{Told, grade};
 use super::look::Seen;
 use super::{CameraReport, Finding, Grade, Options, Report, alone, between, clocks, volume};
 use splat4d::scene::Camera;
@@ -8,8 +9,6 @@ use splat4d_train::capture::Capture;
 use splat4d_train::event::Progress;
 use splat4d_train::vision::triangulate::angle_at;
 
-/// Sharpness relative to other cameras.
-pub(super) const SHARPNESS: [f64; 2] = [0.6, 0.35];
 /// Angle to the nearest other camera, degrees.
 const ANGLE: [f64; 2] = [25.0, 45.0];
 /// Fewer cameras than the first are limited, than the second poor.
@@ -18,59 +17,8 @@ const CAMERAS: [usize; 2] = [6, 4];
 const VOLUME: [f64; 2] = [0.8, 0.5];
 /// Part of the memory that training takes: the system and other programs want theirs, and what does not fit is swapped.
 const MEMORY: [f64; 2] = [0.8, 1.0];
-/// sRGB values are this power of light, about.
-pub(super) const GAMMA: f64 = 2.2;
-/// Matches that tell something of a pair.
-pub(super) const MATCHES: usize = 12;
 /// Cameras with one fault become one finding from this part of all on.
 const MOST: f64 = 0.5;
-
-pub(super) fn grade(value: f64, [warning, bad]: [f64; 2]) -> Option<Grade> {
-    match value {
-        v if v >= bad => Some(Grade::Bad),
-        v if v >= warning => Some(Grade::Warning),
-        _ => None,
-    }
-}
-
-pub(super) fn worse([a, b]: [f64; 2], [c, d]: [f64; 2]) -> [f64; 2] {
-    [a.max(c), b.max(d)]
-}
-
-/// Pixels of a picture 1920 wide for each of its own.
-pub(super) fn unit(view: &Camera) -> f64 {
-    /// The longer side of what thresholds are about.
-    const WIDE: f64 = 1920.0;
-    WIDE / view.width.max(view.height) as f64
-}
-
-/// Where findings go.
-pub(super) struct Told<'a> {
-    pub(super) report: &'a mut Report,
-}
-
-impl Told<'_> {
-    pub(super) fn add(
-        &mut self,
-        (grade, check): (Grade, &'static str),
-        camera: Option<&str>,
-        (amount, unit): (f64, &'static str),
-        what: String,
-        (looks, remedy): (&'static str, &str),
-    ) {
-        self.report.findings.push(Finding {
-            grade,
-            check,
-            camera: camera.map(str::to_owned),
-            amount: Some(amount),
-            unit,
-            what,
-            looks,
-            remedy: remedy.to_owned(),
-            alike: Vec::new(),
-        });
-    }
-}
 
 /// Makes all checks and adds what they find.
 pub(super) fn all(
@@ -142,7 +90,7 @@ fn take(capture: &Capture, seen: &[Seen], report: &mut Report) {
         (0..seen.len()).filter(|&c| capture.cameras[c].fixed && !seen[c].stands.is_empty()).collect();
     if fixed.len() < seen.len() {
         report.left.push(
-            "Moving cameras: whether a camera moved, its flicker, frames and clock are told of fixed ones only.".into(),
+            "Moving cameras: movement, flicker, frames and time offset are checked for fixed cameras only.".into(),
         );
         return;
     }
@@ -155,7 +103,7 @@ fn take(capture: &Capture, seen: &[Seen], report: &mut Report) {
             None,
             (fixed.len() as f64, "cameras"),
             what,
-            ("Good pictures only near the cameras.", "Six and more, all round the scene."),
+            ("Good quality only near the cameras.", "Six and more, all round the scene."),
         );
     }
     if fixed.len() < 2 {
@@ -201,7 +149,7 @@ pub(super) fn volume_of(seen: &[&Seen], target: [f64; 3], report: &mut Report) {
         return;
     };
     if let Some(g) = grade(1.0 / share.max(f64::MIN_POSITIVE), VOLUME.map(|v| 1.0 / v)) {
-        let what = format!("Of the space in which something moves three cameras see {:.0} %.", 100.0 * share);
+        let what = format!("Three cameras see {:.0} % of the space in which something moves.", 100.0 * share);
         let words =
             ("Moving things that dissolve between the views.", "Turn the cameras to the action, or film with more.");
         Told { report }.add((g, "volume"), None, (100.0 * share, "%"), what, words);

@@ -1,8 +1,7 @@
 //! Clocks of cameras against each other, by what moves.
 
 use super::Report;
-use super::between::AGREE;
-use super::check::{MATCHES, Told, grade, unit};
+use super::finding::{AGREE, MATCHES, Told, grade, unit};
 use super::look::Seen;
 use super::shutter::{self, Pair};
 use crate::sync::epipolar::{Range, fundamental, lag, neighbours};
@@ -117,7 +116,7 @@ pub(super) fn clocks(capture: &Capture, seen: &[Seen], report: &mut Report, prog
         if let Some(g) = grade(seconds.abs(), SHUTTER) {
             let name = &capture.cameras[c].name;
             let what = format!(
-                "Camera {name} reads its pictures row by row: the last row is {:.0} ± {:.0} ms later than the first.",
+                "Camera {name} has a rolling shutter: the last row is {:.0} ± {:.0} ms later than the first.",
                 1e3 * seconds,
                 1e3 * sigma
             );

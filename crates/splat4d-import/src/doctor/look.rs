@@ -6,6 +6,7 @@ use crate::sync::grey::{Grey, Pyramid};
 use crate::sync::median;
 use crate::sync::tracks::{APART, LEVELS, PIXELS, Track, Tracker, corners, follow, moving, small};
 use crate::video::{Clock, mean_difference};
+use splat4d::math::median_by;
 use splat4d::scene::{Camera, Planes};
 use splat4d_train::capture::{Capture, ImageStore, Rgb8};
 
@@ -85,8 +86,7 @@ fn median_of(all: &[Rgb8]) -> Rgb8 {
         let mut values = vec![0; all.len()];
         for (p, v) in out.data.iter_mut().enumerate() {
             values.iter_mut().zip(all).for_each(|(v, a)| *v = a.data[p]);
-            let middle = values.len() / 2;
-            *v = *values.select_nth_unstable(middle).1;
+            *v = median_by(&mut values, u8::cmp).expect("there are images");
         }
     }
     out

@@ -7,6 +7,7 @@ mod alone;
 mod between;
 mod check;
 mod clocks;
+mod finding;
 mod look;
 mod shutter;
 #[cfg(test)]
@@ -164,7 +165,7 @@ fn machine_memory() -> Option<u64> {
 /// Errors: a capture without pictures, pictures that cannot be read.
 pub fn examine(capture: &Capture, options: &Options, progress: &mut Progress<'_>) -> Result<Report> {
     if capture.frames.is_empty() {
-        return Err(Error::input("the capture has no pictures").at(capture.root.display()).remedy("Add some."));
+        return Err(Error::input("the capture has no images").at(capture.root.display()).remedy("Add some."));
     }
     let store = ImageStore::new(Arc::new(capture.clone()), STORE);
     let mut report = Report { capture: capture.name.clone(), ..Report::default() };

@@ -180,7 +180,7 @@ fn a_camera_out_of_focus_is_found() {
 }
 
 #[test]
-fn single_blurred_pictures_are_found() {
+fn single_blurred_images_are_found() {
     is_found(
         &with(|n, p| {
             if n == 5 {
@@ -202,7 +202,7 @@ fn a_camera_that_was_pushed_is_found() {
 
 /// A camera that stands still before one body that fills most of its picture and drifts, so that most corners are the body's.
 #[test]
-fn a_camera_that_a_large_body_passes_is_not_said_to_have_moved() {
+fn a_large_passing_object_is_not_reported_as_camera_motion() {
     let near = |t: f64| {
         let mut view = camera(ILL);
         view.intrinsics.cx += 3.0 + 40.0 * t;
@@ -223,14 +223,14 @@ fn a_camera_that_a_large_body_passes_is_not_said_to_have_moved() {
 }
 
 #[test]
-fn pictures_that_come_twice_are_found() {
+fn images_that_come_twice_are_found() {
     let mut clip = clean().clone();
     clip[ILL][6] = clip[ILL][5].clone();
     is_found(&clip, "doubled");
 }
 
 #[test]
-fn dark_and_clipped_pictures_are_found() {
+fn dark_and_clipped_images_are_found() {
     is_found(&with(|_, p| times(p, [0.1; 3])), "dark");
     is_found(&with(|_, p| times(p, [3.0; 3])), "clipped");
 }
@@ -426,7 +426,7 @@ fn a_rolling_shutter_is_found() {
 }
 
 #[test]
-fn few_cameras_one_camera_and_one_moment_are_told() {
+fn few_cameras_one_camera_and_one_time_are_reported() {
     assert_eq!(found(&says(clean(), 0.0, 3), "cameras").len(), 1);
     assert_eq!(found(&says(clean(), 0.0, 1), "cameras").len(), 1);
     let moment: Clip = clean().iter().map(|c| c[..1].to_vec()).collect();
@@ -434,7 +434,7 @@ fn few_cameras_one_camera_and_one_moment_are_told() {
 }
 
 #[test]
-fn training_that_does_not_fit_into_memory_is_told() {
+fn training_that_does_not_fit_into_memory_is_reported() {
     let folder = tempfile::tempdir().unwrap();
     let capture = write(folder.path(), clean(), 0.0, CAMERAS);
     let grades =
@@ -456,7 +456,7 @@ fn training_that_does_not_fit_into_memory_is_told() {
 
 /// The clean take with faults that are smaller than what is told, each of them as large as the names of the checks say.
 #[test]
-fn faults_too_small_to_be_seen_are_not_told() {
+fn invisible_faults_are_not_reported() {
     let mut pushed = clean().clone();
     let mut view = camera(ILL);
     view.intrinsics.cx += 0.25;

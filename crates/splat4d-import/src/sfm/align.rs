@@ -2,8 +2,8 @@
 
 use super::algebra::Mat3;
 use rayon::prelude::*;
-use splat4d::math::Se3;
 use splat4d::math::se3::{cross, dot, mat_mul, mat_vec, norm, normalize, sub};
+use splat4d::math::{Se3, median};
 
 /// The direction that most cameras hold upwards: the mean of their −y axes.
 pub fn up_of(poses: &[Se3]) -> [f64; 3] {
@@ -14,12 +14,8 @@ pub fn up_of(poses: &[Se3]) -> [f64; 3] {
 /// The median distance of the cameras from what they look at: of each, the median distance of the points that it sees. With it
 /// as the unit, a scene is of a size that is known, where no length is.
 pub fn median_distance(distances: &mut [Vec<f64>]) -> Option<f64> {
-    let middle = |v: &mut Vec<f64>| {
-        let at = v.len() / 2;
-        *v.select_nth_unstable_by(at, f64::total_cmp).1
-    };
-    let mut each: Vec<f64> = distances.iter_mut().filter(|d| !d.is_empty()).map(middle).collect();
-    (!each.is_empty()).then(|| middle(&mut each))
+    let mut each: Vec<f64> = distances.iter_mut().filter_map(|d| median(d)).collect();
+    median(&mut each)
 }
 
 /// The frame along which a scene is built.
@@ -240,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn walls_and_floor_tell_the_axes() {
+    fn walls_and_floor_give_the_axes() {
         let turn = rotation([20.0, -70.0, 35.0]);
         let points = room(&turn, 0.005);
         let true_up = [turn[0][2], turn[1][2], turn[2][2]];

@@ -1,26 +1,15 @@
 //! Cameras of which the lens is known, or the lens and the place: features are straightened once, and the rest is found about them.
 
-use super::lens::Lens as Plain;
-use super::mapper::{Ground, Mapped, Mapping, unit};
+use super::lens::{Known, Lens as Plain, unit};
+use super::mapper::{Ground, Mapped, Mapping};
 use super::pictures::{Feature, Sight};
 use super::tracks::{self, Link};
 use crate::sync::epipolar::{fundamental, sampson};
 use splat4d::math::Se3;
 use splat4d::math::se3::dot;
-use splat4d::scene::{Camera, Intrinsics, Lens};
+use splat4d::scene::{Camera, Intrinsics};
 use splat4d_train::capture::Distortion;
 use splat4d_train::event::Progress;
-
-/// What is known of a camera.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Known {
-    /// Pixels of the files' pictures.
-    pub intrinsics: Intrinsics,
-    /// Distortion.
-    pub lens: Lens,
-    /// Takes world points into the camera's axes, where that is known too.
-    pub pose: Option<Se3>,
-}
 
 /// Rays farther off the axis than this (tangent; 72 degrees) are left out: a straightened pixel there is wide, and of little use.
 const WIDEST: f64 = 3.0;

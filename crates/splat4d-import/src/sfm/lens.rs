@@ -4,6 +4,16 @@ use splat4d::math::Se3;
 use splat4d::math::se3::mat_vec;
 use splat4d::scene::{Camera, Intrinsics, Lens as SceneLens};
 
+/// Pixels across for which tolerances are stated.
+const FULL: f64 = 1920.0;
+/// Tolerances shrink with the picture, but not below this share: features of small pictures are no more exact than half a pixel.
+const SMALLEST_UNIT: f64 = 0.5;
+
+/// Pixels of a picture of this larger side for one of a picture of 1920.
+pub(crate) fn unit(size: f64) -> f64 {
+    (size / FULL).max(SMALLEST_UNIT)
+}
+
 /// Focal length, distortion and principal point of a camera.
 ///
 /// A place (x, y, z) in the camera's axes is seen at f·d·(x/z, y/z) + (cx, cy) with d = 1 + k1·(x² + y²)/z².
@@ -113,6 +123,17 @@ pub(crate) fn off(lens: &Lens, pose: &Se3, x: [f64; 3], pixel: [f64; 2]) -> f64 
     let p = mat_vec(&pose.rotation, x);
     let p = std::array::from_fn(|k| p[k] + pose.translation[k]);
     lens.project(p).map_or(f64::INFINITY, |[u, v]| (u - pixel[0]).hypot(v - pixel[1]))
+}
+
+/// What is known of a camera.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Known {
+    /// Pixels of the files' pictures.
+    pub intrinsics: Intrinsics,
+    /// Distortion.
+    pub lens: SceneLens,
+    /// Takes world points into the camera's axes, where that is known too.
+    pub pose: Option<Se3>,
 }
 
 #[cfg(test)]

@@ -4,7 +4,7 @@ mod overlaid;
 mod strays;
 
 use super::adjust::{Bundle, Free, Priors, Settings, Sighting, View, adjust};
-use super::lens::{Lens, off};
+use super::lens::{Lens, off, unit};
 use super::pictures::{Feature, Sight};
 use super::resection::{Known, Placed, place, polish};
 use super::tracks::{self, Link, Track, about_middle};
@@ -14,16 +14,6 @@ use splat4d::math::{Rng, Se3};
 use splat4d::scene::Camera;
 use splat4d_train::event::Progress;
 use splat4d_train::vision::triangulate::{Sight as Ray, Transfer, angle_at, triangulate};
-
-/// Pixels across for which tolerances are stated.
-const FULL: f64 = 1920.0;
-/// Tolerances shrink with the picture, but not below this share: features of small pictures are no more exact than half a pixel.
-const SMALLEST_UNIT: f64 = 0.5;
-
-/// Pixels of a picture of this larger side for one of a picture of 1920.
-pub(crate) fn unit(size: f64) -> f64 {
-    (size / FULL).max(SMALLEST_UNIT)
-}
 
 /// How cameras are placed.
 #[derive(Clone, Debug, PartialEq)]
@@ -498,7 +488,8 @@ impl Map<'_> {
         let known = self.known(sight);
         if known.len() < SEES {
             self.reasons[sight] = format!(
-                "it shares {} places with the others, {SEES} are needed: the overlap is small, or its pictures look different",
+                "it shares {} points with the others, {SEES} are needed: the overlap is small, or its images look \
+                 different",
                 known.len()
             );
             return false;

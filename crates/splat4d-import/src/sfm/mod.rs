@@ -146,8 +146,10 @@ fn solve_sights(
         return Ok(solution(who, sights, mapped, links.len(), 1.0));
     }
     let alone = || {
-        Error::input("no two of these pictures show the same things")
-            .remedy("Film one scene from neighbouring places (at most 30 degrees apart), in focus and in light.")
+        Error::input("no two of these images show the same scene").remedy(
+            "Film one scene with neighbouring cameras at most 20 degrees apart, in focus and well lit \
+             (docs/filming.md).",
+        )
     };
     if links.is_empty() {
         return Err(alone());

@@ -1,12 +1,12 @@
 //! What cameras see, as features: of what stands still on the median picture, of what moves at moments that all share.
 
-use super::known::Known;
+use super::lens::Known;
 use super::overlay::Shown;
 use crate::sync::grey::{Grey, Pyramid};
 use crate::sync::tracks::{LEVELS, follow};
 use crate::{Error, Result};
 use rayon::prelude::*;
-use splat4d::math::Se3;
+use splat4d::math::{Se3, median_by};
 use splat4d::scene::Planes;
 use splat4d_train::event::Progress;
 use splat4d_train::vision::features::{self, Limits, NUMBERS};
@@ -125,30 +125,15 @@ const FASTEST: f64 = 40.0;
 fn load(pictures: &dyn Pictures, camera: usize, frame: usize, most: usize) -> Result<(Planes<f32>, f64)> {
     let mut picture = pictures.load(camera, frame)?;
     if picture.channels != 3 || picture.width.min(picture.height) < 32 {
-        let what = format!("a picture of {}x{} with {} channels", picture.width, picture.height, picture.channels);
-        return Err(Error::input(what).at(pictures.name(camera)).remedy("Give colour pictures of 32x32 and more."));
+        let what = format!("an image of {}x{} with {} channels", picture.width, picture.height, picture.channels);
+        return Err(Error::input(what).at(pictures.name(camera)).remedy("Give colour images of 32x32 and more."));
     }
     let mut factor = 1.0;
     while picture.pixels() > most {
-        picture = halved(&picture);
+        picture.halve();
         factor *= 2.0;
     }
     Ok((picture, factor))
-}
-
-/// The mean of 2x2 boxes.
-fn halved(from: &Planes<f32>) -> Planes<f32> {
-    let (h, w) = (from.height / 2, from.width / 2);
-    let mut out = Planes::new(from.channels, h, w);
-    for c in 0..from.channels {
-        for y in 0..h {
-            for x in 0..w {
-                let at = |dy: usize, dx: usize| from.get(c, 2 * y + dy, 2 * x + dx);
-                out.data[(c * h + y) * w + x] = 0.25 * (at(0, 0) + at(0, 1) + at(1, 0) + at(1, 1));
-            }
-        }
-    }
-    out
 }
 
 /// `count` numbers evenly among `of`, or all.
@@ -200,8 +185,7 @@ fn median(pictures: &dyn Pictures, camera: usize, most: usize) -> Result<(Planes
     let mut values = vec![0u8; all.len()];
     for (p, v) in out.data.iter_mut().enumerate() {
         values.iter_mut().zip(&all).for_each(|(v, picture)| *v = picture[p]);
-        let middle = values.len() / 2;
-        *v = f32::from(*values.select_nth_unstable(middle).1) / 255.0;
+        *v = f32::from(median_by(&mut values, u8::cmp).expect("there are images")) / 255.0;
     }
     Ok((out, factor))
 }
@@ -436,7 +420,7 @@ pub fn walking(
 ) -> Result<Vec<(usize, usize, Sight)>> {
     let total: usize = (0..pictures.cameras()).map(|c| pictures.frames(c)).sum();
     if total == 0 {
-        return Err(Error::input("there are no pictures"));
+        return Err(Error::input("there are no images"));
     }
     let all: Vec<(usize, usize)> =
         (0..pictures.cameras()).flat_map(|c| (0..pictures.frames(c)).map(move |k| (c, k))).collect();

@@ -1,6 +1,6 @@
 //! From made-up features and pictures to cameras.
 
-use super::known::Known;
+use super::lens::Known;
 use super::lens::Lens;
 use super::mapper::{FOCALS, Mapping, map};
 use super::pictures::{Feature, Look, Pictures, Sight, fixed};
@@ -287,7 +287,7 @@ fn walk(cameras: usize) -> Walk {
 }
 
 #[test]
-fn what_moves_is_seen_at_moments_with_its_velocity() {
+fn what_moves_is_seen_at_times_with_its_velocity() {
     let mut silent = |_: &_| {};
     let look = Look { moments: 3, ..Look::default() };
     let sights = fixed(&walk(1), &look, &mut Progress(&mut silent)).unwrap();
@@ -304,7 +304,7 @@ fn what_moves_is_seen_at_moments_with_its_velocity() {
 }
 
 #[test]
-fn pictures_of_straightened_features_are_not_laid_over_each_other() {
+fn images_of_straightened_features_are_not_laid_over_each_other() {
     let mut silent = |_: &_| {};
     let camera = Lens { k1: -0.2, ..Lens::plain(200.0, 240, 120) }.camera(Se3::IDENTITY, 240, 120);
     let known = Known { intrinsics: camera.intrinsics, lens: camera.lens, pose: None };

@@ -188,7 +188,7 @@ const FAR: f32 = 65_536.0;
 /// Cameras whose axes are farther apart see other sides of things, degrees.
 const WIDEST: f64 = 80.0;
 
-/// Compares placed pictures along epipolar lines, within `tolerance` pixels of [`super::mapper::unit`].
+/// Compares placed pictures along epipolar lines, within `tolerance` pixels of [`super::lens::unit`].
 pub(crate) fn guided(
     sights: &[Sight],
     known: &[Option<Known>],
@@ -209,7 +209,7 @@ pub(crate) fn guided(
             .map(|&[a, b]| {
                 let (p, q) = (known[a].as_ref()?, known[b].as_ref()?);
                 let size = sights[b].size[0].max(sights[b].size[1]) as f64;
-                let limit = tolerance * super::mapper::unit(size);
+                let limit = tolerance * super::lens::unit(size);
                 let transfer = Transfer::new(&p.camera, &q.camera);
                 let lines: Vec<[f32; 3]> = p
                     .pixels
@@ -297,7 +297,7 @@ fn verified(sights: &[Sight], [a, b]: [usize; 2], matches: Vec<([usize; 2], f32)
     };
     let pairs: Vec<Pair> = matches.iter().map(pair).collect();
     let size = from.size.iter().chain(&to.size).copied().max().expect("there are four") as f64;
-    let tolerance = TOLERANCE * super::mapper::unit(size);
+    let tolerance = TOLERANCE * super::lens::unit(size);
     let found = fundamental(&pairs, size, tolerance, rng)?;
     let few = found.inliers.len() < LEAST || (found.inliers.len() as f64) < LEAST_SHARE * matches.len() as f64;
     (!few).then(|| Link {
@@ -398,7 +398,7 @@ mod tests {
     }
 
     #[test]
-    fn features_of_different_moments_never_match() {
+    fn features_of_different_times_never_match() {
         let a = sight(vec![feature(1, 10.0, 0), feature(2, 50.0, 1), feature(3, 90.0, 2)]);
         let b = sight(vec![
             feature(4, 30.0, 0),

@@ -1,5 +1,6 @@
 //! Grey pictures in ever smaller sizes.
 
+use splat4d::math::image::box_means;
 use splat4d_train::capture::Rgb8;
 
 /// A grey picture, values from 0 to 1, rows from the top.
@@ -22,17 +23,8 @@ impl Grey {
 
     /// The means of boxes of k×k pixels; what is left over at the edges is dropped.
     pub(super) fn reduced(&self, k: usize) -> Self {
-        let (width, height) = (self.width / k, self.height / k);
-        let mut data = vec![0.0; width * height];
-        for (y, row) in data.chunks_exact_mut(width.max(1)).enumerate() {
-            for inner in y * k..(y + 1) * k {
-                let from = &self.data[inner * self.width..][..width * k];
-                row.iter_mut().zip(from.chunks_exact(k)).for_each(|(o, v)| *o += v.iter().sum::<f32>());
-            }
-        }
-        let scale = 1.0 / (k * k) as f32;
-        data.iter_mut().for_each(|v| *v *= scale);
-        Self { width, height, data }
+        let data = box_means(&self.data, self.width, self.height, k);
+        Self { width: self.width / k, height: self.height / k, data }
     }
 
     /// Half the size, after a binomial blur, so that fine texture does not flicker.

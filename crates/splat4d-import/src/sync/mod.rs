@@ -54,11 +54,7 @@ impl fmt::Display for Refusal {
 
 /// The middle value; half of the values may be anything. NaN of none.
 pub(crate) fn median(values: &mut [f64]) -> f64 {
-    if values.is_empty() {
-        return f64::NAN;
-    }
-    let middle = values.len() / 2;
-    *values.select_nth_unstable_by(middle, f64::total_cmp).1
+    splat4d::math::median(values).unwrap_or(f64::NAN)
 }
 
 /// Ratio of the standard deviation to the median absolute deviation of a normal distribution.

@@ -179,7 +179,7 @@ fn motion_along_the_epipolar_lines_says_nothing() {
 }
 
 #[test]
-fn pictures_become_tracks_and_tracks_an_offset() {
+fn images_become_tracks_and_tracks_an_offset() {
     let rig = Rig::new(&[0.0, 1.37 * FRAME], 30, Dance::Free);
     let frames = 26;
     let tracks = [0, 1].map(|c| {
@@ -273,7 +273,7 @@ fn two_witnesses_that_contradict_each_other_are_not_averaged() {
 }
 
 #[test]
-fn what_the_user_tells_stays() {
+fn settings_of_the_user_stay() {
     let evidence = lags(&TRUTH, Kind::Sound);
     let mut given = vec![None; 7];
     (given[2], given[3]) = (Some(10.0), Some(15.2));

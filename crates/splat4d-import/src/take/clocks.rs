@@ -130,7 +130,9 @@ pub(super) fn check(names: &[&str], solved: &Solved, told: &[Option<f64>], motio
     let guesses: Vec<String> = open.iter().filter_map(guess).collect();
     // Of three cameras that are not calibrated clocks are not adjusted: they cannot be told from places.
     let seen = match placed.len() {
-        ..4 => "geometry tells the clocks of four cameras and more, or of calibrated ones that see the same thing move",
+        ..4 => {
+            "geometry gives the time offsets of at least four cameras, or of calibrated ones that see the same motion"
+        }
         _ => "too few see the same thing move",
     };
     let mut why = vec!["sound agrees of no two of them".to_owned(), seen.to_owned()];
@@ -142,14 +144,14 @@ pub(super) fn check(names: &[&str], solved: &Solved, told: &[Option<f64>], motio
     }
     let open: Vec<&str> = open.iter().map(|&c| names[c]).collect();
     Err(Error::input(format!(
-        "nothing tells how the clocks of these cameras differ, and something moves: {} ({})",
+        "the time offsets of these cameras are unknown, and something moves: {} ({})",
         open.join(", "),
         why.join("; ")
     ))
     .remedy(
-        "If one trigger drives all cameras, say so with --synchronous. Else tell offsets in import.toml (offset, keep_offset = \
-         true) and run the same command again: what was found is kept. Next time let sound run and clap, or film so that two \
-         cameras at most 30 degrees apart see the same thing move for a second.",
+        "If one trigger drives all cameras, use --synchronous. Otherwise set offsets in import.toml (offset, \
+         keep_offset = true) and run the same command again: results so far are kept. Next time record sound and \
+         clap, or let two cameras at most 20 degrees apart see the same motion for a second.",
     ))
 }
 
@@ -200,9 +202,9 @@ pub(super) fn shared(
         .collect();
     let Some(known) = known.filter(|_| cameras.len() > 1) else {
         if cameras.len() > 1 && (selection.from.is_some() || selection.to.is_some()) {
-            report
-                .guesses
-                .push("The chosen part is cut by each file's own clock, for no sound tells how they differ.".into());
+            report.guesses.push(
+                "The time range is cut by each file's own clock, because sound does not give the time offsets.".into(),
+            );
         }
         return Ok(vec![selection.clone(); cameras.len()]);
     };

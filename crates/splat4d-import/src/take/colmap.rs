@@ -83,7 +83,8 @@ pub(super) fn calibrate(
         write_atomically(&note, made_of.as_bytes())?;
     }
     let found = calibration::read(&work.join("sparse")).map_err(|e| {
-        e.at("COLMAP").remedy("It found no two pictures of one scene: leave --colmap out, or film from nearer places.")
+        e.at("COLMAP")
+            .remedy("It found no two images of one scene: leave --colmap out, or place cameras closer together.")
     })?;
     let lost: Vec<&str> = (stored.pictures.iter().map(|p| p.name.as_str()))
         .filter(|name| !found.cameras.iter().any(|c| c.names[0] == *name))
@@ -107,18 +108,18 @@ fn helps() -> Result<Vec<String>> {
 
 /// Writes what the program works on: of each camera its median, where people vanish, and its mask.
 fn prepare(stored: &Stored<'_>, work: &Path, progress: &mut Progress<'_>) -> Result<()> {
-    let fail = |e| Error::environment("the folder cannot be made anew", e).at(work.display());
+    let fail = |e| Error::environment("the folder cannot be created again", e).at(work.display());
     if work.exists() {
         std::fs::remove_dir_all(work).map_err(fail)?;
     }
     std::fs::create_dir_all(work.join("sparse")).map_err(fail)?;
     for (c, p) in stored.pictures.iter().enumerate() {
-        progress.phase("pictures for COLMAP", c, stored.pictures.len());
+        progress.phase("images for COLMAP", c, stored.pictures.len());
         let still = stored.median(c, |picture| picture)?;
         let mut bytes = Vec::new();
         PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive)
             .write_image(&still.data, still.width as u32, still.height as u32, ExtendedColorType::Rgb8)
-            .map_err(|e| Error::input(format!("a picture cannot be stored ({e})")))?;
+            .map_err(|e| Error::input(format!("an image cannot be stored ({e})")))?;
         write_atomically(&work.join("images").join(format!("{}.png", p.name)), &bytes)?;
         if let Some(masks) = stored.masks.get(c) {
             let from = stored.folder.join(&masks.files[p.shots.len() / 2]);

@@ -53,7 +53,7 @@ fn measured(stored: &Stored<'_>, clock: &Solution, progress: &mut Progress<'_>) 
     let middle = 0.5 * (first + last);
     let mut seen = Vec::with_capacity(n);
     for c in 0..n {
-        progress.phase("following what moves", c, n);
+        progress.phase("tracking moving parts", c, n);
         seen.push(camera(stored, c, middle - offset(c))?);
     }
     let centers: Vec<_> = seen.iter().map(|s| s.as_ref().map(|s| s.camera.center())).collect();

@@ -3,7 +3,7 @@
 use super::{Camera, Request};
 use crate::calibration::{self, Calibrated, Calibration, Shape, Unit, Video};
 use crate::corrections::Corrections;
-use crate::sfm::known::Known;
+use crate::sfm::lens::Known;
 use crate::write::Pictures;
 use crate::{Error, Result};
 use splat4d::scene::Planes;

@@ -64,8 +64,9 @@ pub fn find(paths: &[PathBuf]) -> Result<Vec<Input>> {
                 }
             }
             if folders.is_empty() {
-                return Err(Error::input("there is neither a video nor a picture in it").at(path.display()).remedy(
-                    "Give videos, a folder of them, a folder of pictures, or a folder with a folder of pictures for each camera.",
+                return Err(Error::input("there is neither a video nor an image in it").at(path.display()).remedy(
+                    "Give videos, a folder of them, a folder of images, or a folder with a folder of images for each \
+                     camera.",
                 ));
             }
             out.extend(folders);

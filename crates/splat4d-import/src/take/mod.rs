@@ -107,7 +107,7 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     let mut cameras = open(request)?;
     let names: Vec<String> = cameras.iter().map(|c| c.name.clone()).collect();
     std::fs::create_dir_all(folder)
-        .map_err(|e| Error::environment("the folder cannot be made", e).at(folder.display()))?;
+        .map_err(|e| Error::environment("the folder cannot be created", e).at(folder.display()))?;
     let mut corrections = Corrections::read(folder, &names)?;
     let mut wanted = corrections.cameras.iter().map(|c| c.wanted);
     cameras.retain(|_| wanted.next().unwrap_or(true));
@@ -125,7 +125,7 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     for name in measured {
         if !cameras.iter().any(|c| c.name == *name) {
             let known: Vec<&str> = cameras.iter().map(|c| c.name.as_str()).collect();
-            return Err(Error::input(format!("there is no camera \"{name}\", of which a length is told"))
+            return Err(Error::input(format!("there is no camera \"{name}\", for which a distance is given"))
                 .remedy(format!("Cameras are {}.", known.join(", "))));
         }
     }
@@ -134,7 +134,7 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
         + usize::from(request.camera_height.is_some())
         > 1
     {
-        return Err(Error::input("lengths are told in two ways")
+        return Err(Error::input("the scale is given in two ways")
             .remedy("Tell the distance of two cameras, tags, or a height: one."));
     }
     let moving = match request.rig {
@@ -143,8 +143,8 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
         Rig::Moving => true,
     };
     if cameras.len() == 1 && !moving {
-        return Err(Error::input("one camera that stands still shows nothing from two sides")
-            .remedy("Give the videos of all cameras, or --rig moving if this one was carried about."));
+        return Err(Error::input("one fixed camera gives no depth")
+            .remedy("Give the videos of at least two cameras, or use --rig moving if this camera moved."));
     }
     // It can be corrected even if the calibration does not fit.
     corrections.write(folder)?;
@@ -264,8 +264,8 @@ fn check(solved: &poses::Solved, pictures: &[Pictures], report: &mut Report) -> 
             .collect();
         let reasons = if reasons.is_empty() { String::new() } else { format!(" ({})", reasons.join("; ")) };
         return Err(Error::input(format!("only {placed} of {asked} {what} could be placed{reasons}")).remedy(format!(
-            "Film one scene from neighbouring places (at most 30 degrees apart), in focus and in light; or leave those out \
-             (use = false in {}) and run the same command again.",
+            "Place neighbouring cameras at most 20 degrees apart, in focus and well lit (docs/filming.md); or leave \
+             these out (use = false in {}) and run the same command again.",
             corrections::FILE
         )));
     }
@@ -294,8 +294,8 @@ fn agrees(solved: &poses::Solved, pictures: &[Pictures], report: &mut Report) ->
         if off > CONTRADICTS * pixel_unit(p.size) {
             wrong += 1;
             report.cameras[k].warnings.push(format!(
-                "what it shows lies {off:.1} px beside where the calibration says: it was moved or focussed anew, or the \
-                 calibration is another camera's"
+                "its features are {off:.1} px from where the calibration projects them: the camera was moved or \
+                 refocused, or the calibration is another camera's"
             ));
         }
     }
@@ -310,14 +310,14 @@ fn agrees(solved: &poses::Solved, pictures: &[Pictures], report: &mut Report) ->
     if told.len() >= 2 && wrong as f64 > CONTRADICTED * told.len() as f64 {
         told.sort_by(f64::total_cmp);
         return Err(Error::input(format!(
-            "the calibration contradicts the pictures: what {wrong} of {} cameras show lies {:.0} px at the median beside where \
-             it says",
+            "the calibration contradicts the images: the features of {wrong} of {} cameras are {:.0} px (median) \
+             from where it projects them",
             told.len(),
             told[told.len() / 2]
         ))
         .remedy(
-            "Is it of this take, are videos named as their cameras, and were they neither cut nor turned? Without \
-             --calibration, poses are found in the pictures.",
+            "Check that it belongs to this recording, that videos have the names of their cameras, and that they \
+             were neither cropped nor rotated. Without --calibration, poses are found in the images.",
         ));
     }
     Ok(())
@@ -339,7 +339,7 @@ fn sound_goes(
         let frame = pictures.iter().map(|p| p.clock.interval).fold(0.0, f64::max);
         if let Some(done) = way::corrected(solved, evidence, told, 0.5 * frame) {
             report.guesses.push(format!(
-                "The way of sound is taken out of {} clocks that nothing else tells, up to {:.1} ms.",
+                "The travel time of sound is subtracted from {} time offsets that only sound gives, up to {:.1} ms.",
                 done.clocks,
                 1e3 * done.most
             ));
@@ -394,7 +394,7 @@ fn finish(
     };
     if let Some(points) = given.and_then(|g| g.points).filter(|_| solved.points.len() < FEW_POINTS) {
         solved.take_points(&points);
-        report.guesses.push("Points are the calibration's: too few were found in these pictures.".into());
+        report.guesses.push("Points are the calibration's: too few were found in these images.".into());
     }
     // What could not be placed is told before what could not be measured.
     let metres = match world::settle(request, stored, origin, &mut solved, &mut report, progress) {

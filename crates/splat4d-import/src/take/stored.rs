@@ -1,11 +1,12 @@
 //! The stored pictures as structure from motion asks for them.
 
 use crate::sfm;
-use crate::sfm::known::Known;
+use crate::sfm::lens::Known;
 use crate::sync::graph::Offset;
 use crate::write::{Masks, Pictures};
 use crate::{Error, Result};
 use rayon::prelude::*;
+use splat4d::math::median_by;
 use splat4d::scene::Planes;
 use splat4d_train::capture::Rgb8;
 use std::path::Path;
@@ -65,8 +66,7 @@ impl<'a> Stored<'a> {
         let mut values = vec![0u8; all.len()];
         for (p, v) in still.data.iter_mut().enumerate() {
             values.iter_mut().zip(&all).for_each(|(v, a)| *v = a.data[p]);
-            let half = values.len() / 2;
-            *v = *values.select_nth_unstable(half).1;
+            *v = median_by(&mut values, u8::cmp).expect("there are images");
         }
         Ok(still)
     }
@@ -109,7 +109,7 @@ impl sfm::pictures::Pictures for Stored<'_> {
     fn load(&self, camera: usize, frame: usize) -> Result<Planes<f32>> {
         let picture = self.rgb(camera, frame)?;
         if [picture.width, picture.height] != self.pictures[camera].size {
-            return Err(Error::input("a stored picture is of another size than the rest")
+            return Err(Error::input("a stored image is of another size than the rest")
                 .at(self.folder.join(self.pictures[camera].file(frame)).display())
                 .remedy("Remove the folder \"images\" and import again."));
         }

@@ -3,10 +3,12 @@
 use super::poses::Solved;
 use super::stored::Stored;
 use crate::board::{self, Board, Lies, Tag};
-use crate::sfm::known::{Known, pixel_unit};
+use crate::sfm::known::pixel_unit;
+use crate::sfm::lens::Known;
 use crate::sfm::pictures::Pictures as _;
 use crate::{Error, Result};
 use rayon::prelude::*;
+use splat4d::math::median;
 use splat4d::math::se3::{add, cross, dot, norm, normalize, scale, sub};
 use splat4d::scene::Camera;
 use splat4d_train::event::Progress;
@@ -90,7 +92,7 @@ pub(super) fn measured(
     let sightings = seen.len();
     let placed = placed(&seen);
     of(board, &placed, solved.up).map_err(|e| match sightings {
-        0 => Error::input(format!("no tag of {} is seen in {} pictures that were looked at", board.family.name, looks.len()))
+        0 => Error::input(format!("no tag of {} was found in {} images", board.family.name, looks.len()))
             .remedy(
                 "Is it this family, is each of its bits at least two pixels wide, and is there white around every tag? Without \
                  --board the unit is a guess.",
@@ -220,11 +222,6 @@ impl Placed {
     }
 }
 
-fn median(mut v: Vec<f64>) -> Option<f64> {
-    let half = v.len() / 2;
-    (!v.is_empty()).then(|| *v.select_nth_unstable_by(half, f64::total_cmp).1)
-}
-
 /// What placed tags tell.
 fn of(board: &Board, placed: &[Placed], held: [f64; 3]) -> Result<Found> {
     let contradicts = |what: String| {
@@ -234,10 +231,11 @@ fn of(board: &Board, placed: &[Placed], held: [f64; 3]) -> Result<Found> {
         )
     };
     let square: Vec<(&Placed, f64)> = placed.iter().filter_map(|p| Some((p, p.side()?))).collect();
-    let Some(side) = median(square.iter().map(|s| s.1).collect()) else {
+    let Some(side) = median(&mut square.iter().map(|s| s.1).collect::<Vec<_>>()) else {
         return Err(contradicts(format!("{} tags were placed, but none as a square", placed.len())));
     };
-    let spread = median(square.iter().map(|s| (s.1 / side - 1.0).abs()).collect()).expect("there are some");
+    let spread =
+        median(&mut square.iter().map(|s| (s.1 / side - 1.0).abs()).collect::<Vec<_>>()).expect("there are some");
     if spread > UNLIKE {
         return Err(contradicts(format!(
             "the tags' sizes contradict each other: the median one is {:.0} % off",
@@ -258,7 +256,7 @@ fn of(board: &Board, placed: &[Placed], held: [f64; 3]) -> Result<Found> {
         }
         let middles: Vec<[f64; 3]> = square.iter().filter(|s| s.0.id == ids[0]).map(|s| s.0.middle()).collect();
         let origin = std::array::from_fn(|k| {
-            scale * median(middles.iter().map(|m| m[k]).collect()).expect("the tag was placed")
+            scale * median(&mut middles.iter().map(|m| m[k]).collect::<Vec<_>>()).expect("the tag was placed")
         });
         Ok((mean(&near), origin))
     });
@@ -273,7 +271,7 @@ mod tests {
 
     /// Two metres of the world are one unit; the floor is askew in it.
     #[test]
-    fn tags_tell_metres_and_upwards() {
+    fn tags_give_metres_and_up() {
         let board: Board = "36h11:0.3:floor".parse().expect("it is right");
         let unit = 2.0;
         let tilt = Se3::look_at([0.0; 3], [0.3, 1.0, 0.2], [0.1, 0.2, 1.0]).rotation;

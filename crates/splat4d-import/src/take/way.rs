@@ -241,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn the_way_of_sound_is_taken_out_about_where_cameras_look() {
+    fn the_travel_time_of_sound_is_subtracted() {
         let (mut solved, evidence, truth) = take([0.3, -0.2, 1.0], 0);
         assert!(worst(&solved, &truth) > 6e-3, "the way matters here");
         let done = corrected(&mut solved, &evidence, &[None; 7], 0.02).expect("clocks hang on sound");
@@ -251,7 +251,7 @@ mod tests {
     }
 
     #[test]
-    fn clocks_that_geometry_knows_tell_where_the_sound_was() {
+    fn time_offsets_from_geometry_locate_the_sound() {
         let source = [1.2, 1.9, 0.5];
         let (mut alone, evidence, truth) = take(source, 0);
         corrected(&mut alone, &evidence, &[None; 7], 0.02).expect("clocks hang on sound");
@@ -267,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn clocks_that_sound_does_not_tell_stay() {
+    fn time_offsets_not_from_sound_stay() {
         let (mut solved, evidence, _) = take([0.0; 3], 6);
         solved.offsets[0].as_mut().expect("it has one").kinds = vec![Kind::Geometry];
         let before = solved.offsets.clone();

@@ -136,7 +136,7 @@ fn height(solved: &Solved, stored: &Stored<'_>, name: &str) -> Result<f64> {
         Error::input(what).remedy("Tell two cameras' distance instead (--apart A,B=METRES), or film tags (--board).")
     };
     let Some(camera) = place(solved, stored, name) else {
-        return Err(other(format!("{name}, whose height is told, could not be placed")));
+        return Err(other(format!("{name}, whose height is given, could not be placed")));
     };
     let points: Vec<[f64; 3]> = solved.points.iter().map(|p| p.0).collect();
     let Some(floor) = floor(&points, solved.up) else {

@@ -284,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_cut_off_is_told_and_the_rest_is_read() {
+    fn truncation_is_reported_and_the_rest_is_read() {
         let whole = film(&[Some(10), Some(90), Some(200)]);
         let source = open(&whole[..whole.len() - 40]).unwrap();
         assert_eq!(read(&*source).len(), 2);

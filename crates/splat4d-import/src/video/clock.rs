@@ -136,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn identical_pictures_are_doubled_frames_unless_nothing_moves() {
+    fn identical_images_are_doubled_frames_unless_nothing_moves() {
         let even = times(&(0..20).map(f64::from).collect::<Vec<_>>());
         let moving: Vec<(usize, f64)> = (1..20).map(|i| (i, if i % 5 == 0 { 0.1 } else { 3.0 })).collect();
         assert_eq!(Clock::of(&even, &moving).doubled, [5, 10, 15]);
@@ -151,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn pictures_differ_by_their_samples() {
+    fn images_differ_by_their_samples() {
         let picture = |v: u8| Rgb8 { width: 2, height: 1, data: vec![v; 6] };
         assert_eq!(mean_difference(&picture(3), &picture(10)), 7.0);
         assert_eq!(mean_difference(&picture(3), &Rgb8::default()), 255.0);

@@ -57,10 +57,10 @@ impl Source for Video {
         selection.check()?;
         let info = &self.probe.info;
         if info.interlaced && !selection.deinterlace {
-            let what = "it is interlaced: each frame is two half pictures, taken at different times";
+            let what = "it is interlaced: each frame contains two fields of different times";
             return Err(Error::new(ErrorKind::Unsupported, what).at(self.path.display()).remedy(
-                "Film progressively (50p, not 50i). If this is all there is: ffmpeg -i IN -vf yadif=1 -crf 12 OUT.mp4 \
-                 makes a frame of every half picture.",
+                "Film progressively (50p, not 50i). To convert existing video: ffmpeg -i IN -vf yadif=1 -crf 12 \
+                 OUT.mp4 makes a frame of every field.",
             ));
         }
         let Chain { text, size, mut warnings } = filters::chain(info, selection, self.tools.tone_mapping);
@@ -204,7 +204,7 @@ impl Pictures<'_> {
             ));
         } else if !well || said.count > 0 {
             self.warnings.push(format!(
-                "ffmpeg complained {} times while it decoded {frames} frames{}: pictures may be damaged.",
+                "ffmpeg complained {} times while it decoded {frames} frames{}: images may be damaged.",
                 said.count.max(1),
                 said.bracketed()
             ));

@@ -133,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn guesses_are_told_and_rgb_needs_none() {
+    fn guesses_are_reported_and_rgb_needs_none() {
         let mut guessed = info();
         guessed.color.tagged = false;
         assert!(chain(&guessed, &Selection::default(), true).warnings[0].contains("BT.709"));

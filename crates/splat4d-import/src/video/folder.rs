@@ -39,7 +39,7 @@ impl Folder {
         let mut files: Vec<PathBuf> = entries.filter_map(|e| e.ok().map(|e| e.path())).filter(is_picture).collect();
         files.sort_by(|a, b| natural(&name(a), &name(b)).then_with(|| a.cmp(b)));
         let Some(first) = files.first() else {
-            return Err(Error::input("there are no pictures in it")
+            return Err(Error::input("there are no images in it")
                 .at(path.display())
                 .remedy("Give a video, or a folder of .jpg, .png or .webp files."));
         };
@@ -51,7 +51,8 @@ impl Folder {
         let warnings = match steps.windows(2).position(|w| w[1] - w[0] > 1.5) {
             None => Vec::new(),
             Some(first) => vec![format!(
-                "numbers are missing in the names of its pictures, in {gaps} places, first after {}: their times are kept",
+                "numbers are missing in the names of its images, in {gaps} places, first after {}: their times are \
+                 kept",
                 name(&files[first])
             )],
         };
@@ -127,20 +128,18 @@ impl Reader for Pictures<'_> {
             let (picture, alpha) = Rgb8::read_alpha(path)?;
             let [width, height] = self.folder.info.size;
             if [picture.width, picture.height] != [width, height] {
-                let what = format!(
-                    "the picture is {}x{}, those before it are {width}x{height}",
-                    picture.width, picture.height
-                );
+                let what =
+                    format!("the image is {}x{}, those before it are {width}x{height}", picture.width, picture.height);
                 return Err(Error::input(what)
                     .at(path.display())
-                    .remedy("Give each camera a folder of its own, with pictures of one size."));
+                    .remedy("Give each camera a folder of its own, with images of one size."));
             }
             let alpha = alpha.map_or_else(Vec::new, |a| scaled_plane(a, [width, height], &self.selection));
             *frame = Frame { number, time: *time, picture: scaled(picture, &self.selection), alpha };
             return Ok(true);
         }
         if self.counted == 0 {
-            return Err(Error::input("no picture lies in the part that was chosen").remedy("Choose another part."));
+            return Err(Error::input("no image is in the chosen time range").remedy("Choose another part."));
         }
         Ok(false)
     }
@@ -161,7 +160,7 @@ pub(super) fn scaled(picture: Rgb8, selection: &Selection) -> Rgb8 {
         return picture;
     }
     let whole = image::RgbImage::from_raw(picture.width as u32, picture.height as u32, picture.data);
-    let whole = whole.expect("a picture has width·height·3 samples");
+    let whole = whole.expect("an image has width·height·3 samples");
     // The same kind of curve as ffmpeg's; both widen it where pictures get smaller.
     let data = resize(&whole, width as u32, height as u32, FilterType::CatmullRom).into_raw();
     Rgb8 { width, height, data }
@@ -259,7 +258,7 @@ mod tests {
             let picture = image::RgbImage::from_pixel(40, 32, image::Rgb([shade; 3]));
             picture.save(folder.path().join(format!("f{number}.png"))).unwrap();
         }
-        std::fs::write(folder.path().join("notes.txt"), "no picture").unwrap();
+        std::fs::write(folder.path().join("notes.txt"), "no image").unwrap();
         let source = super::super::open(folder.path(), 10.0).unwrap();
         assert_eq!((source.info().size, source.info().frames), ([40, 32], Some(5)));
         assert!(source.info().warnings[0].contains("in 2 places, first after f4:"), "{:?}", source.info().warnings);
@@ -280,7 +279,7 @@ mod tests {
     #[test]
     fn empty_folders_and_mixed_sizes_are_refused() {
         let folder = tempfile::tempdir().unwrap();
-        assert!(Folder::open(folder.path(), 30.0).err().unwrap().to_string().contains("no pictures"));
+        assert!(Folder::open(folder.path(), 30.0).err().unwrap().to_string().contains("no images"));
         for (number, width) in [(1, 20), (2, 24)] {
             image::RgbImage::new(width, 20).save(folder.path().join(format!("{number}.png"))).unwrap();
         }

@@ -57,7 +57,7 @@ impl Selection {
             return bad("every 0th frame is asked for".into(), "Take every frame (1), every second (2) and so on.");
         }
         if self.size.is_some_and(|s| s < MIN_SIDE) {
-            return bad(format!("pictures of less than {MIN_SIDE} pixels are asked for"), "Take 1080, for example.");
+            return bad(format!("images of less than {MIN_SIDE} pixels are requested"), "Take 1080, for example.");
         }
         for second in [self.from, self.to].into_iter().flatten() {
             if !second.is_finite() || second < 0.0 {

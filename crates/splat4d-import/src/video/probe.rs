@@ -97,15 +97,14 @@ pub(super) struct Probe {
 /// Understands what ffprobe wrote. Errors: no picture stream, no codec that is known, no size.
 pub(super) fn parse(json: &str, name: String) -> Result<Probe> {
     let top: Value = serde_json::from_str(json)
-        .map_err(|e| Error::input(format!("what ffprobe tells cannot be understood ({e})")).remedy("Update ffmpeg."))?;
+        .map_err(|e| Error::input(format!("the output of ffprobe cannot be parsed ({e})")).remedy("Update ffmpeg."))?;
     let streams = top["streams"].as_array().map_or(&[][..], Vec::as_slice);
     let of = |kind: &'static str| streams.iter().filter(move |s| s["codec_type"] == kind);
     // The cover of a song is a stream of one picture.
     let films = || of("video").filter(|s| s["disposition"]["attached_pic"] != 1);
     let film = films().find(|s| s["disposition"]["default"] == 1).or_else(|| films().next());
     let Some(film) = film else {
-        let what =
-            if of("audio").next().is_some() { "there is sound, but no pictures" } else { "there are no pictures" };
+        let what = if of("audio").next().is_some() { "there is sound, but no images" } else { "there are no images" };
         return Err(Error::input(what).remedy("Give the file that the camera wrote, or take it out."));
     };
     let text = |key: &str| film[key].as_str().unwrap_or("");
@@ -117,7 +116,7 @@ pub(super) fn parse(json: &str, name: String) -> Result<Probe> {
     }
     let side = |key: &str| film[key].as_u64().filter(|s| *s > 0).map(|s| s as usize);
     let (Some(width), Some(height)) = (side("width"), side("height")) else {
-        return Err(Error::input(format!("its pictures ({codec}) have no size: the beginning of the file is damaged"))
+        return Err(Error::input(format!("its images ({codec}) have no size: the beginning of the file is damaged"))
             .remedy("Copy it again from the camera."));
     };
     let mut warnings = Vec::new();
@@ -267,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn colours_that_nobody_tells_follow_from_the_size() {
+    fn default_colours_follow_from_the_size() {
         let matrix = |width: usize, height: usize, codec: &str, pixels: &str| {
             let film = phone(|f| {
                 for key in ["color_space", "color_range"] {
@@ -341,8 +340,8 @@ mod tests {
         let cover = phone(|f| f["disposition"]["attached_pic"] = json!(1));
         let sound = json!({"index": 1, "codec_type": "audio", "codec_name": "aac"});
         for (streams, word) in [
-            (vec![], "no pictures"),
-            (vec![cover, sound], "sound, but no pictures"),
+            (vec![], "no images"),
+            (vec![cover, sound], "sound, but no images"),
             (vec![phone(|f| f["codec_name"] = json!("unknown"))], "codec"),
             (vec![phone(|f| f["width"] = json!(0))], "no size"),
         ] {

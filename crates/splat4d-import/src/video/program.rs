@@ -10,8 +10,8 @@ use std::sync::mpsc::{Receiver, channel};
 use std::thread::JoinHandle;
 
 /// How to install what is missing.
-const INSTALL: &str = "Install it: apt install ffmpeg (Debian, Ubuntu), brew install ffmpeg (macOS) or winget install \
-                       ffmpeg (Windows). Or extract the frames elsewhere and give folders of pictures.";
+const INSTALL: &str = "Install it: apt install ffmpeg (Debian, Ubuntu), brew install ffmpeg (macOS) or winget \
+                       install ffmpeg (Windows). Or extract the frames elsewhere and give folders of images.";
 /// The first version that knows `-fps_mode`; the older name is gone from newer ones.
 const FPS_MODE_SINCE: (u32, u32) = (5, 1);
 /// The first version whose `showinfo` can leave out checksums, and the oldest that is used.
@@ -321,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn complaints_are_told_without_addresses() {
+    fn warnings_are_reported_without_addresses() {
         let line = "[mov,mp4,m4a,3gp,3g2,mj2 @ 0x558] [error] moov atom not found\n";
         assert_eq!(plain(line, Path::new("a.mp4")), "moov atom not found");
         assert_eq!(plain("file:-a.mp4: Invalid data found", Path::new("-a.mp4")), "Invalid data found");

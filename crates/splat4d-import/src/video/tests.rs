@@ -203,7 +203,7 @@ fn rates_that_vary_and_lost_frames_are_seen() {
 }
 
 #[test]
-fn sound_keeps_the_clock_of_the_pictures() {
+fn sound_keeps_the_clock_of_the_images() {
     let Some(made) = Made::new() else { return };
     // A tone that begins at 0.3 s, in a track that begins at 0.1 s.
     let sound = "-itsoffset 0.1 -f lavfi -i sine=f=440:d=0.3,adelay=200";
@@ -243,7 +243,7 @@ fn what_is_no_video_is_refused_with_a_reason() {
     for (name, word) in [
         ("empty.mp4", "empty"),
         ("noise.mp4", "damaged"),
-        ("sound.wav", "no pictures"),
+        ("sound.wav", "no images"),
         ("headless.mp4", "moov"),
         ("absent.mp4", "cannot be read"),
     ] {

@@ -97,7 +97,7 @@ fn camera(camera: &Placed) -> Result<Value> {
     let Placed { pictures, offset, intrinsics, lens, poses, masks } = camera;
     let place = |e: Error| e.at(format!("camera {}", pictures.name));
     if pictures.shots.is_empty() {
-        return Err(place(Error::input("there are no pictures of it").remedy("Leave the camera out.")));
+        return Err(place(Error::input("there are no images of it").remedy("Leave the camera out.")));
     }
     let matrix = |p: &Se3| {
         let row = |i: usize| {
@@ -112,7 +112,7 @@ fn camera(camera: &Placed) -> Result<Value> {
             json!(all.iter().flatten().map(matrix).collect::<Vec<_>>())
         }
         Poses::Moving(all) => {
-            let what = format!("there are {} poses for {} pictures", all.len(), pictures.shots.len());
+            let what = format!("there are {} poses for {} images", all.len(), pictures.shots.len());
             return Err(place(Error::input(what).remedy("Import it again.")));
         }
     };

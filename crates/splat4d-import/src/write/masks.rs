@@ -66,7 +66,7 @@ fn camera(folder: &Path, from: &Path, pictures: &Pictures, begin: Begin) -> Resu
     let own = from.join(&pictures.name);
     if !own.is_dir() {
         return Err(Error::input("it has no masks").at(from.display()).remedy(format!(
-            "Add {}.png for the whole take, or a folder {} with one for each frame: white where the picture counts.",
+            "Add {}.png for the whole take, or a folder {} with one for each frame: white where the image counts.",
             pictures.name, pictures.name
         )));
     }
@@ -113,11 +113,11 @@ fn store(from: &Path, to: &Path, [width, height]: [usize; 2]) -> Result<u64> {
     // Sides are whole pixels.
     if off > mask.width.max(mask.height).max(width).max(height) {
         return Err(Error::input(format!(
-            "the mask has {}x{} pixels, its picture {width}x{height}",
+            "the mask has {}x{} pixels, its image {width}x{height}",
             mask.width, mask.height
         ))
         .at(from.display())
-        .remedy("Masks must show the same part as pictures, in any size."));
+        .remedy("Masks must show the same part as images, in any size."));
     }
     // Masks of zeros and ones are meant to be black and white.
     let most = mask.data.iter().copied().max().unwrap_or(0);

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::event::Progress;
-use splat4d_train::run::checkpoint::write_atomically;
+use splat4d_train::output::{write_atomically, written};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -16,6 +16,8 @@ use std::path::{Path, PathBuf};
 const VERSION: u32 = 1;
 /// Folder of the notes, beside that of the pictures.
 const NOTES: &str = "import";
+/// Folder of the pictures, in one for each camera.
+const IMAGES: &str = "images";
 /// Pictures that are compressed at a time: eight of 4K are 200 MB.
 const BATCH: usize = 8;
 /// Least quality of JPEG files: below, blocks are seen that training would learn.
@@ -54,7 +56,7 @@ impl Format {
             let rgba: Vec<u8> = pixels.flat_map(|(rgb, a)| [rgb[0], rgb[1], rgb[2], *a]).collect();
             PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive)
                 .write_image(&rgba, width, height, ExtendedColorType::Rgba8)
-                .map_err(|e| Error::input(format!("a picture of {width}x{height} cannot be stored ({e})")))?;
+                .map_err(|e| Error::input(format!("an image of {width}x{height} cannot be stored ({e})")))?;
             return Ok(bytes);
         }
         let done = match self {
@@ -67,7 +69,7 @@ impl Format {
             Self::Png => PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive)
                 .write_image(&picture.data, width, height, ExtendedColorType::Rgb8),
         };
-        done.map_err(|e| Error::input(format!("a picture of {width}x{height} cannot be stored ({e})")))?;
+        done.map_err(|e| Error::input(format!("an image of {width}x{height} cannot be stored ({e})")))?;
         Ok(bytes)
     }
 }
@@ -167,7 +169,7 @@ pub fn pictures(
     if let Format::Jpeg(quality) = format
         && !(MIN_QUALITY..=100).contains(&quality)
     {
-        return Err(Error::input(format!("pictures of quality {quality} are asked for"))
+        return Err(Error::input(format!("invalid JPEG quality {quality}"))
             .remedy(format!("Take {MIN_QUALITY} to 100: training learns the blocks of lower ones.")));
     }
     let mut out = Vec::new();
@@ -201,11 +203,11 @@ fn camera(folder: &Path, clip: &Clip<'_>, format: Format, stop: &dyn Fn() -> boo
     let transparent = is_transparent(clip)?;
     // Nothing else holds alpha.
     let format = if transparent { Format::Png } else { format };
-    let place = folder.join("images").join(&clip.name);
+    let place = folder.join(IMAGES).join(&clip.name);
     let notes = folder.join(NOTES).join(format!("{}.json", clip.name));
     let made_of = format!("{} {:?} {format:?} {VERSION}", clip.source.fingerprint()?, clip.selection);
     let fingerprint = format!("{:016x}", fnv1a(made_of.as_bytes()));
-    let pattern = format!("images/{}/%06d.{}", clip.name, format.ending());
+    let pattern = format!("{IMAGES}/{}/%06d.{}", clip.name, format.ending());
     let known = read(&notes).filter(|n| n.version == VERSION && n.fingerprint == fingerprint);
     let file = |number: usize| place.join(format!("{number:06}.{}", format.ending()));
     if let Some(note) = &known
@@ -216,7 +218,7 @@ fn camera(folder: &Path, clip: &Clip<'_>, format: Format, stop: &dyn Fn() -> boo
     }
     if known.is_none() {
         // What was made of something else must not be taken for this.
-        clear(&place)?;
+        clear(folder, &place, read(&notes).is_some())?;
         let begun = Note { version: VERSION, fingerprint: fingerprint.clone(), ..Note::default() };
         begun.write(&notes)?;
     }
@@ -269,7 +271,7 @@ fn camera(folder: &Path, clip: &Clip<'_>, format: Format, stop: &dyn Fn() -> boo
     note.doubled = clock.doubled;
     note.warnings = reader.warnings().to_vec();
     if transparent {
-        note.warnings.push("Some of its pixels are transparent: its pictures are stored as PNG with alpha.".into());
+        note.warnings.push("Some of its pixels are transparent: its images are stored as PNG with alpha.".into());
     }
     // Left from a time when more of the same could be read.
     let mut number = note.shots.len();
@@ -312,21 +314,28 @@ fn read(path: &Path) -> Option<Note> {
     serde_json::from_slice(&splat4d_train::files::read(path).ok()?).ok()
 }
 
-/// Removes the pictures that were written into a folder before, and nothing else.
-fn clear(folder: &Path) -> Result<()> {
+/// Removes the pictures that were written into a folder of a capture before. `noted`: whether a note tells of such pictures, which
+/// captures without a list of their files go by. Errors: it holds pictures of such names that nobody noted; nothing is removed then.
+fn clear(capture: &Path, folder: &Path, noted: bool) -> Result<()> {
     let Ok(entries) = std::fs::read_dir(folder) else { return Ok(()) };
-    for path in entries.filter_map(|e| e.ok().map(|e| e.path())) {
+    let numbered = |path: &PathBuf| {
         let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-        let ours = name.split_once('.').is_some_and(|(stem, ending)| {
+        name.split_once('.').is_some_and(|(stem, ending)| {
             stem.len() == 6 && stem.bytes().all(|b| b.is_ascii_digit()) && ["jpg", "png"].contains(&ending)
-        });
-        if ours {
-            remove(&path)?;
-        }
+        })
+    };
+    let there: Vec<PathBuf> = entries.filter_map(|e| e.ok().map(|e| e.path())).filter(numbered).collect();
+    let listed = written(capture);
+    let noted = noted && !listed.iter().any(|file| file.starts_with(IMAGES));
+    let ours = |path: &PathBuf| noted || path.strip_prefix(capture).is_ok_and(|file| listed.contains(file));
+    if let Some(foreign) = there.iter().find(|path| !ours(path)) {
+        return Err(Error::input("there is no record that splat4d wrote this image, which would be replaced")
+            .at(foreign.display())
+            .remedy("Move the folder's images away, or give another folder with -o."));
     }
-    Ok(())
+    there.iter().try_for_each(|path| remove(path))
 }
 
 fn remove(path: &Path) -> Result<()> {
-    std::fs::remove_file(path).map_err(|e| Error::environment("an old picture cannot be removed", e).at(path.display()))
+    std::fs::remove_file(path).map_err(|e| Error::environment("an old image cannot be removed", e).at(path.display()))
 }

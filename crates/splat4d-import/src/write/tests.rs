@@ -84,7 +84,7 @@ fn what_was_interrupted_ends_in_the_same_bytes() {
 }
 
 #[test]
-fn what_is_made_of_something_else_is_made_anew() {
+fn derived_values_are_computed_again() {
     let (_folder, sources) = rig();
     let out = tempfile::tempdir().unwrap();
     store(out.path(), &clips(&sources, &Selection::default()), usize::MAX).unwrap();
@@ -104,6 +104,28 @@ fn what_is_made_of_something_else_is_made_anew() {
 }
 
 #[test]
+fn pictures_of_others_are_neither_taken_for_ours_nor_removed() {
+    let (_folder, sources) = rig();
+    let clips = clips(&sources, &Selection::default());
+    let out = tempfile::tempdir().unwrap();
+    let theirs = out.path().join("images/cam_1/000003.jpg");
+    std::fs::create_dir_all(theirs.parent().unwrap()).unwrap();
+    std::fs::write(&theirs, "mine").unwrap();
+    let error = store(out.path(), &clips, usize::MAX).unwrap_err().to_string();
+    assert!(error.contains("000003.jpg") && error.contains("no record"), "{error}");
+    assert_eq!(std::fs::read(&theirs).unwrap(), b"mine");
+    std::fs::remove_file(&theirs).unwrap();
+    // With a list of what is ours, a note alone is no proof.
+    let owned = splat4d_train::output::OutputFolder::amend(out.path(), "import").unwrap();
+    store(out.path(), &clips, usize::MAX).unwrap();
+    std::fs::write(out.path().join("images/cam_1/000099.jpg"), "mine").unwrap();
+    let half = self::clips(&sources, &Selection { every: 2, ..Selection::default() });
+    let error = store(out.path(), &half, usize::MAX).unwrap_err().to_string();
+    assert!(error.contains("000099.jpg") && theirs.is_file(), "{error}");
+    drop(owned);
+}
+
+#[test]
 fn names_of_cameras_are_names_of_folders() {
     let names = camera_names(&["GX01/0042", "-rf", "é 1", "gx01_0042", "", "..", "a".repeat(90).as_str()]);
     assert_eq!(&names[..6], ["GX01_0042", "rf", "é_1", "gx01_0042_2", "camera", "__"]);
@@ -111,7 +133,7 @@ fn names_of_cameras_are_names_of_folders() {
 }
 
 #[test]
-fn masks_are_stored_beside_their_pictures() {
+fn masks_are_stored_next_to_their_images() {
     let (_folder, sources) = rig();
     let out = tempfile::tempdir().unwrap();
     let half = Selection { every: 2, ..Selection::default() };

@@ -6,6 +6,7 @@ from ._native import (
     Error,
     Frame,
     Gaussians,
+    Rendering,
     Run,
     Scene,
     Tracks,
@@ -18,6 +19,7 @@ from ._native import (
     resume,
     train,
 )
+from .motion import Motion
 
 __all__ = [
     "Camera",
@@ -25,6 +27,8 @@ __all__ = [
     "Error",
     "Frame",
     "Gaussians",
+    "Motion",
+    "Rendering",
     "Run",
     "Scene",
     "Tracks",

@@ -1,9 +1,11 @@
 from collections.abc import Callable, Sequence
 from os import PathLike
-from typing import Any, Literal, final
+from typing import Any, Literal, final, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from .motion import Motion
 
 _Path = str | PathLike[str]
 _F32 = NDArray[np.float32]
@@ -67,6 +69,17 @@ class Camera:
 
 @final
 class Gaussians:
+    def __new__(
+        cls,
+        means: ArrayLike,
+        quats: ArrayLike,
+        scales: ArrayLike,
+        opacities: ArrayLike,
+        *,
+        sh: ArrayLike | None = None,
+        colors: ArrayLike | None = None,
+        time: float = 0.0,
+    ) -> Gaussians: ...
     @property
     def time(self) -> float: ...
     @property
@@ -93,7 +106,48 @@ class Tracks:
     def rows(self) -> NDArray[np.uint32]: ...
 
 @final
+class Rendering:
+    @property
+    def color(self) -> _F32: ...
+    @property
+    def alpha(self) -> _F32: ...
+    @property
+    def depth(self) -> _F32: ...
+    def backward(
+        self, color: ArrayLike | None = None, alpha: ArrayLike | None = None, depth: ArrayLike | None = None
+    ) -> dict[str, Any]: ...
+
+@final
 class Scene:
+    @staticmethod
+    def from_arrays(
+        means: ArrayLike,
+        quats: ArrayLike,
+        scales: ArrayLike,
+        opacities: ArrayLike,
+        *,
+        sh: ArrayLike | None = None,
+        colors: ArrayLike | None = None,
+        times: ArrayLike | None = None,
+        velocities: ArrayLike | None = None,
+        rotation_rates: ArrayLike | None = None,
+        centers: ArrayLike | None = None,
+        durations: ArrayLike | None = None,
+        fps: float = 30.0,
+        clip: tuple[float, float] | None = None,
+        up: ArrayLike | None = None,
+        background: ArrayLike | None = None,
+    ) -> Scene: ...
+    @staticmethod
+    def from_frames(
+        frames: Sequence[Gaussians],
+        *,
+        fps: float = 30.0,
+        up: ArrayLike | None = None,
+        background: ArrayLike | None = None,
+    ) -> Scene: ...
+    def parameters(self) -> dict[str, _F32]: ...
+    def with_parameters(self, parameters: dict[str, ArrayLike]) -> Scene: ...
     @property
     def clip(self) -> tuple[float, float]: ...
     @property
@@ -109,6 +163,7 @@ class Scene:
     @property
     def cameras(self) -> list[tuple[str, Camera]]: ...
     def at(self, t: float) -> Gaussians: ...
+    @overload
     def render(
         self,
         camera: Camera,
@@ -119,10 +174,21 @@ class Scene:
         ] = "color",
         background: ArrayLike | None = None,
         device: _Device = "cpu",
+        requires_grad: Literal[False] = False,
     ) -> _F32: ...
+    @overload
+    def render(
+        self,
+        camera: Camera,
+        t: float,
+        *,
+        background: ArrayLike | None = None,
+        requires_grad: Literal[True],
+    ) -> Rendering: ...
     def tracks(self, every: int = 1, times: ArrayLike | None = None) -> Tracks: ...
     def bake(self, path: _Path, *, tolerance: float | None = None) -> None: ...
     def export(self, path: _Path, t: float | None = None) -> None: ...
+    def edit(self, edits: str | _Path) -> Scene: ...
     def __len__(self) -> int: ...
 
 @final
@@ -199,26 +265,29 @@ class Run:
     def scene(self) -> Scene: ...
     def evaluate(self) -> dict[str, Any]: ...
 
-def open(path: _Path) -> Scene: ...
+def open(path: _Path, *, motion: Motion | None = None) -> Scene: ...
 def metrics(render: ArrayLike, truth: ArrayLike) -> dict[str, float]: ...
 def photometric(render: ArrayLike, truth: ArrayLike, lambda_dssim: float = 0.2) -> tuple[float, _F32]: ...
 def train(
     capture: Capture | _Path,
     out: _Path | None = None,
     *,
-    progress: _Progress | None = None,
+    motion: str | Motion | None = None,
+    progress: _Progress | Literal[False] | None = None,
     loss: _Loss | None = None,
     minutes: float | None = None,
     quality: Literal["draft", "standard", "best"] | None = None,
     device: _Device = "cpu",
+    force: bool = False,
     **settings: Any,
 ) -> Run: ...
 def resume(
     run: Run | _Path,
     *,
-    progress: _Progress | None = None,
+    motion: Motion | None = None,
+    progress: _Progress | Literal[False] | None = None,
     loss: _Loss | None = None,
     device: _Device = "cpu",
 ) -> Run: ...
-def command(*words: _Path) -> None: ...
+def command(*words: _Path) -> list[dict[str, Any]]: ...
 def main(words: Sequence[str]) -> int: ...

@@ -164,19 +164,19 @@ test('a lasso over the picture deletes, undo brings it back, and the list is sav
 
 test('words, colours, moves by handles, keys on the time line; wrong words are said', options, async () => {
   const e = await edit(await view(KNIGHT, path.join(work, 'moves.toml'))), { page, panel } = e;
-  const area = panel.getByLabel('Selection in words');
+  const area = panel.getByLabel('Selection as text');
   await area.fill('bux(1)');
   await area.blur();
   await page.waitForFunction(() => /no predicate/.test(document.querySelector('splat-4d').shadowRoot.querySelector('.said').textContent));
   await area.fill('all');
   await area.blur();
-  await page.waitForFunction(() => /seen now/.test(document.querySelector('splat-4d').shadowRoot.querySelector('.said').textContent));
+  await page.waitForFunction(() => /visible now/.test(document.querySelector('splat-4d').shadowRoot.querySelector('.said').textContent));
   await e.act('Colour');
   await e.idle();
   await panel.getByLabel('Exposure, stops').fill('-2');
   await e.idle();
   assert.equal((await e.steps())[0].exposure, -2);
-  await e.act('Set edit 1: Colour');
+  await e.act('Change edit 1: Colour');
   await area.fill('all');
   await area.blur();
   await page.waitForFunction(() => document.querySelector('splat-4d').face.editing.acts.children[0].disabled === false);
@@ -191,7 +191,7 @@ test('words, colours, moves by handles, keys on the time line; wrong words are s
   await e.idle();
   const shift = (await e.steps())[1].to.shift;
   assert.ok(Math.hypot(...shift) > 0, `${shift}`);
-  await e.act('Key here');
+  await e.act('Add key here');
   await page.evaluate(() => { const p = document.querySelector('splat-4d').player; p.seek(p.first + p.duration / 2); });
   // A key is set at the time that is shown.
   await page.waitForFunction(() => {
@@ -275,7 +275,7 @@ test('after a reload unsaved edits are in the list; another page begins with wha
   assert.equal(await panel.getByRole('button', { name: 'Delete', exact: true }).getAttribute('title'), 'Select something first');
   await panel.getByRole('button', { name: 'Speed', exact: true }).click();
   assert.match(await page.evaluate(() => document.querySelector('splat-4d').face.editing.text), /^speed\(/);
-  const area = panel.getByLabel('Selection in words');
+  const area = panel.getByLabel('Selection as text');
   await area.fill('box(-99,-99,-99, 0,99,99)');
   await area.blur();
   await page.waitForFunction(() => /Gaussians/.test(document.querySelector('splat-4d').shadowRoot.querySelector('.said').textContent));
@@ -301,7 +301,7 @@ test('after a reload unsaved edits are in the list; another page begins with wha
 
 test('the box of a selection has numbers and faces that can be pulled', options, async () => {
   const e = await edit(await view(KNIGHT, path.join(work, 'box.toml'))), { page, panel } = e;
-  const area = panel.getByLabel('Selection in words'), text = () => page.evaluate(() => document.querySelector('splat-4d').face.editing.text);
+  const area = panel.getByLabel('Selection as text'), text = () => page.evaluate(() => document.querySelector('splat-4d').face.editing.text);
   assert.equal(await panel.getByRole('group', { name: 'Box' }).isVisible(), false);
   await area.fill('box(-1,0,-1, 1,2,1)');
   await area.blur();

@@ -188,7 +188,7 @@ test('a file that was cut short is complete up to there', async () => {
   const file = await SceneFile.open(bytes.subarray(0, cut));
   assert.deepEqual([file.truncated, file.pages.length], [true, 3]);
   for (const p of file.pages) await file.page(p.id);
-  await assert.rejects(file.page(whole.pages[3].id), /cut short/);
+  await assert.rejects(file.page(whole.pages[3].id), /truncated/);
 });
 
 test('a file that grows has its index behind its sections, and reads like a finished one', async () => {
@@ -203,7 +203,7 @@ test('a file that grows has its index behind its sections, and reads like a fini
   assert.equal(more.pages.length, a.pages.length);
   const gaps = await SceneFile.open(grown(sample({ json: { missing: [[2, 3], [5, 4]] } }).bytes));
   assert.deepEqual(gaps.meta.missing, [[2, 3]]);
-  await assert.rejects(SceneFile.open(growing.subarray(0, growing.length - 1)), /inside its index/);
+  await assert.rejects(SceneFile.open(growing.subarray(0, growing.length - 1)), /truncated in its index/);
 });
 
 test('hostile and foreign files are refused in words', async () => {
@@ -243,59 +243,59 @@ test('hostile and foreign files are refused in words', async () => {
     ['index is longer', grown(layout(base, [PAGE()]), { at: 1n << 60n })],
     ['index is longer', grown(layout(base, [PAGE()]), { at: 12n })],
     ['overlap', layout(base, [PAGE(), PAGE({ patch: (e) => e.writeBigUInt64LE(e.readBigUInt64LE(8) - 64n, 8) })])],
-    ['cannot hold', layout(base, [PAGE({ codec: 1, patch: patch(20, 4e9) })])],
-    ['cannot hold', layout(base, [PAGE({ patch: patch(20, 64) })])],
+    ['cannot have', layout(base, [PAGE({ codec: 1, patch: patch(20, 4e9) })])],
+    ['cannot have', layout(base, [PAGE({ patch: patch(20, 64) })])],
     ['decodes to', layout(base, [PAGE({ patch: patch(32, 2) })])],
     ['entries', layout(base, [PAGE({ patch: patch(32, 0) })])],
     ['entries', layout(base, [PAGE({ patch: patch(32, 70_000) })])],
     ['method 9', layout(base, [PAGE({ patch: patch(28, 9, 2) })])],
     ['words', layout(base, [PAGE({ words: 9 })])],
-    ['span', layout(base, [PAGE({ from: 3, to: 3 })])],
-    ['span', layout(base, [PAGE({ from: NaN })])],
+    ['time range', layout(base, [PAGE({ from: 3, to: 3 })])],
+    ['time range', layout(base, [PAGE({ from: NaN })])],
     ['no palette', layout(base, [PAGE({ palette: 0 })])],
     ['no palette', layout(base, [PAGE({ palette: 77 })])],
-    ['names no page', layout(base, [PAGE(), MASK({ page: 1 })])],
-    ['names no page', layout(base, [PAGE(), MASK({ page: 99 })])],
-    ['of 2 Gaussians, its page', layout(base, [PAGE(), MASK({ count: 2 })])],
+    ['refers to no page', layout(base, [PAGE(), MASK({ page: 1 })])],
+    ['refers to no page', layout(base, [PAGE(), MASK({ page: 99 })])],
+    ['for 2 Gaussians, its page', layout(base, [PAGE(), MASK({ count: 2 })])],
     ['two masks', layout(base, [PAGE(), MASK(), MASK()])],
     ['entries', layout(base, [PAGE(), MASK({ count: 0 })])],
     ['key times', layout(base, [PAGE(), MASK({ data: Buffer.alloc(8) })])],
     ['key times', layout(base, [PAGE(), MASK({ data: Buffer.alloc(25) })])],
     ['key times', layout(base, [PAGE(), MASK({ codec: 1, data: Buffer.alloc(8 + 9 * 65536) })])],
-    ['span', layout(base, [PAGE(), MASK({ from: 4 })])],
-    ['span', layout(base, [PAGE(), MASK({ to: Infinity })])],
-    ['cannot hold', layout(base, [PAGE(), MASK({ patch: patch(20, 35) })])],
-    ['cannot hold', layout(base, [PAGE(), MASK({ codec: 1, patch: patch(20, 4e9) })])],
+    ['time range', layout(base, [PAGE(), MASK({ from: 4 })])],
+    ['time range', layout(base, [PAGE(), MASK({ to: Infinity })])],
+    ['cannot have', layout(base, [PAGE(), MASK({ patch: patch(20, 35) })])],
+    ['cannot have', layout(base, [PAGE(), MASK({ codec: 1, patch: patch(20, 4e9) })])],
     ['method 2', layout(base, [PAGE(), MASK({ patch: patch(28, 2, 2) })])],
     [
-      'unpacks to',
+      'decompresses to',
       layout(base, [
         PAGE({ count: 65536, data: Buffer.alloc(256 * 96 + 32 * 65536), codec: 1 }),
         MASK({ count: 65536, codec: 1, data: Buffer.alloc(8 + 10_000 * 8200) }),
       ]),
     ],
     ['degree 4', layout(base, [{ kind: 'PALT', data: Buffer.alloc(12 + 72), count: 1, level: 4 }])],
-    ['no .s4d', Buffer.from('ply\nformat binary')],
-    ['no .s4d', Buffer.alloc(0)],
+    ['Not a .s4d', Buffer.from('ply\nformat binary')],
+    ['Not a .s4d', Buffer.alloc(0)],
   ];
   for (const [say, bytes] of cases) {
     await assert.rejects(SceneFile.open(bytes), (e) => e instanceof SceneError && e.message.includes(say), say);
   }
   const lazy = [
-    ['no finite', PAGE({ data: Buffer.alloc(128, 255) })],
+    ['not finite', PAGE({ data: Buffer.alloc(128, 255) })],
     [
       'palette of 1',
       PAGE({ palette: 1, data: Buffer.alloc(128, 1) }),
       { kind: 'PALT', data: Buffer.alloc(12 + 9), count: 1, level: 1 },
     ],
     ['checksum', PAGE({ patch: patch(24, 1) })],
-    ['no mask of 3', PAGE(), MASK({ data: changed(0, 3) })],
-    ['no mask of 0', PAGE(), MASK({ data: changed(0, 0) })],
-    ['no finite', PAGE(), MASK({ data: changed(14, 255, 255) })],
-    ['do not rise', PAGE(), MASK({ data: changed(8, ...two.subarray(16, 24)), from: 3 })],
-    ['not those', PAGE(), MASK({ from: 1 })],
-    ['not those', PAGE(), MASK({ to: 4 })],
-    ['inflates to 26', PAGE(), MASK({ codec: 1, patch: patch(20, 35) })],
+    ['not a mask of 3', PAGE(), MASK({ data: changed(0, 3) })],
+    ['not a mask of 0', PAGE(), MASK({ data: changed(0, 0) })],
+    ['not finite', PAGE(), MASK({ data: changed(14, 255, 255) })],
+    ['are not increasing', PAGE(), MASK({ data: changed(8, ...two.subarray(16, 24)), from: 3 })],
+    ['differ from the index', PAGE(), MASK({ from: 1 })],
+    ['differ from the index', PAGE(), MASK({ to: 4 })],
+    ['decompresses to 26', PAGE(), MASK({ codec: 1, patch: patch(20, 35) })],
     ['checksum', PAGE(), MASK({ patch: patch(24, 1) })],
   ];
   for (const [say, ...sections] of lazy) {
@@ -314,11 +314,11 @@ test('inflating stops at the stated size', async () => {
   // 60 MB of zeros in 58 kB, stated as the 128 bytes of one Gaussian; then too few; then no deflate at all.
   const page = { kind: 'PAGE', codec: 1, count: 1, words: 8, from: 2, to: 7 };
   const bomb = layout(base, [{ ...page, data: Buffer.alloc(60 << 20), patch: state() }]);
-  await assert.rejects(SceneFile.open(bomb), /longer packed/);
+  await assert.rejects(SceneFile.open(bomb), /longer compressed/);
   const big = layout(base, [{ ...page, data: Buffer.alloc(200_000), patch: state() }]);
-  await assert.rejects((await SceneFile.open(big)).page(0), /inflates to more/);
+  await assert.rejects((await SceneFile.open(big)).page(0), /decompresses to more/);
   const small = layout(base, [{ ...page, data: Buffer.alloc(100), patch: state() }]);
-  await assert.rejects((await SceneFile.open(small)).page(0), /inflates to 100/);
+  await assert.rejects((await SceneFile.open(small)).page(0), /decompresses to 100/);
   const random = layout(base, [{ ...page, data: Buffer.alloc(128) }]);
   const raw = deflateRawSync(Buffer.alloc(128), { level: 9 }).length;
   const { crc32 } = await import('node:zlib');

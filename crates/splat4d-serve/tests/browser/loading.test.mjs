@@ -102,6 +102,6 @@ test('a file that was cut short plays what is there, and says so', options, asyn
   await page.goto(url);
   await page.waitForFunction(() => document.querySelector('splat-4d').statistics?.firstFrame > 0, null, { timeout: 60000 });
   const { what, remedy } = await page.evaluate(() => ({ what: globalThis.said?.what, remedy: globalThis.said?.remedy }));
-  assert.match(what, /cut short: 300000 of 766421 bytes/);
+  assert.match(what, /truncated: 300000 of 766421 bytes/);
   assert.match(remedy, /again/);
 });

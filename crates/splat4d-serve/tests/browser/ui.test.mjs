@@ -314,8 +314,8 @@ test('every control has a name, and the keyboard reaches it', options, async () 
   }
   const tree = await page.locator('splat-4d').ariaSnapshot();
   for (const part of ['application "Scene: Two knights"', 'toolbar "Playback"', 'slider "Time"', 'button "Play"',
-    'button "Loop"', 'combobox "Speed"', 'radiogroup "Picture"', 'radio "Depth"', 'button "Cameras and paths"',
-    'dialog "View"', 'combobox "Resolution"', 'radiogroup "Theme"', 'button "Save picture"', 'button "Copy link"',
+    'button "Loop"', 'combobox "Speed"', 'radiogroup "Channel"', 'radio "Depth"', 'button "Cameras and paths"',
+    'dialog "View"', 'combobox "Resolution"', 'radiogroup "Theme"', 'button "Save image"', 'button "Copy link"',
     'button "Full screen"', 'button "Keys and gestures"']) {
     assert.ok(tree.includes(part), `${part} in\n${tree}`);
   }
@@ -477,7 +477,7 @@ test('a path is made, played, exported and read again; bullet time holds the clo
   for (const [text, reason] of [
     ['{"keys": []}', 'empty'], ['{', 'JSON'], ['{"keys": [{"time": 0}]}', 'world_to_camera'],
     ['{"keys": [{"time": 0, "lookat": 1}]}', 'lookat'],
-    ['{"keys": [{"time": 0, "position": [0,0,1], "look_at": [0,0,1]}]}', 'one point'],
+    ['{"keys": [{"time": 0, "position": [0,0,1], "look_at": [0,0,1]}]}', 'the same point'],
     [JSON.stringify({ keys: [file.keys[0], file.keys[0]] }), 'not after']]) {
     assert.ok((await read(text)).includes(reason), `${text}: ${await read(text)}`);
   }
@@ -522,7 +522,7 @@ test('training is followed: late join, new snapshots, lost connections', options
   }
   assert.match(await page.getByRole('img', { name: /PSNR from/ }).getAttribute('aria-label'), /from 15\.1 to 17\.0 dB/);
   const opened = () => page.evaluate(() => globalThis.mockOpened.map(u => new URL(u).search));
-  for (const part of ['PSNR of training views, dB', 'Loss', '17.0', '15.1', '0.299', '0.280', '10', 'steps']) {
+  for (const part of ['PSNR, training views, dB', 'Loss', '17.0', '15.1', '0.299', '0.280', '10', 'steps']) {
     assert.ok(text.includes(part), `the chart has ${part}: ${text}`);
   }
   assert.deepEqual(await opened(), ['?v=7'], 'one scene, the newest');

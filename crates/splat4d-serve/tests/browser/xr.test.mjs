@@ -151,7 +151,7 @@ test('in a simulated room the scene stands on the floor, and a tap puts it elsew
     await look();
     hand.updateButtonValue('trigger', 0);
     const second = await look();
-    const buttons = [...shadowRoot.querySelectorAll('button')].filter((b) => /room/.test(b.title + b.ariaLabel) && !b.hidden).length;
+    const buttons = [...shadowRoot.querySelectorAll('button')].filter((b) => /AR/.test(b.title + b.ariaLabel) && !b.hidden).length;
     await session.end();
     await ended;
     return { first, second, buttons };

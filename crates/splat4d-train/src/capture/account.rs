@@ -1,6 +1,13 @@
 //! What a reader did not find, did not read, assumed or could not check: `info` prints it in one block.
 
-use super::preflight::Severity;
+/// How bad a [`Finding`] is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Severity {
+    /// Worth knowing.
+    Note,
+    /// The result will probably suffer.
+    Warning,
+}
 
 /// What a [`Remark`] is about.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]

@@ -1,21 +1,20 @@
 //! From what the files say to a checked capture: poses, sizes, files, duplicates, split, clock.
 
+use super::account::Severity;
 use super::account::{Aspect, Remark, first_names};
-use super::preflight::Severity;
+use super::pose::{SAME_POSE, same_pose};
 use super::{
     Capture, CaptureKind, CaptureOptions, Exif, Extent, FlowFile, Frame, HoldOut, PointCloud, RawFrame, Rig, Split,
     Take, Timing,
 };
 use super::{borders, evidence, lookup, masks, options, panorama, picture, plausible, pose};
-use splat4d::math::se3::{norm, normalize, sub};
+use splat4d::math::se3::{norm, normalize};
 use splat4d::scene::{Camera, Lens, Time};
 use splat4d::{Error, Result};
 use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-/// Poses closer than this, relative to the distance from the origin, are one pose.
-const SAME_POSE: f64 = 1e-9;
 /// Every how many images one is held out where no rig and no convention says otherwise (LLFF's habit).
 const HOLD_EVERY: usize = 8;
 /// White: what transparent pixels are composited on unless told (the papers' choice for D-NeRF).
@@ -28,7 +27,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
     if take.frames.is_empty() {
         return Err(located(
             Error::input("the capture has no frames")
-                .remedy("Check that the file lists pictures and that the pictures lie where it says."),
+                .remedy("Check that the file lists images and that the images lie where it says."),
         ));
     }
     options::check_rate("frame rate", take.fps).map_err(located)?;
@@ -72,6 +71,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
     let points = take.points.map(|p| p.voxel_downsample(options.max_points)).filter(|p| !p.points.is_empty());
     let mut capture = Capture {
         name,
+        elsewhere: super::elsewhere::find(&take.root, &frames, &take.files),
         root: take.root,
         kind: take.kind,
         cameras,
@@ -192,7 +192,7 @@ fn check_frame(frame: &mut RawFrame, camera: &str, options: &CaptureOptions) -> 
         ("depth", frame.depth.as_ref().map(|d| &d.path)),
         ("flow", frame.flow.as_ref()),
         ("mask of labels", frame.labels.as_ref()),
-        ("picture of features", frame.features.as_ref()),
+        ("image of features", frame.features.as_ref()),
     ];
     for (what, file) in files.into_iter().filter_map(|(what, file)| Some((what, file?))) {
         if !file.is_file() {
@@ -227,14 +227,6 @@ fn rigs(take: &Take) -> Vec<Rig> {
         fixed[frame.camera] &= same_pose(&reference.source, &frame.source);
     }
     take.cameras.iter().zip(fixed).map(|(name, fixed)| Rig { name: name.clone(), fixed }).collect()
-}
-
-/// Whether two cameras stand at one place and look the same way.
-pub(super) fn same_pose(a: &Camera, b: &Camera) -> bool {
-    let (p, q) = (&a.cam_from_world, &b.cam_from_world);
-    let turn = p.rotation.iter().flatten().zip(q.rotation.iter().flatten()).map(|(x, y)| (x - y).abs());
-    let moved = norm(sub(p.translation, q.translation));
-    turn.fold(0.0, f64::max) <= SAME_POSE && moved <= SAME_POSE * (1.0 + norm(p.translation))
 }
 
 /// Two fixed cameras with one pose are a slip of the hand: a copied matrix. Photos may be taken twice from one place,
@@ -299,7 +291,7 @@ fn check_duplicates(take: &mut Take, cameras: &[Rig]) -> Result<()> {
                 continue;
             }
             let what = format!(
-                "camera {} has two pictures at {} s: {} and {}",
+                "camera {} has two images at {} s: {} and {}",
                 cameras[frame.camera].name,
                 frame.time,
                 other.image.display(),
@@ -469,7 +461,7 @@ fn fit_pictures(take: &mut Take, options: &CaptureOptions) -> Result<(bool, Vec<
     }
     if let Some((image, size, stated)) = resized.first() {
         let what = format!(
-            "{} pictures are of another size than their intrinsics are for, which are scaled to them: {} is {}x{}, not \
+            "{} images are of another size than their intrinsics are for, which are scaled to them: {} is {}x{}, not \
              {}x{}.",
             resized.len(),
             image.display(),
@@ -547,9 +539,9 @@ fn check_masks(take: &Take, has_alpha: bool) -> Result<()> {
         }
     }
     let place = first.mask.as_ref().unwrap_or(&first.image);
-    Err(Error::input("the masks exclude everything: no picture has a foreground pixel")
+    Err(Error::input("the masks exclude everything: no image has a foreground pixel")
         .at(place.display())
-        .remedy("Masks are white where the picture counts: invert them, or leave them out of the capture."))
+        .remedy("Masks are white where the image counts: invert them, or leave them out of the capture."))
 }
 
 /// Masks whose shape is compared with that of their image's before training loads all.

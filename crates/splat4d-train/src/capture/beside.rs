@@ -29,11 +29,11 @@ pub(super) fn key(path: &Path) -> String {
 pub(super) fn align(pairs: &[(Se3, Se3)]) -> Result<Sim3> {
     const REMEDY: &str = "Points of the poses' own world can be named by ply_file_path, or by --set init=FILE.";
     if pairs.len() < LEAST {
-        let what = format!("it has only {} of the pictures, by name", pairs.len());
+        let what = format!("it has only {} of the images, by name", pairs.len());
         return Err(Error::input(what).remedy(REMEDY));
     }
     if spread(pairs) <= ONE_PLACE * (1.0 + norm(means(pairs).0)) {
-        return Err(Error::input("the cameras all stand in one place, which tells no scale").remedy(REMEDY));
+        return Err(Error::input("all cameras have the same position, which gives no scale").remedy(REMEDY));
     }
     let fitted = fit(pairs);
     let choices = [Sim3::default(), fitted];

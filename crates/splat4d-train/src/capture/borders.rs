@@ -10,9 +10,9 @@
 //! What is looked at is the same for every part of a take: the first image of each fixed camera, and images of moving ones
 //! evenly. The parts of one run get what the first of them found ([`Lenses`]).
 
+use super::account::Severity;
 use super::account::{Aspect, Remark};
 use super::options::Borders;
-use super::preflight::Severity;
 use super::{Capture, CaptureOptions, Frame, panorama, picture};
 use rayon::prelude::*;
 use splat4d::scene::Lens;

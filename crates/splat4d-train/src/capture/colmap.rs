@@ -7,12 +7,12 @@
 mod multiview;
 mod unregistered;
 
+use super::account::Severity;
 use super::account::{Account, Aspect};
 use super::colmap_files::{self, Point, Registered};
 use super::convention::{Convention, Poses};
 use super::lookup::{self, Lookup};
 use super::points::read_ply;
-use super::preflight::Severity;
 use super::splits::Lists;
 use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take, beside, rig, sequence};
 use splat4d::math::{Se3, quat};
@@ -166,7 +166,7 @@ fn sources(folder: &Path, registered: &[Registered], poses: Poses) -> Result<Vec
     let optics = colmap_files::cameras(folder, &used)?;
     let mut shots = Vec::with_capacity(registered.len());
     for picture in registered {
-        let place = |e: Error| e.at(format!("{}: picture {:.200}", folder.display(), picture.name));
+        let place = |e: Error| e.at(format!("{}: image {:.200}", folder.display(), picture.name));
         let camera = optics.get(&picture.camera).ok_or_else(|| {
             place(Error::input(format!("its camera {} is not in the cameras file", picture.camera)))
                 .remedy("Export the reconstruction again.")
@@ -228,7 +228,7 @@ fn best_model(sparse: &Path, warnings: &mut Vec<String>) -> Result<(PathBuf, Vec
     })?;
     if count > 1 {
         warnings.push(format!(
-            "COLMAP split the pictures into {count} separate models; {} is used ({} pictures).",
+            "COLMAP split the images into {count} separate models; {} is used ({} images).",
             best.0.display(),
             best.1.len()
         ));
@@ -240,7 +240,7 @@ fn pose_of(picture: &Registered) -> Result<Se3> {
     let (unit, length) = quat::normalize(picture.quat);
     if !(length.is_finite() && length > 1e-6) || picture.translation.iter().any(|v| !v.is_finite()) {
         return Err(Error::input("the pose holds NaN, infinity or a zero quaternion")
-            .remedy("Reconstruct again, or remove that picture."));
+            .remedy("Reconstruct again, or remove that image."));
     }
     Ok(Se3 { rotation: quat::to_rotation(unit), translation: picture.translation })
 }

@@ -56,10 +56,10 @@ pub(super) fn read(file: &DepthFile, frame: &Frame, downscale: usize) -> Result<
     if (map.width, map.height) != (source.width, source.height) && !picture::is_resized((map.width, map.height), source)
     {
         let what =
-            format!("the depth map is {}x{}, its picture {}x{}", map.width, map.height, source.width, source.height);
+            format!("the depth map is {}x{}, its image {}x{}", map.width, map.height, source.width, source.height);
         return Err(Error::input(what)
             .at(file.path.display())
-            .remedy("Write it in the picture's shape (it may be smaller or larger as a whole)"));
+            .remedy("Write it in the image's shape (it may be smaller or larger as a whole)"));
     }
     let full = straighten(&map, source);
     Ok(reduce(&full, source.width, source.height, downscale))

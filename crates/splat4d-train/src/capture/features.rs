@@ -30,21 +30,20 @@ pub(crate) fn read(frame: &Frame, capture: &Capture) -> Result<Option<Features>>
     };
     let array = Npy::read(&json::read_bytes(path)?).map_err(place)?;
     let [height, width, channels] = array.shape[..] else {
-        let what = format!("a picture of features is [height, width, channels], this array is {:?}", array.shape);
+        let what = format!("an image of features is [height, width, channels], this array is {:?}", array.shape);
         return Err(place(Error::input(what).remedy("Save it so: numpy.save(path, features.astype('f4'))")));
     };
     if !(1..=MOST_CHANNELS).contains(&channels) {
-        let what = format!("the picture of features has {channels} channels, 1 to {MOST_CHANNELS} are possible");
+        let what = format!("the image of features has {channels} channels, 1 to {MOST_CHANNELS} are possible");
         return Err(place(
-            Error::input(what).remedy("Reduce them first, all pictures alike: their main components are enough"),
+            Error::input(what).remedy("Reduce them first, all images alike: their main components are enough"),
         ));
     }
     let source = &frame.source;
     if (width, height) != (source.width, source.height) && !picture::is_resized((width, height), source) {
-        let what =
-            format!("the picture of features is {width}x{height}, its picture {}x{}", source.width, source.height);
+        let what = format!("the image of features is {width}x{height}, its image {}x{}", source.width, source.height);
         return Err(place(
-            Error::input(what).remedy("Write it in the picture's shape (it may be smaller or larger as a whole)"),
+            Error::input(what).remedy("Write it in the image's shape (it may be smaller or larger as a whole)"),
         ));
     }
     let values = array.to_f32();

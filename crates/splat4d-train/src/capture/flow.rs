@@ -165,7 +165,7 @@ pub(crate) fn to_picture(flow: &Planes<f32>) -> image::ImageBuffer<image::Rgb<u1
 fn decode_picture(path: &Path, camera: &Camera) -> Result<Vec<Code>> {
     let raster = picture::decode_beside(path, "flow", camera)?;
     let bad = |what: &str| {
-        Err(Error::input(format!("the flow picture has {what}"))
+        Err(Error::input(format!("the flow image has {what}"))
             .at(path.display())
             .remedy("Write 16-bit RGB as in KITTI: 64 u + 32768, 64 v + 32768, and 1 where they are known"))
     };

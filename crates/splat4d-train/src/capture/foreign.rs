@@ -11,7 +11,7 @@ mod tests;
 use super::convention::{Convention, Poses};
 use super::points::read_ply;
 use super::{CaptureKind, CaptureOptions, DepthFile, PointCloud, RawFrame, Take, Timing, rig, sequence};
-use super::{lookup, masks, pose};
+use super::{lookup, pose};
 use splat4d::math::Se3;
 use splat4d::scene::Camera;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -127,7 +127,7 @@ impl Images {
         let folders = |of: &Path| -> Vec<PathBuf> {
             let names = rig::file_names(of)
                 .into_iter()
-                .filter(|n| !masks::may_be(n) && !OTHERS.iter().any(|o| n.starts_with(o)));
+                .filter(|n| !lookup::may_hold_masks(n) && !OTHERS.iter().any(|o| n.starts_with(o)));
             names.map(|n| of.join(n)).filter(|p| p.is_dir()).collect()
         };
         for folder in folders(root) {

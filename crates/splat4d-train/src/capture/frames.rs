@@ -95,7 +95,7 @@ impl Flow {
 
     /// At half the size, pixels are twice as large.
     fn halve(&mut self) {
-        halve(&mut self.vectors);
+        self.vectors.halve();
         self.camera = self.camera.downscaled(2);
         let n = self.vectors.pixels();
         self.vectors.data[..2 * n].iter_mut().for_each(|v| *v *= 0.5);
@@ -105,30 +105,12 @@ impl Flow {
 impl Picture {
     /// Half the size: the mean of 2x2 boxes, an odd last row or column left out (as `Camera::downscaled`).
     pub(crate) fn halve(&mut self) {
-        halve(&mut self.color);
-        self.mask.as_mut().map(halve);
-        self.weight.as_mut().map(halve);
+        self.color.halve();
+        self.mask.as_mut().map(Planes::halve);
+        self.weight.as_mut().map(Planes::halve);
         self.depth.as_mut().map(Depth::halve);
         self.flow.as_mut().map(Flow::halve);
     }
-}
-
-/// In place: a pixel of the half picture is written before the places that later ones read.
-pub(crate) fn halve(planes: &mut Planes<f32>) {
-    let (height, width) = (planes.height / 2, planes.width / 2);
-    for c in 0..planes.channels {
-        for y in 0..height {
-            let from = (c * planes.height + 2 * y) * planes.width;
-            let to = (c * height + y) * width;
-            for x in 0..width {
-                let [a, b] = [from + 2 * x, from + planes.width + 2 * x];
-                let data = &mut planes.data;
-                data[to + x] = 0.25 * (data[a] + data[a + 1] + data[b] + data[b + 1]);
-            }
-        }
-    }
-    (planes.height, planes.width) = (height, width);
-    planes.data.truncate(planes.channels * height * width);
 }
 
 /// The pictures a scene is trained on.
@@ -198,16 +180,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn shutters_that_do_not_open_at_once_share_their_moments() {
+    fn shutters_that_do_not_open_at_once_share_their_times() {
         let rig = |late: f64| (0..12).map(move |i| (i % 3, (i / 3) as f64 + late * (i % 3) as f64));
         assert_eq!([moments(rig(0.0)), moments(rig(0.2)), moments(rig(1.0))], [4, 4, 6]);
         assert_eq!((half_frame(rig(0.2)), half_frame([(0, 1.0), (1, 3.0)].into_iter())), (0.5, 0.0));
     }
 
     #[test]
-    fn half_a_picture_is_the_mean_of_its_boxes() {
+    fn half_an_image_is_the_mean_of_its_boxes() {
         let mut p = Planes::from_interleaved(1, 3, 5, &(0..15).map(|x| x as f32).collect::<Vec<_>>());
-        halve(&mut p);
+        p.halve();
         assert_eq!((p.height, p.width, p.data), (1, 2, vec![3.0, 5.0]));
     }
 }

@@ -195,7 +195,7 @@ fn unknown(node: &Node<'_>, key: &str, known: &[&str]) -> Error {
         Some(near) => format!("Did you mean \"{near}\"?"),
         None => format!("Known keys here: {}.", known.join(", ")),
     };
-    node.error(format!("the key \"{key}\" is not known")).remedy(remedy)
+    node.error(format!("unknown key \"{key}\"")).remedy(remedy)
 }
 
 /// The candidate with the smallest edit distance to `word`, if that is at most a third of its length (and ≥ 2 edits).

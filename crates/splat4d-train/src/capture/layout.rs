@@ -1,7 +1,7 @@
 //! Which layout a folder has: markers in a stated order, what lies beside the one that is taken, and what to do where there
 //! is none.
 
-use super::{CaptureOptions, Take, colmap, foreign, n3dv, nerfies, own, panoptic, rig, stray, transforms};
+use super::{CaptureOptions, Take, colmap, foreign, llff, n3dv, nerfies, own, panoptic, rig, stray, transforms};
 use splat4d::{Error, ErrorKind, Result};
 use std::path::Path;
 
@@ -15,7 +15,7 @@ const READERS: &[(&str, Reader)] = &[
     ("train_meta.json", panoptic::read),
     (transforms::ALL, transforms::read),
     (nerfies::MARKER, nerfies::read),
-    (BOUNDS, n3dv::read),
+    (BOUNDS, read_bounds),
     (colmap::SPARSE, colmap::read),
     (colmap::NESTED, colmap::read),
     (colmap::MULTIVIEW, colmap::read),
@@ -146,8 +146,13 @@ pub(super) fn is_metadata(path: &Path) -> bool {
     ending || model && path.is_file()
 }
 
+/// LLFF's poses: of the cameras of a rig with folders of frames, or of the images of one folder.
+fn read_bounds(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
+    if n3dv::applies(root) { n3dv::read(root, marker, options) } else { llff::read(root, marker, options) }
+}
+
 /// Whether a folder holds a capture of one of these layouts.
-pub(super) fn is_capture(folder: &Path) -> bool {
+fn is_capture(folder: &Path) -> bool {
     READERS.iter().any(|(marker, _)| is_there(folder, marker))
 }
 
@@ -162,7 +167,7 @@ fn remark(take: &mut Take, path: &Path, marker: &str, others: &[&str]) {
     let list = |names: &[&str]| names.join(", ");
     let choose = |other: &str| format!("To read another, give its path: {}.", path.join(other).display());
     if let Some(other) = same.first() {
-        let what = format!("{marker} is read and {other} is not: the former says which pictures are held out.");
+        let what = format!("{marker} is read and {other} is not: the former says which images are held out.");
         take.notes.push(format!("{what} {}", choose(other)));
     }
     if let Some(other) = foreign.first() {
@@ -186,7 +191,7 @@ fn unknown_layout(root: &Path, named: &Path) -> Error {
     }
     let markers: Vec<&str> = READERS.iter().map(|(marker, _)| *marker).collect();
     Error::input(format!("is not a capture: none of {} is there", markers.join(", "))).at(named.display()).remedy(
-        stray::advice(root, named).unwrap_or_else(|| {
+        stray::advice(root, named, &is_capture).unwrap_or_else(|| {
             "Write a capture.json with your cameras (docs/capture-format.md), or give the folder of a known layout."
                 .into()
         }),

@@ -4,15 +4,18 @@
 //! normal form (macOS decomposes umlauts) and leading folders (absolute paths of another machine). The exact name goes
 //! first; else the one file that fits is taken, and one remark counts such names. Several files that fit are an error.
 
+use super::account::Severity;
 use super::account::{Account, Aspect};
-use super::preflight::Severity;
-use super::{CaptureOptions, masks, rig};
+use super::{CaptureOptions, rig};
 use splat4d::{Error, Result};
 use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 use unicode_normalization::UnicodeNormalization;
+
+/// What names of folders have in which other programs keep masks, whatever white means there.
+const MASK_WORDS: [&str; 3] = ["mask", "matte", "segment"];
 
 /// Folders in which images usually lie, below that of the capture.
 const IMAGE_FOLDERS: [&str; 3] = ["images", "input", "image"];
@@ -393,9 +396,14 @@ fn one<'a>(fitting: Option<&'a Vec<String>>, name: &str, folder: &Path) -> Resul
     }
 }
 
+/// Whether a folder's name is like those of masks.
+pub(super) fn may_hold_masks(folder: &str) -> bool {
+    MASK_WORDS.iter().any(|word| fold(folder).contains(word))
+}
+
 /// Folders in a folder that may hold images.
 fn folders_in(folder: &Path) -> Vec<PathBuf> {
-    let for_images = |n: &String| !NO_IMAGES.iter().any(|o| fold(n).starts_with(o)) && !masks::may_be(n);
+    let for_images = |n: &String| !NO_IMAGES.iter().any(|o| fold(n).starts_with(o)) && !may_hold_masks(n);
     let names = rig::file_names(folder).into_iter().filter(for_images);
     names.map(|name| folder.join(name)).filter(|folder| folder.is_dir()).collect()
 }

@@ -3,9 +3,9 @@
 //! For the image `cam0/a.jpg` these are, in `masks/` or `mask/`: `cam0/a.jpg.png` (COLMAP), `cam0/a.png`, `cam0/a_mask.png`,
 //! `cam0/mask_a.png` and `cam0/a.mask.png` (Metashape), with any ending of images.
 
+use super::account::Severity;
 use super::account::{Aspect, first_names};
-use super::lookup::{fold, key, without_ending};
-use super::preflight::Severity;
+use super::lookup::{fold, key, may_hold_masks, without_ending};
 use super::{CaptureKind, Take, rig};
 use splat4d::{Error, Result};
 use std::collections::{BTreeMap, BTreeSet};
@@ -13,8 +13,6 @@ use std::path::{Path, PathBuf};
 
 /// Folders of masks, in any letter case.
 const FOLDERS: [&str; 2] = ["masks", "mask"];
-/// What names of folders have in which other programs keep masks, whatever white means there.
-const MAYBE: [&str; 3] = ["mask", "matte", "segment"];
 /// What names of masks have besides those of their images.
 const SUFFIXES: [&str; 4] = ["_mask", "-mask", ".mask", "_seg"];
 const PREFIXES: [&str; 2] = ["mask_", "mask-"];
@@ -83,11 +81,6 @@ pub(super) fn fill(take: &mut Take) -> Result<()> {
     Ok(())
 }
 
-/// Whether a folder's name is like those of masks.
-pub(super) fn may_be(folder: &str) -> bool {
-    MAYBE.iter().any(|word| fold(folder).contains(word))
-}
-
 /// An image's path below the capture's folder.
 fn below(root: &Path, image: &Path) -> String {
     image.strip_prefix(root).unwrap_or(image).to_string_lossy().into_owned()
@@ -95,7 +88,7 @@ fn below(root: &Path, image: &Path) -> String {
 
 /// Names folders that may hold masks and are not read, where no frame has one.
 fn tell_of_others(take: &mut Take, folders: &[String]) {
-    let others: Vec<&String> = folders.iter().filter(|n| may_be(n)).collect();
+    let others: Vec<&String> = folders.iter().filter(|n| may_hold_masks(n)).collect();
     if others.is_empty() || take.frames.iter().any(|f| f.mask.is_some()) {
         return;
     }

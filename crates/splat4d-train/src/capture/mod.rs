@@ -13,6 +13,7 @@ mod colmap;
 mod colmap_files;
 mod convention;
 mod depth;
+mod elsewhere;
 mod evidence;
 mod exr;
 pub(crate) mod features;
@@ -49,7 +50,7 @@ mod stray;
 mod tracks;
 mod transforms;
 
-pub use account::{Aspect, Remark};
+pub use account::{Aspect, Remark, Severity};
 pub use borders::Lenses;
 pub use convention::{Convention, Poses};
 pub use depth::{DepthFile, DepthKind};
@@ -63,7 +64,7 @@ pub use options::{
 };
 pub use points::PointCloud;
 pub use posed::{PosedCamera, check_intrinsics, colmap_cameras, is_colmap, rigid, transforms_cameras};
-pub use preflight::{Finding, Reach, Severity};
+pub use preflight::{Finding, Reach};
 pub use rgb8::Rgb8;
 pub use sequence::Timing;
 pub use store::{ImageStore, Picture, StoredPicture};
@@ -76,7 +77,7 @@ use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, Time};
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
-use std::path::{Component, Path, PathBuf};
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 /// Which layout a capture was read from.
@@ -197,6 +198,8 @@ pub struct Capture {
     pub name: String,
     /// The folder.
     pub root: PathBuf,
+    /// Real folders of its images, masks and maps that lie elsewhere, and such files.
+    pub elsewhere: BTreeSet<PathBuf>,
     /// The layout it was read from.
     pub kind: CaptureKind,
     /// The cameras; a moving camera is one entry that is not `fixed`.
@@ -265,6 +268,8 @@ struct Take {
     hold_out: Option<HoldOut>,
     fps: f64,
     points: Option<PointCloud>,
+    /// Files named in its metadata that were read and are no frame's.
+    files: Vec<PathBuf>,
     background: Option<[f32; 3]>,
     up: Option<[f64; 3]>,
     labels: Vec<String>,
@@ -291,6 +296,7 @@ impl Take {
             hold_out: None,
             fps: DEFAULT_FPS,
             points: None,
+            files: Vec::new(),
             background: None,
             up: None,
             labels: Vec::new(),
@@ -348,19 +354,10 @@ impl Capture {
         assemble::assemble(layout::read(path, options)?, options)
     }
 
-    /// Real folders outside of its own that it holds by links, as `images` often is.
-    pub fn linked_folders(&self) -> BTreeSet<PathBuf> {
-        let files = self.frames.iter().flat_map(|f| {
-            let priors = [f.depth.as_ref().map(|d| &d.path), f.flow.as_ref().map(|f| &f.path)];
-            let others = [f.mask.as_ref(), f.labels.as_ref(), f.features.as_ref()];
-            std::iter::once(&f.image).chain(priors.into_iter().chain(others).flatten())
-        });
-        let held = |p: &&Path| p.starts_with(&self.root) && !p.components().any(|c| c == Component::ParentDir);
-        let folders = files.filter_map(|file| file.parent()).filter(held);
-        let below_root = folders.flat_map(|p| p.ancestors().take_while(|above| *above != self.root));
-        let named: BTreeSet<&Path> = below_root.collect();
-        let Ok(root) = self.root.canonicalize() else { return BTreeSet::new() };
-        named.into_iter().filter_map(|p| p.canonicalize().ok()).filter(|p| !p.starts_with(&root)).collect()
+    /// Reads a frame's mask of labels and its features, where there are such. Errors: damage; another size.
+    pub fn check_labels(&self, frame: &Frame) -> Result<()> {
+        labels::read(frame, self)?;
+        features::read(frame, self).map(drop)
     }
 
     /// The first and last time of all frames, seconds.

@@ -1,12 +1,12 @@
 //! N3DV captures (Li 2022): `poses_bounds.npy`, one row per camera, and a folder of frames per camera.
 
+use super::account::Severity;
 use super::account::{Account, Aspect, first_names};
 use super::convention::{Convention, Poses};
 use super::points::read_ply;
-use super::preflight::Severity;
 use super::stray::{ffmpeg_command, videos};
 use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take};
-use super::{json, llff, masks, picture, pose, rig, sequence};
+use super::{json, lookup, picture, pose, rig, sequence};
 use splat4d::format::npy::Npy;
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -56,11 +56,8 @@ pub(super) fn points(root: &Path) -> Result<Option<PointCloud>> {
     POINTS.iter().map(|name| root.join(name)).find(|p| p.is_file()).map(|p| read_ply(&p)).transpose()
 }
 
-/// Reads poses and frame folders; the first camera is held out. Without such folders it is LLFF's layout.
+/// Reads poses and frame folders; the first camera is held out.
 pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
-    if !applies(root) {
-        return llff::read(root, marker, options);
-    }
     let place = |e: Error| e.at(marker.display());
     let rows = rows(marker)?;
     let folders = folders(root);
@@ -225,7 +222,7 @@ fn folders(root: &Path) -> Vec<Folder> {
 /// Whether a folder's images are not the frames of one camera.
 fn is_other(name: &str) -> bool {
     ["depth", "sparse", "sparse_", "colmap", "image_colmap"].contains(&name)
-        || masks::may_be(name)
+        || lookup::may_hold_masks(name)
         || rig::is_plain(name)
 }
 
@@ -244,7 +241,7 @@ pub(super) fn camera_of(row: &[f64], (width, height): (usize, usize), poses: Pos
     // Sides of reduced copies are rounded.
     let rounding = 1.0 / width.min(height).max(1) as f64;
     if aspect.is_nan() || (aspect - 1.0).abs() > MAX_ASPECT_CHANGE.max(rounding) {
-        let what = format!("the pose is for pictures of {stated_width}x{stated_height}, not {width}x{height}");
+        let what = format!("the pose is for images of {stated_width}x{stated_height}, not {width}x{height}");
         return Err(Error::input(what).remedy("Extract the frames without cropping."));
     }
     // Frames are often extracted at half the size that the calibration states.

@@ -5,11 +5,11 @@
 //! `pixel_aspect_ratio`, `principal_point`, `radial_distortion`, `tangential_distortion` and `image_size` [width, height] of
 //! the pictures at 1x. `scene.json` brings the world to about a unit: x becomes (x − center)·scale, cameras and points alike.
 
+use super::account::Severity;
 use super::account::{Account, Aspect, first_names};
 use super::convention::{Convention, Poses};
 use super::json::{self, Node};
 use super::lookup::Lookup;
-use super::preflight::Severity;
 use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take, pose};
 use splat4d::format::npy::Npy;
 use splat4d::math::Se3;
@@ -147,9 +147,9 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         let index = match (of("time_id")?, of("warp_id")?, of("appearance_id")?) {
             (Some(n), ..) | (_, Some(n), _) | (.., Some(n)) => n,
             _ => {
-                return Err(Error::input(format!("picture \"{id:.80}\" has no time_id, warp_id or appearance_id"))
+                return Err(Error::input(format!("image \"{id:.80}\" has no time_id, warp_id or appearance_id"))
                     .at(path.display())
-                    .remedy("Give each picture the number of its moment."));
+                    .remedy("Give each image its time index."));
             }
         };
         let number = of("camera_id")?.unwrap_or(0) as u64;
@@ -200,7 +200,7 @@ fn pictures(root: &Path, options: &CaptureOptions) -> Result<(PathBuf, usize)> {
     }
     let all = SCALES.map(|k| (root.join("rgb").join(format!("{k}x")), k));
     all.into_iter().find(|(p, _)| p.is_dir()).ok_or_else(|| {
-        Error::input("there are no pictures: none of 1x, 2x, 4x, 8x and 16x is there")
+        Error::input("there are no images: none of 1x, 2x, 4x, 8x and 16x is there")
             .at(root.join("rgb").display())
             .remedy("Copy the data set's rgb folder here.")
     })
@@ -256,7 +256,7 @@ fn points(root: &Path, framing: &Framing) -> Result<Option<PointCloud>> {
     if array.shape.len() != 2 || array.shape[1] != 3 {
         return Err(Error::input(format!("the points have shape {:?}, not [N, 3]", array.shape))
             .at(path.display())
-            .remedy("Delete the file: points are then found in the pictures."));
+            .remedy("Delete the file: points are then found in the images."));
     }
     let mut cloud = PointCloud::default();
     for x in array.to_f64().chunks_exact(3) {

@@ -18,7 +18,7 @@ impl Capture {
         let times = || self.train.iter().chain(&self.held).map(|&i| self.frames[i].time.0);
         let (first, last) = times().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), t| (a.min(t), b.max(t)));
         if last <= first {
-            return Err(place(Error::input("the capture has one moment, and so no future"))
+            return Err(place(Error::input("all images of the capture have the same time, so there is no future"))
                 .remedy("Leave --observe away, or give a moving take"));
         }
         if !(share > 0.0 && share < 1.0) {

@@ -46,7 +46,7 @@ impl Capture {
     }
 
     /// Makes positions relative to another offset: that of a scene with which the capture is compared.
-    pub(crate) fn relocate(&mut self, offset: [f64; 3]) {
+    pub fn relocate(&mut self, offset: [f64; 3]) {
         let by = sub(offset, self.offset);
         if by == [0.0; 3] {
             return;

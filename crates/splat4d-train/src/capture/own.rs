@@ -118,6 +118,7 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<T
     let mut account = Account::default();
     lookup.tell(&mut account);
     let convention = Convention { world_to_camera: !inverse, opengl, quaternions: false };
+    let points = top.opt("points")?.map(|n| lookup.file(n.text()?)).transpose()?;
     Ok(Take {
         name: top.opt("name")?.map(|n| n.text()).transpose()?.map(str::to_string),
         cameras,
@@ -127,7 +128,8 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<T
         named: true,
         hold_out,
         fps,
-        points: top.opt("points")?.map(|n| read_ply(&lookup.file(n.text()?)?)).transpose()?,
+        points: points.as_deref().map(read_ply).transpose()?,
+        files: points.into_iter().collect(),
         background: read_background(top)?,
         up: top.opt("up")?.map(|n| n.numbers::<3>()).transpose()?,
         labels,
@@ -323,7 +325,7 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
         }
         let pose = if moving { poses.get(index) } else { poses.first() };
         let Some(&cam_from_world) = pose else {
-            let what = format!("there are {} poses, but a picture of frame {index}", poses.len());
+            let what = format!("there are {} poses, but an image of frame {index}", poses.len());
             return Err(node.error(what).remedy("Give one pose per frame, or \"count\"."));
         };
         let time = match times.as_ref().map(|t| t.get(index)) {
@@ -331,7 +333,7 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
             Some(Some(&time)) => time,
             Some(None) => {
                 let what =
-                    format!("there are {} times, but a picture of frame {index}", times.as_ref().map_or(0, Vec::len));
+                    format!("there are {} times, but an image of frame {index}", times.as_ref().map_or(0, Vec::len));
                 return Err(node.error(what).remedy("Give one time per frame, in seconds, or \"frames\"."));
             }
         };
@@ -390,7 +392,7 @@ impl Depth {
         };
         if scale.is_none() && whole && kind == DepthKind::Metric {
             return Err(camera
-                .error("\"depth\" are pictures of whole numbers, and nothing says what one of them is")
+                .error("\"depth\" refers to integer images without a unit")
                 .remedy("Give \"depth_scale\": scene units a number, for instance 0.001 for millimetres in metres."));
         }
         Ok(Self { files, kind, scale: scale.unwrap_or(1.0) })
@@ -407,7 +409,7 @@ fn read_times(node: &Node<'_>) -> Result<Vec<f64>> {
     let times = node.list()?.iter().map(|n| n.number()).collect::<Result<Vec<f64>>>()?;
     if let Some(k) = times.windows(2).position(|w| w[0] >= w[1]) {
         let what = format!("time {} ({} s) is not later than the one before ({} s)", k + 1, times[k + 1], times[k]);
-        return Err(node.error(what).remedy("Give the times in seconds, in the order of the pictures."));
+        return Err(node.error(what).remedy("Give the times in seconds, in the order of the images."));
     }
     Ok(times)
 }

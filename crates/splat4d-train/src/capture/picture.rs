@@ -138,7 +138,7 @@ fn broken(path: &Path, detail: impl std::fmt::Display) -> Error {
     }
     // Some decoders' messages hold line breaks.
     let detail = detail.to_string().split_whitespace().collect::<Vec<_>>().join(" ");
-    Error::input(format!("the picture is damaged, truncated or of another format than JPEG, PNG and WebP ({detail})"))
+    Error::input(format!("the image is damaged, truncated or of another format than JPEG, PNG and WebP ({detail})"))
         .at(path.display())
         .remedy("Copy or extract it again, or delete it: an image that is missing is skipped.")
 }
@@ -226,12 +226,12 @@ pub(super) fn check_size(path: &Path, size: (usize, usize), camera: &Camera) -> 
         return Ok(());
     }
     let what = format!(
-        "the picture is {}x{}, but its camera's intrinsics are for {}x{}",
+        "the image is {}x{}, but its camera's intrinsics are for {}x{}",
         size.0, size.1, camera.width, camera.height
     );
     Err(Error::input(what).at(path.display()).remedy(
-        "Give the intrinsics of these pictures, or resize them. Where they have an EXIF orientation, --set capture.exif=stored \
-         or upright says which pixels the intrinsics describe.",
+        "Give the intrinsics of these images, or resize them. Where they have an EXIF orientation, --set \
+         capture.exif=stored or upright says which pixels the intrinsics describe.",
     ))
 }
 
@@ -240,9 +240,9 @@ pub(super) fn check_beside(path: &Path, what: &str, size: (usize, usize), camera
     if size == (camera.width, camera.height) {
         return Ok(());
     }
-    Err(Error::input(format!("the {what} is {}x{}, its picture {}x{}", size.0, size.1, camera.width, camera.height))
+    Err(Error::input(format!("the {what} is {}x{}, its image {}x{}", size.0, size.1, camera.width, camera.height))
         .at(path.display())
-        .remedy("Write it in the size of the stored picture"))
+        .remedy("Write it in the size of the stored image"))
 }
 
 /// How many times as long as its picture's the sides of a map may be; a larger one is a mistake, or a trap for memory.
@@ -253,9 +253,8 @@ pub(super) fn check_not_larger(what: &str, size: (usize, usize), camera: &Camera
     if size.0 <= MOST_TIMES * camera.width && size.1 <= MOST_TIMES * camera.height {
         return Ok(());
     }
-    let what = format!("the {what} is {}x{}, its picture {}x{}", size.0, size.1, camera.width, camera.height);
-    Err(Error::input(what)
-        .remedy(format!("Write it in the size of the picture; at most {MOST_TIMES} times its sides.")))
+    let what = format!("the {what} is {}x{}, its image {}x{}", size.0, size.1, camera.width, camera.height);
+    Err(Error::input(what).remedy(format!("Write it in the size of the image; at most {MOST_TIMES} times its sides.")))
 }
 
 /// Decodes what lies beside a picture, `what` in words. Errors before its pixels are read where its size is not that of the

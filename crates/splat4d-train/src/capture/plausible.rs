@@ -1,8 +1,8 @@
 //! Whether intrinsics and lenses can be those of the images: principal point, field of view, bend. Cheap: opens no image.
 
 use super::account::Aspect;
+use super::account::Severity;
 use super::lens::Distortion;
-use super::preflight::Severity;
 use super::{RawFrame, Take};
 use splat4d::scene::{Camera, Lens};
 use std::collections::BTreeSet;

@@ -1,9 +1,12 @@
 //! Poses as data sets write them, checked and brought to `cam_from_world` in OpenCV axes.
 
 use splat4d::math::Se3;
-use splat4d::math::se3::{mat_mul, transpose};
-use splat4d::scene::Intrinsics;
+use splat4d::math::se3::{mat_mul, norm, sub, transpose};
+use splat4d::scene::{Camera, Intrinsics};
 use splat4d::{Error, Result};
+
+/// Poses closer than this, relative to the distance from the origin, are one pose.
+pub(super) const SAME_POSE: f64 = 1e-9;
 
 /// Largest |R Rᵀ − I| of a rotation that is accepted: poses typed with three decimals stay below it, scaled or sheared
 /// ones do not.
@@ -86,6 +89,14 @@ pub(super) fn check_size(width: usize, height: usize) -> Result<()> {
     }
     Err(Error::input(format!("the image size {width}x{height} is not possible"))
         .remedy(format!("Sides must be 1 to {MAX_SIDE} pixels, at most {MAX_PIXELS} in all.")))
+}
+
+/// Whether two cameras stand at one place and look the same way.
+pub(super) fn same_pose(a: &Camera, b: &Camera) -> bool {
+    let (p, q) = (&a.cam_from_world, &b.cam_from_world);
+    let turn = p.rotation.iter().flatten().zip(q.rotation.iter().flatten()).map(|(x, y)| (x - y).abs());
+    let moved = norm(sub(p.translation, q.translation));
+    turn.fold(0.0, f64::max) <= SAME_POSE && moved <= SAME_POSE * (1.0 + norm(p.translation))
 }
 
 #[cfg(test)]

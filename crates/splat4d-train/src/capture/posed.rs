@@ -64,7 +64,7 @@ fn of_pictures(shots: &[(String, Camera)]) -> Result<Vec<PosedCamera>> {
             Some(known) if alike(&known.camera, camera) => {}
             Some(_) => {
                 return Err(Error::input(format!("camera {name:.80} is in several places, as {path:.200} shows"))
-                    .remedy("A calibration is of cameras that stand still: give a reconstruction of one moment."));
+                    .remedy("A calibration describes fixed cameras: give a reconstruction of one time."));
             }
         }
     }
@@ -91,7 +91,7 @@ mod tests {
     use serde_json::json;
 
     #[test]
-    fn cameras_are_read_without_their_pictures() {
+    fn cameras_are_read_without_their_images() {
         let dir = tempfile::tempdir().unwrap();
         let frame = |path: &str, x: f64| {
             json!({"file_path": path,

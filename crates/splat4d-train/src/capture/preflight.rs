@@ -1,17 +1,9 @@
 //! Checks of a capture before hours of training: few cameras, narrow coverage, uneven clocks.
 
+use super::account::Severity;
 use super::{Aspect, Capture, Frame};
 use splat4d::math::mat3::solve;
 use splat4d::math::se3::{dot, norm, normalize, sub};
-
-/// How bad a [`Finding`] is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Severity {
-    /// Worth knowing.
-    Note,
-    /// The result will probably suffer.
-    Warning,
-}
 
 /// Something about a capture that will show in the result.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -114,7 +106,7 @@ impl Capture {
         if self.points.is_none() {
             findings.push(finding(
                 Severity::Note,
-                "The capture has no initial points: training looks for some in its pictures.".into(),
+                "The capture has no initial points: training finds points in its images.".into(),
                 "A sparse cloud (COLMAP, or any coloured .ply) gives a better start.",
             ));
         }
@@ -163,7 +155,7 @@ impl Capture {
             findings.push(finding(
                 Severity::Warning,
                 format!("The cameras cover only {widest:.0}° around the scene: depth is poorly determined."),
-                "Spread the cameras, or expect good pictures only between them.",
+                "Spread the cameras, or expect good quality only between them.",
             ));
         }
         if let Some((angle, i, j)) = closest.filter(|c| c.0 < CLOSE_DEGREES) {

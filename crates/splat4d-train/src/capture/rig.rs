@@ -131,7 +131,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_tell_cameras_and_frames() {
+    fn names_give_cameras_and_frames() {
         let n = naming(&["cam02/0007.png", "images/cam01/0005.jpg", "cam01/images/0006.png"]);
         assert_eq!((n.cameras.as_slice(), n.told), (&["cam01".to_string(), "cam02".into()][..], true));
         assert_eq!(n.frames, [(1, 2), (0, 0), (0, 1)]);

@@ -67,14 +67,14 @@ pub(super) fn order(
     let count = names.len();
     if sequence == Sequence::Auto && moment && !one_each && count > 1 {
         notes.push(format!(
-            "The capture states no times, and its names do not number the frames of a film: its {count} pictures are \
-             one moment. If they are frames of a film, say --set capture.sequence=video."
+            "The capture has no times, and its names do not number the frames of a video: its {count} images are \
+             given the same time. If they are frames of a video, use --set capture.sequence=video."
         ));
     }
     if sequence == Sequence::Auto && !moment && !rig && count > 1 && !still(&groups[0], poses) {
         warnings.push(format!(
-            "The capture states no times: its {count} pictures are numbered like frames ({}) and taken for a film of \
-             one moving camera at {fps} frames per second. If they are photos of one moment, say --set \
+            "The capture has no times: its {count} images are numbered like frames ({}) and read as a video of one \
+             moving camera at {fps} frames per second. If they are photos of one time, use --set \
              capture.sequence=photos.",
             names[0]
         ));
@@ -197,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn names_tell_photos_from_films() {
+    fn names_distinguish_photos_from_videos() {
         let films: [&dyn Fn(usize) -> String; 7] = [
             &|i| format!("frame_{:04}.png", i + 1),
             &|i| format!("{i:06}.jpg"),
@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn rigs_number_their_frames_or_show_one_moment() {
+    fn rigs_number_their_frames_or_show_one_time() {
         let rig = |name: &dyn Fn(usize, usize) -> String| numbered(12, |i| name(i / 4, i % 4));
         assert_eq!(timing(&rig(&|c, t| format!("cam{c}/{t:04}.png"))), (Timing::Numbers, 3, 0, 0));
         assert_eq!(timing(&rig(&|c, t| format!("side{c}/DSC{t}.png"))), (Timing::Moment, 12, 0, 1));
@@ -237,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn cameras_of_a_moment_are_named_by_their_pictures() {
+    fn cameras_of_a_time_are_named_by_their_images() {
         let order = moment(&["images/b.png", "images/a.jpg"]);
         assert_eq!((order.cameras, order.frames), (vec!["a".into(), "b".into()], vec![(1, 0, 0.0), (0, 0, 0.0)]));
         assert_eq!(moment(&["x/a.png", "y/a.png"]).cameras, ["x/a", "y/a"]);
@@ -253,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_said_goes_before_what_names_tell() {
+    fn stated_times_override_names() {
         let (names, poses) = (["frame_1.png", "frame_2.png", "frame_3.png"], poses(3));
         let mut said = (Vec::new(), Vec::new());
         let mut of = |names, sequence| order(names, &poses, sequence, 30.0, &mut said.0, &mut said.1);

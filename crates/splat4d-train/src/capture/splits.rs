@@ -2,10 +2,10 @@
 //! `train_list.txt`, `test_list.txt` and `validation_list.txt`, 3DGS's `sparse/0/test.txt`).
 
 use super::Split;
+use super::account::Severity;
 use super::account::{Account, Aspect, first_names};
 use super::json::{self, Node};
 use super::lookup::key;
-use super::preflight::Severity;
 use crate::text;
 use splat4d::{Error, Result};
 use std::collections::{BTreeMap, BTreeSet};

@@ -10,6 +10,7 @@ use super::picture::{self, Raster, Samples};
 use super::{Capture, DepthKind, Frame, depth, flow, panorama};
 use rayon::prelude::*;
 use splat4d::Result;
+use splat4d::math::image::box_means;
 use splat4d::scene::{Camera, Lens, Planes};
 use splat4d::simd::{Pass, Simd, dispatch_pass};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
@@ -392,7 +393,7 @@ fn prepare(frame: &Frame, capture: &Capture) -> Result<StoredPicture> {
         valid = valid.as_ref().map(undistort).or_else(|| map.valid());
     }
     let (k, width, height) = (capture.downscale, frame.source.width, frame.source.height);
-    planes.iter_mut().chain(&mut valid).for_each(|p| *p = box_mean(p, width, height, k));
+    planes.iter_mut().chain(&mut valid).for_each(|p| *p = box_means(p, width, height, k));
     let bytes = |plane: Vec<f32>| plane.iter().map(|&v| to_byte(v)).collect();
     let mask = (planes.len() == 4).then(|| planes.pop()).flatten().map(bytes);
     // Any doubt about a pixel must not round to certainty.
@@ -448,22 +449,6 @@ fn composite(raster: &Raster, background: [f32; 3]) -> Vec<Vec<f32>> {
             (0..n).map(pixel).collect()
         })
         .collect()
-}
-
-/// Means of k×k boxes; rows and columns that fill no box are cut off.
-fn box_mean(plane: &[f32], width: usize, height: usize, k: usize) -> Vec<f32> {
-    if k == 1 {
-        return plane.to_vec();
-    }
-    let scale = 1.0 / (k * k) as f32;
-    let mut out = Vec::with_capacity((width / k) * (height / k));
-    for y in 0..height / k {
-        for x in 0..width / k {
-            let rows = (0..k).map(|j| (y * k + j) * width + x * k);
-            out.push(scale * rows.map(|start| plane[start..start + k].iter().sum::<f32>()).sum::<f32>());
-        }
-    }
-    out
 }
 
 /// For every pixel of the pinhole picture, where it is in the distorted one.

@@ -1,7 +1,7 @@
 //! What a folder holds that is no capture, and the way from there to one: archives, captures above and below, files under
 //! other names, images and videos without poses.
 
-use super::{colmap, layout, lookup, rig, sequence};
+use super::{colmap, lookup, rig, sequence};
 use crate::path_text::in_command;
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -21,13 +21,13 @@ const MOST_FOLDERS: usize = 100;
 
 /// What to do with a folder that is no capture, which the user called `named`, by what it holds. `None`: it holds nothing
 /// that is known.
-pub(super) fn advice(root: &Path, named: &Path) -> Option<String> {
+pub(super) fn advice(root: &Path, named: &Path, is_capture: &dyn Fn(&Path) -> bool) -> Option<String> {
     let names = rig::file_names(root);
     let folders = || names.iter().map(|n| root.join(n)).filter(|p| p.is_dir()).take(MOST_FOLDERS);
-    if let Some(inner) = folders().find(|folder| layout::is_capture(folder)) {
+    if let Some(inner) = folders().find(|folder| is_capture(folder)) {
         return Some(format!("A folder in it is a capture: give {}.", inner.display()));
     }
-    if let Some(above) = above(root).filter(|folder| is_part(root) && layout::is_capture(folder)) {
+    if let Some(above) = above(root).filter(|folder| is_part(root) && is_capture(folder)) {
         return Some(format!("The folder that holds it is a capture: give {}.", above.display()));
     }
     if let Some(name) = names.iter().find(|n| is_transforms(&root.join(n))) {

@@ -37,15 +37,15 @@ impl Tracks {
             };
             if frame >= frames {
                 let what = format!("the track goes to frame {frame}, the camera has {frames}");
-                return bad(what, "Frames are numbered from 0, whatever the pictures' names say");
+                return bad(what, "Frames are numbered from 0, whatever the images' names say");
             }
             let inside = (0..2).all(|k| place[k] >= 0.0 && place[k] < size[k] as f32);
             if !inside {
                 let what = format!(
-                    "the point is visible at ({}, {}), outside of the {}x{} picture",
+                    "the point is visible at ({}, {}), outside of the {}x{} image",
                     place[0], place[1], size[0], size[1]
                 );
-                return bad(what, "Mark it as not visible there, and give pixels of the stored picture, x before y");
+                return bad(what, "Mark it as not visible there, and give pixels of the stored image, x before y");
             }
             out.seen.entry(frame).or_default().push((point, place));
         }

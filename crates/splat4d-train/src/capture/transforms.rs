@@ -7,12 +7,12 @@
 mod clock;
 mod frame;
 
+use super::account::Severity;
 use super::account::{Account, Aspect, first_names};
 use super::convention::{Convention, Poses};
 use super::json::{self, Node};
 use super::lookup::Lookup;
 use super::points::read_ply;
-use super::preflight::Severity;
 use super::sequence::{self, Order};
 use super::splits::Lists;
 use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Sequence, Split, Take, colmap, picture};
@@ -20,7 +20,7 @@ use frame::Entry;
 use splat4d::Result;
 use splat4d::scene::Camera;
 use splat4d::scene::time::DEFAULT_FPS;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// The training frames of captures that come in several files.
 pub(super) const TRAIN: &str = "transforms_train.json";
@@ -69,7 +69,8 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         ..RawFrame::new(place, entry.source, entry.image)
     };
     let frames: Vec<RawFrame> = entries.into_iter().zip(places).map(frame).collect();
-    let points = match first.points {
+    let (file, told) = first.points.unzip();
+    let points = match told {
         Some(points) => Some(points),
         None => colmap::points_beside(root, marker, &frames, &mut warnings, &mut notes),
     };
@@ -83,6 +84,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         timing,
         fps,
         points,
+        files: file.into_iter().collect(),
         up: blender.then_some(BLENDER_UP),
         warnings,
         notes,
@@ -120,7 +122,7 @@ fn untimed(
     let poses: Vec<_> = entries.iter().map(|e| e.source.cam_from_world).collect();
     if several && options.sequence == Sequence::Auto {
         notes.push(format!(
-            "{TRAIN} states no times: its pictures are one moment. If they are frames of a film, say --set \
+            "{TRAIN} has no times: its images are given the same time. If they are frames of a video, use --set \
              capture.sequence=video."
         ));
         return sequence::moment(&names);
@@ -134,7 +136,8 @@ struct Document {
     fps: f64,
     /// Whether the file, or the user, states the rate.
     stated: bool,
-    points: Option<PointCloud>,
+    /// The points that it names, and their file.
+    points: Option<(PathBuf, PointCloud)>,
     warning: Option<String>,
 }
 
@@ -190,7 +193,8 @@ impl Document {
         if let Some(name) = top.opt("ply_file_path")? {
             let path = lookup.file(name.text()?)?;
             if path.is_file() {
-                points = Some(read_ply(&path)?);
+                let cloud = read_ply(&path)?;
+                points = Some((path, cloud));
             } else {
                 warning = Some(format!("The initial points that ply_file_path names are missing: {}.", path.display()));
             }

@@ -117,6 +117,7 @@ fn prepared(job: &Job<'_>) -> Result<Prepared> {
     Ok(Prepared {
         frames,
         plan: plan(&job.capture, job.recipe),
+        recipe: job.recipe.clone(),
         cameras: cameras(&job.capture),
         settings: job.settings.clone(),
     })

@@ -9,6 +9,7 @@ use crate::event::Progress;
 use crate::loss::scene::MeanOpacity;
 use crate::loss::terms::ParamLoss;
 use crate::methods::{Hook, Plan, Rate, Stage, tuning};
+use crate::recipe::Recipe;
 use crate::upkeep::worth::{MaskConfig, ScoreConfig, key_masks, prune, score};
 use splat4d::format::playback::{WriteConfig, read_pages, write};
 use splat4d::layers::Scene;
@@ -29,13 +30,14 @@ const FILE_RATES: f64 = 0.5;
 pub(super) struct Prepared {
     pub frames: Arc<dyn Frames>,
     pub plan: Plan,
+    pub recipe: Recipe,
     pub cameras: Vec<Camera>,
     pub settings: Compression,
 }
 
 impl Prepared {
     fn antialias(&self) -> Antialias {
-        if self.plan.recipe.appearance.antialias { Antialias::On } else { Antialias::Off }
+        if self.plan.common.appearance.antialias { Antialias::On } else { Antialias::Off }
     }
 
     /// How the settings want Gaussians scored. Errors: names that are none.
@@ -77,7 +79,7 @@ pub(super) fn float_stages(prepared: &Prepared) -> Result<Vec<Stage>> {
 
 /// The stage that the model learns by, at rates that settle.
 fn host_stage(prepared: &Prepared, steps: usize) -> Result<Stage> {
-    let mut stage = tuning(&prepared.plan)?;
+    let mut stage = tuning(prepared.recipe.program()?.as_ref(), &prepared.plan);
     stage.iterations = steps;
     stage.groups.iter_mut().for_each(|g| g.rate = settling(g.rate, prepared.settings.first_rates()));
     stage.params.extend(fading(&prepared.settings));
@@ -104,7 +106,7 @@ fn pruning(prepared: Prepared, share: f64, filter: bool) -> Hook {
                 progress.phase("scoring Gaussians", done, total);
             })?;
             for (layer, edit) in prune(scene, &scores, share).into_iter().enumerate() {
-                scene.layers[layer].edit(&edit, &Rng::new(prepared.plan.recipe.run.seed, "prune", layer as u64));
+                scene.layers[layer].edit(&edit, &Rng::new(prepared.plan.seed, "prune", layer as u64));
             }
         }
         if filter { masks(scene, &prepared, progress) } else { Ok(()) }
@@ -122,8 +124,9 @@ fn masks(scene: &mut Scene<f32>, prepared: &Prepared, progress: &mut Progress<'_
 /// Fine-tuning through the file, and the codec that is it.
 pub(super) fn file_stage(prepared: &Prepared) -> Result<(Stage, Arc<Quantised>)> {
     let s = &prepared.settings;
-    let codec = Quantised::new(s.depths, palette_rate(&prepared.plan.recipe, FILE_RATES * s.first_rates()))?;
-    let mut stage = quantise::stage(&prepared.plan, s.quantise, FILE_RATES * s.first_rates(), codec.clone());
+    let codec = Quantised::new(s.depths, palette_rate(&prepared.plan.common.rates, FILE_RATES * s.first_rates()))?;
+    let mut stage =
+        quantise::stage(&prepared.recipe, &prepared.plan, s.quantise, FILE_RATES * s.first_rates(), codec.clone());
     stage.params.extend(fading(s));
     let (own, begun) = (prepared.clone(), codec.clone());
     stage.start = Some(Box::new(move |scene: &mut Scene<f32>, progress| {
@@ -131,7 +134,7 @@ pub(super) fn file_stage(prepared: &Prepared) -> Result<(Stage, Arc<Quantised>)>
             progress.phase("baking", done, total);
         })?;
         let s = &own.settings;
-        let seed = own.plan.recipe.run.seed;
+        let seed = own.plan.seed;
         let config = WriteConfig { depths: s.depths, palette: s.palette, seed, ..WriteConfig::default() };
         let mut bytes = Vec::new();
         write(&draft, &config, &mut bytes)?;

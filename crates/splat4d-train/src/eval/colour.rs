@@ -138,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_s_colours_are_found_over_its_views_and_the_error_told_without_them() {
+    fn a_colour_matrix_per_camera_is_fitted_and_the_remaining_error_reported() {
         let views = [noise(1), noise(2)];
         let error = |seed: u64| noise(seed).data.into_iter().map(|x| 0.02 * (x - 0.5));
         let truths: Vec<Planes<f32>> = views
@@ -169,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn colours_that_tell_no_matrix_have_none() {
+    fn colours_that_determine_no_matrix_get_none() {
         let mut grey = noise(3);
         let (first, rest) = grey.data.split_at_mut(SIDE * SIDE);
         rest.chunks_exact_mut(SIDE * SIDE).for_each(|plane| plane.copy_from_slice(first));

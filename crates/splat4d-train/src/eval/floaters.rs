@@ -101,7 +101,7 @@ pub fn support(
 ) -> Result<Judged> {
     scene.without_head("the search for floaters")?;
     if held.is_empty() {
-        return Err(Error::input("no view was held out: nobody can say what floats")
+        return Err(Error::input("no view was held out, which is needed to find floaters")
             .remedy("Train with held-out views, or delete by a selection"));
     }
     let mut judge = Judge::new(scene, antialias);
@@ -302,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn a_removal_changes_the_error_as_told() {
+    fn the_predicted_error_of_a_removal_is_the_measured_one() {
         let (rig, s) = (rig(), scene(true));
         let mut judge = Judge::new(&s, false);
         let mut sums = vec![vec![[0.0; 2]; s.len()]];
@@ -326,7 +326,7 @@ mod tests {
     }
 
     #[test]
-    fn without_strength_nothing_floats_and_without_held_out_views_nobody_knows() {
+    fn zero_strength_finds_no_floaters_and_held_out_views_are_required() {
         let (rig, s) = (rig(), scene(true));
         // Camera 5 and 11 are held out; 0 and 1 have the veil.
         let train: Vec<usize> = (0..12).filter(|i| i % 6 != 5).collect();

@@ -7,7 +7,6 @@
 //! has another exposure. What does not fit the scene much better than one plain colour would is refused ([`Located::is_sure`]).
 
 use crate::Result;
-use crate::capture::frames::halve;
 use crate::learner::moved;
 use splat4d::device;
 use splat4d::layers::{Evaluation, Scene};
@@ -109,9 +108,9 @@ pub fn localise(
     question: Question,
     told: &mut dyn FnMut(usize, usize),
 ) -> Result<Located> {
-    assert!(!starts.is_empty(), "a picture is looked for from somewhere");
+    assert!(!starts.is_empty(), "localisation has a start camera");
     let fits = |c: &Camera| (c.width, c.height) == (picture.width, picture.height);
-    assert!(starts.iter().all(fits), "starts have the picture's size");
+    assert!(starts.iter().all(fits), "starts have the image's size");
     let backend = device::cpu(RenderConfig { antialias: question.antialias, ..RenderConfig::default() });
     let (instant, image) = (Evaluation::default(), Image::default());
     let mut search = Search { scene, backend, instant, image, lens: question.lens };
@@ -336,7 +335,7 @@ fn response(x: &[f32], y: &[f32]) -> (f32, f32) {
 fn shrunk(picture: &Planes<f32>, side: usize) -> (Planes<f32>, usize) {
     let (mut out, mut times) = (picture.clone(), 1);
     while out.width.max(out.height) > side && out.width.min(out.height) > 1 {
-        halve(&mut out);
+        out.halve();
         times *= 2;
     }
     (out, times)
@@ -396,7 +395,7 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_is_found_in_space_and_time_and_a_strange_one_is_not() {
+    fn an_image_is_localised_and_a_foreign_one_refused() {
         let scene = scene();
         let starts: Vec<Camera> = (0..6).map(|k| camera(f64::from(k), 0.3)).collect();
         let (truth, when) = (camera(2.12, 0.55), 0.37);

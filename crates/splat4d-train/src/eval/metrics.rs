@@ -5,6 +5,7 @@
 
 use crate::loss::Photometric;
 use rayon::prelude::*;
+use splat4d::math::image::halve;
 use splat4d::scene::Planes;
 
 /// A pixel is dynamic where a channel is further than this from its camera's temporal mean.
@@ -100,7 +101,7 @@ pub(crate) fn ms_ssim(render: &Planes<f32>, truth: &Planes<f32>) -> Option<f64> 
             let (full, contrast) = valid_ssim(&a, &b, h, w);
             product *= if last { full } else { contrast }.max(0.0).powf(weight);
             if !last {
-                (a, b) = (halved(&a, h, w), halved(&b, h, w));
+                [&mut a, &mut b].into_iter().for_each(|plane| halve(plane, [1, h, w]));
                 (h, w) = (h / 2, w / 2);
             }
         }
@@ -153,18 +154,6 @@ fn valid_ssim(a: &[f64], b: &[f64], h: usize, w: usize) -> (f64, f64) {
     }
     let n = (oh * ow) as f64;
     (full / n, contrast / n)
-}
-
-/// Means of 2x2 pixels.
-fn halved(a: &[f64], h: usize, w: usize) -> Vec<f64> {
-    let mut out = Vec::with_capacity((h / 2) * (w / 2));
-    for y in 0..h / 2 {
-        for x in 0..w / 2 {
-            let i = 2 * y * w + 2 * x;
-            out.push(0.25 * (a[i] + a[i + 1] + a[i + w] + a[i + w + 1]));
-        }
-    }
-    out
 }
 
 /// The mean over time of one fixed camera's images, taken one by one.

@@ -7,11 +7,12 @@
 //! with it; else every point in the picture counts.
 
 use crate::capture::Capture;
-use crate::eval::tracks::{Truth, median};
+use crate::eval::tracks::Truth;
 use crate::{Error, Result};
 use splat4d::flow::query::{Place, Query, follow, sights};
 use splat4d::format::npy::Npy;
 use splat4d::layers::Scene;
+use splat4d::math::median;
 use splat4d::math::se3::{norm, sub};
 use splat4d::scene::{Camera, Time};
 
@@ -160,7 +161,10 @@ fn visibility(capture: &Capture, truth: &Truth) -> Result<Option<Visible>> {
     if array.shape != wanted {
         return Err(Error::input(format!("visibility has shape {:?}, not {wanted:?}", array.shape))
             .at(path.display())
-            .remedy("Save it as uint8 [cameras, frames, points] beside tracks.npy, or delete it: it is only used to measure"));
+            .remedy(
+                "Save it as uint8 [cameras, frames, points] next to tracks.npy, or delete it: it is only used to \
+                 measure",
+            ));
     }
     Ok(Some(Visible { frames: truth.frames, points: truth.points, data: array.to_f32() }))
 }

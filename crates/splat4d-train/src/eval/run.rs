@@ -487,7 +487,7 @@ fn png(picture: &Planes<f32>) -> Vec<u8> {
     let mut bytes = Vec::new();
     PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive)
         .write_image(&data, picture.width as u32, picture.height as u32, ExtendedColorType::Rgb8)
-        .expect("a picture in memory can be encoded");
+        .expect("an image in memory can be encoded");
     bytes
 }
 

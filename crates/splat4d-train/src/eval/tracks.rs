@@ -11,6 +11,7 @@ use crate::{Error, Result};
 use splat4d::flow::tracks::{Tracks, nearest};
 use splat4d::format::npy::Npy;
 use splat4d::layers::Scene;
+use splat4d::math::median;
 use splat4d::math::se3::{norm, sub};
 use splat4d::scene::Time;
 
@@ -144,11 +145,6 @@ impl Truth {
             height: self.height(frames[0], scene.up),
         })
     }
-}
-
-pub(super) fn median(values: &mut [f64]) -> Option<f64> {
-    let middle = values.len() / 2;
-    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
 #[cfg(test)]

@@ -2,23 +2,16 @@
 //! sees what is farther away belongs to something that moves: it lives about its moment, and begins with the velocity that
 //! optical flow and the depth at both of its ends tell ([`super::scene_flow`]). All others stand still.
 
+use super::map::Map;
 use super::{Seeds, scene_flow};
 use crate::Result;
-use crate::capture::DepthKind;
 use crate::capture::frames::{Frames, Picture};
 use rayon::prelude::*;
 use splat4d::math::Rng;
-use splat4d::scene::{Camera, Planes};
 use std::f64::consts::TAU;
 
 /// Pictures that points are taken from and held against, at most, evenly chosen.
 const VIEWS: usize = 100;
-/// Pictures whose longer side exceeds this many pixels are halved until it does not: they have more pixels than there are
-/// seeds, and a hundred maps of that size fit into any memory.
-const LONGEST_SIDE: usize = 640;
-/// A picture sees through a point if what it shows there is farther away by more than this share: beyond the noise of
-/// sensors and the slant of surfaces within a pixel.
-const THROUGH: f64 = 0.05;
 /// Points a wanted one that stand still.
 const CANDIDATES: usize = 4;
 /// Pixels of a picture of which is asked whether they move, at most.
@@ -27,42 +20,6 @@ const ASKED: usize = 20_000;
 /// bounds in times between moments. Shorter ones leave holes between moments; over longer ones velocities change.
 const ALIVE_SHARE: f64 = 0.15;
 const LIFE: [f64; 2] = [0.5, 2.0];
-
-/// A picture's map.
-pub(super) struct Map {
-    pub frame: usize,
-    pub camera: Camera,
-    pub time: f64,
-    /// [1, h, w]; 0: not known.
-    pub depth: Planes<f32>,
-}
-
-impl Map {
-    /// The frame's metric map, its picture made small in `picture`; nothing where it has none.
-    pub(super) fn load(frames: &dyn Frames, frame: usize, picture: &mut Picture) -> Result<Option<Self>> {
-        frames.load(frame, picture)?;
-        if picture.depth.as_ref().is_none_or(|d| d.kind != DepthKind::Metric) {
-            return Ok(None);
-        }
-        let mut camera = frames.camera(frame).clone();
-        while camera.width.max(camera.height) > LONGEST_SIDE {
-            picture.halve();
-            camera = camera.downscaled(2);
-        }
-        let depth = picture.depth.as_ref().expect("just seen").values.clone();
-        Ok(Some(Self { frame, camera, time: frames.time(frame).0, depth }))
-    }
-
-    /// Whether it sees something farther away where the point is.
-    fn sees_through(&self, point: [f64; 3]) -> bool {
-        let Some(([u, v], z)) = self.camera.project(point) else { return false };
-        let (w, h) = (self.depth.width as f64, self.depth.height as f64);
-        if !(0.0..w).contains(&u) || !(0.0..h).contains(&v) {
-            return false;
-        }
-        f64::from(self.depth.get(0, v as usize, u as usize)) > z * (1.0 + THROUGH)
-    }
-}
 
 /// A pixel and where it is.
 struct Candidate {
@@ -143,12 +100,14 @@ fn evenly<T>(all: Vec<T>, count: usize, rng: Rng) -> Vec<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::capture::DepthKind;
     use crate::capture::frames::Depth;
     use crate::methods::Plan;
     use crate::recipe::Recipe;
     use crate::step::tests::Made;
     use splat4d::math::se3::{dot, norm, normalize, sub};
     use splat4d::scene::Time;
+    use splat4d::scene::{Camera, Planes};
 
     /// The made-up ball with its depth, before a wall.
     struct Deep(Made);
@@ -200,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn what_moves_belongs_to_its_moment_and_all_else_to_all() {
+    fn what_moves_belongs_to_its_time_and_all_else_to_all() {
         let deep = Deep(Made::new(4, 3, 24));
         let seeds = points(&deep, 400, true, Rng::new(1, "test", 0)).unwrap();
         let moving: Vec<usize> = (0..seeds.len()).filter(|&i| seeds.times[i].is_some()).collect();
@@ -219,10 +178,9 @@ mod tests {
         let none = points(&deep.0, 400, true, Rng::new(1, "test", 0)).unwrap();
         assert!(none.is_empty(), "no maps, no points");
         // Gaussians that live through the whole clip begin with what moves at one moment of it.
-        let recipe = Recipe::default().with(|r| r.init.count = 400).resolve();
-        let plan =
-            Plan { recipe, clip: [deep.0.time_of(0), deep.0.time_of(2)], times: 3, fps: 10.0, ..Plan::default() };
-        let one = super::super::one_moment(&plan, &deep, None).unwrap();
+        let recipe = Recipe::default().with(|r| r.init.count = 400);
+        let plan = Plan { clip: [deep.0.time_of(0), deep.0.time_of(2)], times: 3, fps: 10.0, ..recipe.plan() };
+        let one = super::super::one_moment(&plan, &recipe.init, &deep, None).unwrap();
         let off = |i: usize, k: usize| norm(sub(one.points[i], deep.0.object_at(deep.0.time_of(k)))) - Made::RADIUS;
         let near = |i: usize, k: usize| off(i, k).abs() < 1e-3;
         let count = |k: usize| (0..one.len()).filter(|&i| near(i, k)).count();

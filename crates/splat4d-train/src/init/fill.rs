@@ -158,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn a_plane_is_found_everywhere_on_the_picture() {
+    fn a_plane_is_found_everywhere_on_the_image() {
         for (strays, within) in [(0, 1e-2), (20, 3e-2)] {
             let marks = seen(&camera(), &wall(strays), &|_, _| false);
             let mut errors: Vec<f64> = Vec::new();

@@ -7,7 +7,7 @@ use crate::Result;
 use crate::capture::frames::{Frames, Picture, half_frame};
 use crate::vision::view::{Rigs, View};
 use rayon::prelude::*;
-use splat4d::math::Rng;
+use splat4d::math::{Rng, median_by};
 use splat4d::scene::Camera;
 use std::collections::BTreeMap;
 
@@ -246,10 +246,7 @@ fn vote(silhouettes: &Silhouettes<'_>, points: &[[f64; 3]]) -> Result<Seeds> {
 }
 
 fn median(colors: &mut [[f32; 3]]) -> [f32; 3] {
-    std::array::from_fn(|c| {
-        colors.sort_by(|a, b| a[c].total_cmp(&b[c]));
-        colors[colors.len() / 2][c]
-    })
+    std::array::from_fn(|c| median_by(colors, |a, b| a[c].total_cmp(&b[c])).expect("a voxel has colours")[c])
 }
 
 #[cfg(test)]

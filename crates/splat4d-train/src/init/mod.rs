@@ -4,6 +4,7 @@
 mod depth;
 pub(crate) mod fill;
 pub(crate) mod hull;
+mod map;
 mod scene_flow;
 pub(crate) mod volume;
 
@@ -98,9 +99,10 @@ settings! {
         /// Source of initial Gaussians: `auto`, `points`, `pictures` (found in the images), `hull`, `random`, or a .ply
         /// file.
         source: Source = Source::Auto;
-        /// Number of initial Gaussians. If a capture has fewer points, more are placed between them along surfaces;
-        /// hulls of masks and of dynamic regions, and random points, add as many.
-        count: usize = 10_000 => any().when(IsNot("init.source", &["points"]));
+        /// Number of initial Gaussians; 0: 10,000, and more in proportion for static scenes of more than 30,000 Gaussians. If
+        /// a capture has fewer points, more are placed between them along surfaces; hulls of masks and of dynamic regions,
+        /// and random points, add as many.
+        count: usize = 0 => any().when(IsNot("init.source", &["points"]));
         /// Initial opacity.
         opacity: f64 = 0.1 => inside_share();
         /// Number of times at which initial points are placed over the clip; 0: about every 5 frames.
@@ -111,6 +113,11 @@ settings! {
             => any().unit("clips").when(Any(&[Is("run.motion", &["spacetime", "native4d"]), Is("life.kind", &["gauss-half", "gauss-one", "interval"])]));
     }
 }
+
+/// Initial Gaussians where [`InitSettings::count`] is 0: what small captures are tuned for (docs/suite.md). A static scene
+/// of many Gaussians has a third of them at once: a real room at half size gains 0.3 dB by half of them in the same steps, at an
+/// eighth more time (studies/records/2026-11-27-real-size.md).
+pub(crate) const COUNT: usize = 10_000;
 
 /// Where the first Gaussians are.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -180,29 +187,35 @@ const INITIAL_SOFTNESS_FRAMES: f64 = 1.0;
 const OPEN_LIFE: (f64, f64) = (0.3, 0.25);
 
 /// The keyframe times of the plan: evenly over the clip, at least one.
-pub(crate) fn keyframes(plan: &Plan) -> Vec<f64> {
-    let count = match plan.recipe.init.keyframes {
+pub(crate) fn keyframes(plan: &Plan, settings: &InitSettings) -> Vec<f64> {
+    let count = match settings.keyframes {
         0 => plan.times.div_ceil(FRAMES_PER_KEYFRAME).max(1),
         k => k.min(plan.times.max(1)),
     };
     (0..count).map(|k| plan.clip[0] + (plan.clip[1] - plan.clip[0]) * (k as f64 + 0.5) / count as f64).collect()
 }
 
-/// Chooses initial points as the recipe says. `points`: the capture's own.
-pub fn seeds(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>, moving: bool) -> Result<Seeds> {
-    let r = &plan.recipe;
-    let rng = Rng::new(r.run.seed, "init", 0);
+/// Chooses initial points. `points`: the capture's own.
+pub fn seeds(
+    plan: &Plan,
+    settings: &InitSettings,
+    frames: &dyn Frames,
+    points: Option<Seeds>,
+    moving: bool,
+) -> Result<Seeds> {
+    let rng = Rng::new(plan.seed, "init", 0);
+    let count = if settings.count == 0 { COUNT } else { settings.count };
     let volume = volume::common(frames);
-    let times = if moving { keyframes(plan) } else { vec![0.5 * (plan.clip[0] + plan.clip[1])] };
+    let times = if moving { keyframes(plan, settings) } else { vec![0.5 * (plan.clip[0] + plan.clip[1])] };
     let have_points = points.as_ref().is_some_and(|p| !p.is_empty());
     let mut out = Seeds::default();
-    match r.init.source {
+    match settings.source {
         Source::Points if !have_points => {
             return Err(Error::input("the capture has no points to start from")
                 .remedy("Add a points file to the capture, or use --set init=random"));
         }
         Source::Pictures if !have_points => {
-            return Err(Error::input("no points were found in the pictures")
+            return Err(Error::input("no points were found in the images")
                 .remedy("Check the poses with `splat4d info CAPTURE`, or use --set init=random"));
         }
         Source::Hull if !frames.has_masks() => {
@@ -212,42 +225,46 @@ pub fn seeds(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>, moving: bo
         _ => {}
     }
     let use_hull =
-        frames.has_masks() && matches!(r.init.source, Source::Auto | Source::Hull) && (moving || !have_points);
-    let seen = match r.init.source {
-        Source::Auto if frames.has_depth() => depth::points(frames, r.init.count, moving, rng.fork(4))?,
+        frames.has_masks() && matches!(settings.source, Source::Auto | Source::Hull) && (moving || !have_points);
+    let seen = match settings.source {
+        Source::Auto if frames.has_depth() => depth::points(frames, count, moving, rng.fork(4))?,
         _ => Seeds::default(),
     };
     let have_depth = !seen.is_empty();
     out.append(seen);
-    if have_points && !matches!(r.init.source, Source::Random | Source::Hull) {
+    if have_points && !matches!(settings.source, Source::Random | Source::Hull) {
         out.append(points.expect("just seen"));
-        let filled = matches!(r.init.source, Source::Auto | Source::Pictures);
-        if filled && !have_depth && out.len() < r.init.count {
+        let filled = matches!(settings.source, Source::Auto | Source::Pictures);
+        if filled && !have_depth && out.len() < count {
             // Surfaces that move are elsewhere at other times.
             let still = (0..out.len()).filter(|&i| out.times[i].is_none());
             let known: Vec<[f64; 3]> = still.map(|i| out.points[i]).collect();
-            out.append(fill::between(frames, &known, r.init.count - out.len())?);
+            out.append(fill::between(frames, &known, count - out.len())?);
         }
     }
     if have_depth {
         // What a map shows no hull knows better.
     } else if use_hull {
-        out.append(hull::carve(frames, &volume, &times, r.init.count, moving, rng.fork(1))?);
-    } else if r.init.source == Source::Auto && have_points && moving {
-        out.append(hull::carve_moving(frames, &volume, &times, r.init.count, rng.fork(1))?);
-    } else if r.init.source == Source::Random || !have_points {
-        out.append(volume::random(frames, &volume, r.init.count, moving.then_some(plan.clip), rng.fork(2)));
+        out.append(hull::carve(frames, &volume, &times, count, moving, rng.fork(1))?);
+    } else if settings.source == Source::Auto && have_points && moving {
+        out.append(hull::carve_moving(frames, &volume, &times, count, rng.fork(1))?);
+    } else if settings.source == Source::Random || !have_points {
+        out.append(volume::random(frames, &volume, count, moving.then_some(plan.clip), rng.fork(2)));
     }
-    out.truncate_evenly(r.densify.max_cap, rng.fork(3));
+    out.truncate_evenly(plan.common.densify.max_cap, rng.fork(3));
     Ok(out)
 }
 
 /// Initial points for Gaussians that live through the whole clip: those of its middle, where what moves is on average
 /// nearest to where it will be.
-pub(crate) fn one_moment(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>) -> Result<Seeds> {
-    let mut single = plan.clone();
-    single.recipe.init.keyframes = single.recipe.init.keyframes.max(1);
-    let mut out = seeds(&single, frames, points, true)?;
+pub(crate) fn one_moment(
+    plan: &Plan,
+    settings: &InitSettings,
+    frames: &dyn Frames,
+    points: Option<Seeds>,
+) -> Result<Seeds> {
+    let single = InitSettings { keyframes: settings.keyframes.max(1), ..settings.clone() };
+    let mut out = seeds(plan, &single, frames, points, true)?;
     if out.life.take().is_some() {
         // Depth maps show every moment: of what moves only one is wanted.
         let middle = 0.5 * (plan.clip[0] + plan.clip[1]);
@@ -262,19 +279,20 @@ pub(crate) fn one_moment(plan: &Plan, frames: &dyn Frames, points: Option<Seeds>
 /// One layer of Gaussians at the seeds: isotropic, as large as the distance to their neighbours of the same moment.
 pub fn scene(
     plan: &Plan,
+    settings: &InitSettings,
     program: &dyn Program,
     seeds: &Seeds,
     background: [f32; 3],
     up: [f64; 3],
 ) -> Result<Scene<f32>> {
-    let r = &plan.recipe;
+    let degree = plan.common.appearance.sh_degree;
     let life = program.life(plan);
     let n = seeds.len();
-    let mut params = Params::<f32>::new(n, (r.appearance.sh_degree + 1) * (r.appearance.sh_degree + 1), life.columns());
+    let mut params = Params::<f32>::new(n, (degree + 1) * (degree + 1), life.columns());
     let scales = scales(seeds, plan);
-    let begin = |i: usize| Beginning { life: first_life(plan, seeds, i), velocity: seeds.velocities[i] };
+    let begin = |i: usize| Beginning { life: first_life(plan, settings, seeds, i), velocity: seeds.velocities[i] };
     let beginnings: Vec<Beginning> = (0..n).map(begin).collect();
-    let logit = (r.init.opacity / (1.0 - r.init.opacity)).ln() as f32;
+    let logit = (settings.opacity / (1.0 - settings.opacity)).ln() as f32;
     for i in 0..n {
         let geometry = &mut params[GEOMETRY];
         geometry.write(i, 0, seeds.points[i].map(|x| x as f32));
@@ -304,10 +322,10 @@ pub fn scene(
 }
 
 /// Centre and width (seconds) of the life that a Gaussian at a seed starts with.
-fn first_life(plan: &Plan, seeds: &Seeds, i: usize) -> (f64, f64) {
-    let gap = plan.seconds() / keyframes(plan).len() as f64;
+fn first_life(plan: &Plan, settings: &InitSettings, seeds: &Seeds, i: usize) -> (f64, f64) {
+    let gap = plan.seconds() / keyframes(plan, settings).len() as f64;
     let short = match seeds.life {
-        _ if plan.recipe.init.life > 0.0 => plan.recipe.init.life * plan.seconds(),
+        _ if settings.life > 0.0 => settings.life * plan.seconds(),
         Some(width) => width,
         None => 2.0 * gap,
     };
@@ -342,7 +360,6 @@ fn scales(seeds: &Seeds, plan: &Plan) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::methods::program;
     use crate::recipe::{MotionName, Recipe};
     use splat4d::layers::Evaluation;
     use splat4d::scene::{Rows, Space, Time};
@@ -364,14 +381,16 @@ mod tests {
     #[test]
     fn a_seed_that_moves_makes_a_gaussian_that_moves() {
         for motion in ["spacetime", "native4d"] {
-            let recipe = Recipe::default().with(|r| r.run.motion = MotionName::of(motion)).resolve();
-            let plan = Plan { recipe, extent: 2.0, clip: [0.0, 1.0], times: 11, fps: 10.0, ..Plan::default() };
+            let recipe = Recipe::default().with(|r| r.run.motion = MotionName::of(motion));
+            let plan = Plan { extent: 2.0, clip: [0.0, 1.0], times: 11, fps: 10.0, ..recipe.plan() };
             let mut seeds = Seeds { life: Some(0.2), ..Seeds::default() };
             for k in 0..6 {
                 seeds.push([0.1 * k as f64, 0.0, 1.0], [0.5; 3], Some(0.5));
                 seeds.velocities[k] = [0.3 * k as f64, -0.4, 0.7];
             }
-            let made = scene(&plan, program(motion).unwrap().as_ref(), &seeds, [0.0; 3], [0.0, 1.0, 0.0]).unwrap();
+            let made =
+                scene(&plan, &recipe.init, recipe.program().unwrap().as_ref(), &seeds, [0.0; 3], [0.0, 1.0, 0.0])
+                    .unwrap();
             for t in [0.5, 0.6] {
                 let answer = Evaluation::of_layer(&made.layers[0], Space::Gaussians, Rows::All, Time(t));
                 for k in 0..6 {

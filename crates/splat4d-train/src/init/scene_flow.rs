@@ -1,11 +1,12 @@
 //! How fast what a depth map shows moves: optical flow to the pictures before and after, and the depth at both of its ends.
 
-use super::depth::Map;
+use super::map::Map;
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};
 use crate::vision::flow::{Pyramid, dense};
 use crate::vision::raster::grey;
 use splat4d::flow::lift::lift;
+use splat4d::math::median;
 use splat4d::scene::Planes;
 
 /// The four pixels about a place show one surface where their depths differ by less than this share.
@@ -51,7 +52,7 @@ pub(super) fn velocities(frames: &dyn Frames, map: &Map, pixels: &[usize]) -> Re
                 near.select_nth_unstable_by_key(NEAREST - 1, apart);
                 near.truncate(NEAREST);
             }
-            median(&near, &sums)
+            median_of(&near, &sums)
         })
         .collect())
 }
@@ -93,11 +94,10 @@ fn surface(depth: &Planes<f32>, at: [f64; 2]) -> Option<f64> {
     Some((1.0 - v) * ((1.0 - u) * four[0] + u * four[1]) + v * ((1.0 - u) * four[2] + u * four[3]))
 }
 
-fn median(of: &[usize], vectors: &[[f64; 3]]) -> [f64; 3] {
+fn median_of(of: &[usize], vectors: &[[f64; 3]]) -> [f64; 3] {
     std::array::from_fn(|k| {
         let mut values: Vec<f64> = of.iter().map(|&i| vectors[i][k]).collect();
-        values.sort_by(f64::total_cmp);
-        values.get(values.len() / 2).copied().unwrap_or(0.0)
+        median(&mut values).unwrap_or(0.0)
     })
 }
 
@@ -201,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn flow_and_depth_at_both_ends_tell_velocity_in_space() {
+    fn flow_and_depth_at_both_ends_give_velocity() {
         let far = |of: &[[f64; 3]]| -> f64 {
             let off = |v: &[f64; 3]| (0..3).map(|k| (v[k] - VELOCITY[k]).powi(2)).sum::<f64>().sqrt();
             let mut all: Vec<f64> = of.iter().map(off).collect();
@@ -218,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_without_neighbours_tells_nothing() {
+    fn an_image_without_neighbours_gives_no_evidence() {
         let mut wall = Wall::new(None);
         wall.cameras.truncate(1);
         assert!(of(&wall, 0).iter().all(|v| *v == [0.0; 3]));

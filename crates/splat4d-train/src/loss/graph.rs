@@ -248,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn weights_do_not_know_the_unit_unless_told() {
+    fn weights_ignore_the_unit_unless_set() {
         let points = cloud(50);
         let large: Vec<[f64; 3]> = points.iter().map(|p| p.map(|x| 4096.0 * x)).collect();
         let [a, b] = [&points, &large].map(|p| Graph::new(p, 8, Weigh::Median(1.0)));

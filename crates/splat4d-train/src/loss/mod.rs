@@ -17,7 +17,8 @@ pub mod terms;
 pub(crate) mod tracked;
 pub(crate) mod transport;
 
-pub use photometric::{LossValue, Photometric};
+pub use image::LossValue;
+pub use photometric::Photometric;
 pub(crate) use transport::TransportSettings;
 
 use crate::settings::settings;

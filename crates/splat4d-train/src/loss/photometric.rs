@@ -1,6 +1,6 @@
 //! The picture loss of 3DGS, (1 − λ)·L1 + λ·(1 − SSIM), and its gradient, in one pass over the image.
 
-use super::image::{ImageTerm, PictureGrads, Shown, View};
+use super::image::{ImageTerm, LossValue, PictureGrads, Shown, View};
 use super::kernel::{self, Scratch, Strip};
 use super::terms::StepInfo;
 use rayon::prelude::*;
@@ -15,19 +15,6 @@ use std::sync::Mutex;
 const STRIP_ROWS: usize = 128;
 /// Strips are whole groups of rows of the kernel.
 const GROUP_ROWS: usize = 4;
-
-/// The loss of one image.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct LossValue {
-    /// (1 − λ)·l1 + λ·(1 − ssim)
-    pub total: f64,
-    /// Weighted mean |render − truth| over pixels and channels.
-    pub l1: f64,
-    /// Weighted mean of the SSIM map over pixels and channels; 1 for equal images.
-    pub ssim: f64,
-    /// Weighted mean of (render − truth)², the render clamped to [0, 1]; no part of `total`.
-    pub mse: f64,
-}
 
 /// L1 and SSIM with their gradient; keeps its working memory between calls.
 #[derive(Debug)]

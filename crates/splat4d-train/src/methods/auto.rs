@@ -1,6 +1,6 @@
 //! `--motion auto`: looks at the capture, and takes the first program that says why it suits.
 
-use super::{PROGRAMS, Plan};
+use super::{Plan, Program};
 use crate::Result;
 use crate::capture::Agreement;
 use crate::capture::frames::{Frames, Picture};
@@ -49,7 +49,7 @@ impl Seen {
             fewest: plan.moments.iter().map(|m| m.1).min().unwrap_or(0),
             masks: frames.has_masks(),
             depth: frames.has_depth(),
-            predicted: plan.recipe.capture.observe < 1.0,
+            predicted: plan.predicted,
         })
     }
 
@@ -73,10 +73,15 @@ pub(crate) struct Choice {
     pub why: String,
 }
 
-/// Chooses for the training frames of a capture: the first program that says why it suits.
-pub(crate) fn choose(plan: &Plan, frames: &dyn Frames) -> Result<Choice> {
+/// Chooses for the training frames of a capture: the first of the programs that says why it suits.
+pub(crate) fn choose(
+    plan: &Plan,
+    programs: impl IntoIterator<Item = (&'static str, Box<dyn Program>)>,
+    frames: &dyn Frames,
+) -> Result<Choice> {
     let seen = Seen::of(plan, frames)?;
-    let choice = PROGRAMS.into_iter().find_map(|(motion, make)| Some(Choice { motion, why: make().suits(&seen)? }));
+    let mut programs = programs.into_iter();
+    let choice = programs.find_map(|(motion, program)| Some(Choice { motion, why: program.suits(&seen)? }));
     Ok(choice.expect("one program suits whatever no other does"))
 }
 
@@ -151,8 +156,8 @@ mod tests {
         }
 
         fn choose(&self, fixed: bool) -> Choice {
+            let recipe = Recipe::default().with(|r| r.capture.observe = self.observe);
             let plan = Plan {
-                recipe: Recipe::default().with(|r| r.capture.observe = self.observe).resolve(),
                 extent: 1.0,
                 center: [0.0; 3],
                 clip: [0.0, 1.0],
@@ -161,8 +166,9 @@ mod tests {
                 fixed_cameras: if fixed { self.cameras } else { 0 },
                 moments: (0..self.times).map(|t| (t as f64 / 30.0, if fixed { self.cameras } else { 0 })).collect(),
                 masks: self.masks,
+                ..recipe.plan()
             };
-            choose(&plan, self).unwrap()
+            choose(&plan, recipe.programs(), self).unwrap()
         }
     }
 
@@ -207,14 +213,14 @@ mod tests {
             let choice = made.choose(fixed);
             assert!(choice.motion == motion && choice.why.contains(word), "{choice:?}");
         };
-        is(Made::new(6, 1, 4, true), true, "still", "one moment");
+        is(Made::new(6, 1, 4, true), true, "still", "the same time");
         is(Made::new(6, 10, 0, true), true, "still", "0.000 %");
         is(Made::new(6, 10, 4, true), true, "spacetime", "6 cameras");
         // Shutters that do not open at once: by little, and by up to a frame.
         is(Made { late: 0.002, ..Made::new(6, 10, 4, true) }, true, "spacetime", "6 cameras");
         is(Made { late: 0.005, ..Made::new(6, 10, 4, true) }, true, "spacetime", "4 cameras");
         // What is to go on needs Gaussians that last, where cameras can follow them.
-        is(Made { observe: 0.8, ..Made::new(6, 10, 4, true) }, true, "tracked", "to be predicted");
+        is(Made { observe: 0.8, ..Made::new(6, 10, 4, true) }, true, "tracked", "prediction");
         is(Made { observe: 0.8, ..Made::new(2, 10, 4, true) }, true, "control", "2.0 cameras");
         is(Made { observe: 0.8, ..Made::new(1, 50, 4, true) }, false, "control", "one camera");
         is(Made::new(1, 50, 4, true), false, "control", "one camera");

@@ -6,9 +6,8 @@ pub(crate) mod losses;
 
 use super::auto::Seen;
 use super::{Group, Plan, Program, Rate, Stage, still};
-use crate::recipe::Recipe;
 use crate::settings::{choices, settings};
-use crate::upkeep::AdaptNodes;
+use crate::upkeep::{AdaptNodes, NodeSettings};
 use crate::{Error, Result};
 use losses::{MaskSize, NodeAcceleration, NodeArap, NodeElastic, Sparse};
 use splat4d::motion::Spec;
@@ -108,19 +107,24 @@ settings! {
 }
 
 /// Gaussians skinned to sparse control nodes (Huang et al. 2024, "SC-GS").
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct ControlProgram;
+#[derive(Clone, Debug)]
+pub(crate) struct ControlProgram {
+    pub control: ControlSettings,
+    pub nodes: NodeSettings,
+}
 
 impl Program for ControlProgram {
     fn spec(&self, plan: &Plan) -> Spec {
-        let r = &plan.recipe;
-        Spec::Control(ControlSpec { seed: r.run.seed, clip: plan.clip, skin: skin(r), trajectory: trajectory(plan) })
+        let (skin, trajectory) = (skin(&self.control), trajectory(plan, &self.control));
+        Spec::Control(ControlSpec { seed: plan.seed, clip: plan.clip, skin, trajectory })
     }
 
     fn check(&self, plan: &Plan) -> Result<()> {
         if plan.times < 2 {
-            return Err(Error::input("control nodes learn from motion, and the capture has one moment only")
-                .remedy("Use --motion still"));
+            return Err(Error::input(
+                "control nodes learn from motion, but all images of the capture have the same time",
+            )
+            .remedy("Use --motion still"));
         }
         Ok(())
     }
@@ -132,73 +136,72 @@ impl Program for ControlProgram {
     fn suits(&self, seen: &Seen) -> Option<String> {
         let one = seen.masks && !seen.is_long();
         one.then(|| {
-            format!("{} a moment, and masks show one object: few nodes move all of it", seen.cameras_in_words())
+            format!("{} each time, and masks show one object: few nodes move all of it", seen.cameras_in_words())
         })
     }
 
-    fn nodes(&self, plan: &Plan) -> usize {
-        most_nodes(&plan.recipe)
+    fn nodes(&self, _plan: &Plan) -> usize {
+        most_nodes(&self.control, &self.nodes)
     }
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
         let mut stage = still::stage("control", plan);
         still::learn_life(&mut stage, plan, self.life(plan));
-        add_nodes(&mut stage, plan);
-        add_trajectory(&mut stage, plan);
+        add_nodes(&mut stage, plan, &self.control, self.nodes);
+        add_trajectory(&mut stage, plan, &self.control);
         vec![stage]
     }
 }
 
 /// Most nodes that training may have.
-pub(crate) fn most_nodes(r: &Recipe) -> usize {
-    if r.nodes.adapt_interval > 0 { r.nodes.cap.max(r.control.nodes) } else { r.control.nodes }
+pub(crate) fn most_nodes(control: &ControlSettings, nodes: &NodeSettings) -> usize {
+    if nodes.adapt_interval > 0 { nodes.cap.max(control.nodes) } else { control.nodes }
 }
 
-/// The skin that the recipe asks for.
-pub(crate) fn skin(r: &Recipe) -> SkinSpec {
-    SkinSpec { nodes: r.control.nodes, neighbours: r.control.neighbours, hyper: r.control.hyper, mask: r.control.mask }
+/// The skin of the control nodes.
+pub(crate) fn skin(control: &ControlSettings) -> SkinSpec {
+    SkinSpec { nodes: control.nodes, neighbours: control.neighbours, hyper: control.hyper, mask: control.mask }
 }
 
 /// Adds the parts that every model of control nodes shares: groups of the skin, losses on nodes, upkeep.
-pub(crate) fn add_nodes(stage: &mut Stage, plan: &Plan) {
-    let r = &plan.recipe;
-    let positions = r.falling(r.control.node_lr * plan.extent);
+pub(crate) fn add_nodes(stage: &mut Stage, plan: &Plan, control: &ControlSettings, nodes: NodeSettings) {
+    let c = &plan.common;
+    let positions = c.rates.falling(control.node_lr * plan.extent);
     stage.groups.push(Group::new("node_means", positions));
-    stage.groups.push(Group::new("node_log_radii", r.falling(r.control.weight_lr)));
-    stage.groups.push(Group::new("node_logits", r.falling(r.control.weight_lr)));
-    let hyper = r.falling(r.control.hyper_lr * plan.extent);
+    stage.groups.push(Group::new("node_log_radii", c.rates.falling(control.weight_lr)));
+    stage.groups.push(Group::new("node_logits", c.rates.falling(control.weight_lr)));
+    let hyper = c.rates.falling(control.hyper_lr * plan.extent);
     stage.groups.push(Group::new("node_hyper", hyper));
     stage.groups.push(Group::new("hyper", hyper));
-    stage.groups.push(Group::new("motion_mask", r.falling(r.control.mask_lr)));
+    stage.groups.push(Group::new("motion_mask", c.rates.falling(control.mask_lr)));
     let extent = plan.extent;
-    if r.control.arap > 0.0 {
-        stage.probes.push(Box::new(NodeArap { weight: r.control.arap, extent, clip: plan.clip }));
+    if control.arap > 0.0 {
+        stage.probes.push(Box::new(NodeArap { weight: control.arap, extent, clip: plan.clip }));
     }
-    if r.control.elastic > 0.0 {
-        stage.probes.push(Box::new(NodeElastic { weight: r.control.elastic, clip: plan.clip }));
+    if control.elastic > 0.0 {
+        stage.probes.push(Box::new(NodeElastic { weight: control.elastic, clip: plan.clip }));
     }
-    if r.control.acceleration > 0.0 {
+    if control.acceleration > 0.0 {
         let step = 1.0 / plan.fps;
-        stage.probes.push(Box::new(NodeAcceleration { weight: r.control.acceleration, clip: plan.clip, step }));
+        stage.probes.push(Box::new(NodeAcceleration { weight: control.acceleration, clip: plan.clip, step }));
     }
-    if r.control.motion_mask > 0.0 && r.control.mask {
-        stage.params.push(Box::new(MaskSize { weight: r.control.motion_mask }));
+    if control.motion_mask > 0.0 && control.mask {
+        stage.params.push(Box::new(MaskSize { weight: control.motion_mask }));
     }
-    stage.keep(AdaptNodes::of(r));
+    stage.keep(AdaptNodes::of(nodes, &c.densify));
 }
 
-fn trajectory(plan: &Plan) -> TrajectorySpec {
-    let r = &plan.recipe;
+fn trajectory(plan: &Plan, control: &ControlSettings) -> TrajectorySpec {
     let auto = plan.times.div_ceil(FRAMES_PER_KEY).clamp(1, MOST_KEYS);
-    let straight = if r.control.keys == 0 { auto + 1 } else { r.control.keys };
-    let cubic = if r.control.keys == 0 { auto + CUBIC_EXTRA } else { r.control.keys };
-    match r.control.trajectory {
+    let straight = if control.keys == 0 { auto + 1 } else { control.keys };
+    let cubic = if control.keys == 0 { auto + CUBIC_EXTRA } else { control.keys };
+    match control.trajectory {
         Trajectory::Linear => TrajectorySpec::Keys { curve: Curve::Linear, keys: straight },
         Trajectory::Slerp => TrajectorySpec::Keys { curve: Curve::Slerp, keys: straight },
-        Trajectory::LowRank => TrajectorySpec::LowRank { bases: r.control.bases, keys: cubic },
+        Trajectory::LowRank => TrajectorySpec::LowRank { bases: control.bases, keys: cubic },
         Trajectory::Network => TrajectorySpec::Network {
-            width: r.control.width,
-            layers: r.control.layers,
+            width: control.width,
+            layers: control.layers,
             position_levels: LEVELS.0,
             time_levels: LEVELS.1,
         },
@@ -207,18 +210,17 @@ fn trajectory(plan: &Plan) -> TrajectorySpec {
 }
 
 /// The trajectory's groups.
-fn add_trajectory(stage: &mut Stage, plan: &Plan) {
-    let r = &plan.recipe;
-    let shifts = Rate { start: r.control.shift_lr_init * plan.extent, end: r.control.shift_lr_final * plan.extent };
-    let turns = Rate { start: r.control.turn_lr_init, end: r.control.turn_lr_final };
-    let network = Rate { start: r.control.network_lr_init, end: r.control.network_lr_final };
-    match trajectory(plan) {
+fn add_trajectory(stage: &mut Stage, plan: &Plan, control: &ControlSettings) {
+    let shifts = Rate { start: control.shift_lr_init * plan.extent, end: control.shift_lr_final * plan.extent };
+    let turns = Rate { start: control.turn_lr_init, end: control.turn_lr_final };
+    let network = Rate { start: control.network_lr_init, end: control.network_lr_final };
+    match trajectory(plan, control) {
         TrajectorySpec::LowRank { .. } => {
             stage.groups.push(Group::new("shift_coefficients", shifts));
             stage.groups.push(Group::new("turn_coefficients", turns));
             stage.groups.push(Group::new("bases", turns));
-            if r.control.sparse > 0.0 {
-                stage.params.push(Box::new(Sparse { weight: r.control.sparse, table: "node_coefficients" }));
+            if control.sparse > 0.0 {
+                stage.params.push(Box::new(Sparse { weight: control.sparse, table: "node_coefficients" }));
             }
         }
         TrajectorySpec::Network { layers, .. } => {

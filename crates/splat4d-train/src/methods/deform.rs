@@ -23,9 +23,9 @@ const NOISE_STEPS: f64 = 0.5;
 /// Steps over which the rates of networks and grids rise. Adam's first step is as long as the rate whatever the gradient, and
 /// at once it threw a settled cloud 25 pixels about: training views of a hand-held take fell by 4.6 dB in one step. With
 /// it 0.2 dB more are held out there (docs/suite.md). Source of linear warm-up: Goyal et al. 2017, §2.2.
-const WARM_UP: usize = 50;
+pub(super) const WARM_UP: usize = 50;
 /// Short runs have no time for it: at most this part of the iterations.
-const WARM_UP_SHARE: usize = 20;
+pub(super) const WARM_UP_SHARE: usize = 20;
 /// The grid over space: a sixteenth of the published entries, since Gaussians are thousands and not millions of samples.
 const SPACE: HashShape = HashShape { levels: 8, features: 2, log2_size: 15, base: 8, finest: 256 };
 /// The grids over two axes and time.
@@ -81,16 +81,18 @@ settings! {
 }
 
 /// A canonical cloud that a perceptron or a hash grid deforms (Yang et al. 2024, "Deformable 3D Gaussians").
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct DeformProgram;
+#[derive(Clone, Debug)]
+pub(crate) struct DeformProgram {
+    pub deform: DeformSettings,
+}
 
 impl Program for DeformProgram {
     fn spec(&self, plan: &Plan) -> Spec {
-        Spec::DeformMlp(spec(plan))
+        Spec::DeformMlp(spec(plan, &self.deform))
     }
 
     fn check(&self, plan: &Plan) -> Result<()> {
-        check(plan)
+        check(plan, &self.deform)
     }
 
     fn one_moment(&self, _plan: &Plan) -> bool {
@@ -98,51 +100,50 @@ impl Program for DeformProgram {
     }
 
     fn suits(&self, seen: &Seen) -> Option<String> {
-        let length = if seen.is_long() { format!(" of {}", seen.times) } else { String::new() };
+        let times = if seen.is_long() { format!("each of {} times", seen.times) } else { "each time".to_owned() };
         Some(format!(
-            "{} a moment{length}: one cloud that a network moves shares what every moment shows",
+            "{} {times}: one set of Gaussians, deformed by a network, uses all times together",
             seen.cameras_in_words()
         ))
     }
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
-        let r = &plan.recipe;
-        let warmup = (r.deform.warmup * r.run.iterations as f64) as usize;
+        let deform = &self.deform;
+        let warmup = (deform.warmup * plan.iterations as f64) as usize;
         let mut out = Vec::new();
         if warmup > 0 {
-            let mut first = stage(plan, 0, warmup);
+            let mut first = self.stage(plan, 0, warmup);
             first.name = "deform-mlp, still".into();
             // A network that rests and learns nothing is not asked; nobody need wait for it.
             first.start = Some(learns(false));
             first.end = Some(learns(true));
             out.push(first);
         }
-        if warmup < r.run.iterations {
-            let mut second = stage(plan, warmup, r.run.iterations);
-            networks(&mut second, plan);
-            let noise = ((NOISE_STEPS * r.run.iterations as f64) as usize).saturating_sub(warmup);
-            second.time_noise = TimeNoise { start: r.deform.time_noise / plan.fps, steps: noise };
+        if warmup < plan.iterations {
+            let mut second = self.stage(plan, warmup, plan.iterations);
+            networks(&mut second, plan, deform);
+            let noise = ((NOISE_STEPS * plan.iterations as f64) as usize).saturating_sub(warmup);
+            second.time_noise = TimeNoise { start: deform.time_noise / plan.fps, steps: noise };
             out.push(second);
         }
         out
     }
 }
 
-fn check(plan: &Plan) -> Result<()> {
+fn check(plan: &Plan, deform: &DeformSettings) -> Result<()> {
     if plan.times < 2 {
-        return Err(Error::input("every picture of the capture is of one moment: there is nothing to deform")
+        return Err(Error::input("all images of the capture have the same time: there is nothing to deform")
             .remedy("Train it with --motion still"));
     }
-    Deform::new(spec(plan), &mut Params::<f32>::new(0, 1, &[])).map(drop).map_err(|e| {
+    Deform::new(spec(plan, deform), &mut Params::<f32>::new(0, 1, &[])).map(drop).map_err(|e| {
         Error::input(format!("the network that the recipe asks for cannot be made: {e}"))
             .remedy("Change deform_width, deform_layers, deform_x_levels or deform_t_levels")
     })
 }
 
-fn spec(plan: &Plan) -> DeformSpec {
-    let r = &plan.recipe;
-    let encoded = |x_levels| Input::Encoded { x_levels, t_levels: r.deform.t_levels, time_net: r.deform.time_net };
-    let trunk = match r.deform.trunk {
+fn spec(plan: &Plan, deform: &DeformSettings) -> DeformSpec {
+    let encoded = |x_levels| Input::Encoded { x_levels, t_levels: deform.t_levels, time_net: deform.time_net };
+    let trunk = match deform.trunk {
         // Grids follow more motion: by a small network a ball before a wall is lost, and a hand-held take has 1.9 dB less
         // (docs/suite.md). Of one object alone, seen once a moment, the network generalises better (docs/models.md).
         Trunk::Auto if plan.masks && plan.fixed_cameras == 0 => Trunk::Small,
@@ -150,23 +151,30 @@ fn spec(plan: &Plan) -> DeformSpec {
         chosen => chosen,
     };
     let (input, layers, width, skip) = match trunk {
-        Trunk::Mlp => (encoded(LARGE_X_LEVELS.max(r.deform.x_levels)), LARGE.0, LARGE.1, Some(LARGE.2)),
-        Trunk::Hash => (Input::Hashed { space: SPACE, time: TIME }, r.deform.layers.max(1), r.deform.width, None),
-        Trunk::HashLinear => (Input::Hashed { space: SPACE, time: TIME }, 0, r.deform.width, None),
-        Trunk::Small | Trunk::Auto => (encoded(r.deform.x_levels), r.deform.layers, r.deform.width, None),
+        Trunk::Mlp => (encoded(LARGE_X_LEVELS.max(deform.x_levels)), LARGE.0, LARGE.1, Some(LARGE.2)),
+        Trunk::Hash => (Input::Hashed { space: SPACE, time: TIME }, deform.layers.max(1), deform.width, None),
+        Trunk::HashLinear => (Input::Hashed { space: SPACE, time: TIME }, 0, deform.width, None),
+        Trunk::Small | Trunk::Auto => (encoded(deform.x_levels), deform.layers, deform.width, None),
     };
-    DeformSpec { seed: r.run.seed, clip: plan.clip, input, width, layers, skip, rigid: r.deform.rigid }
+    DeformSpec { seed: plan.seed, clip: plan.clip, input, width, layers, skip, rigid: deform.rigid }
 }
 
-/// Steps `from .. to` of the recipe's one schedule as a stage of its own.
-fn stage(plan: &Plan, from: usize, to: usize) -> Stage {
-    let mut stage = still::stage("deform-mlp", plan);
-    still::learn_life(&mut stage, plan, DeformProgram.life(plan));
+impl DeformProgram {
+    /// Steps `from .. to` of the recipe's one schedule as a stage of its own.
+    fn stage(&self, plan: &Plan, from: usize, to: usize) -> Stage {
+        let mut stage = still::stage("deform-mlp", plan);
+        still::learn_life(&mut stage, plan, self.life(plan));
+        canonical(&mut stage);
+        stage.part(from, to)
+    }
+}
+
+/// Lets positions start as slowly as those of a cloud must that is seen at every moment.
+pub(super) fn canonical(stage: &mut Stage) {
     for group in stage.groups.iter_mut().filter(|g| g.column == "means") {
         group.rate.start /= CANONICAL_SLOWDOWN;
         group.rate.end = group.rate.end.min(group.rate.start);
     }
-    stage.part(from, to)
 }
 
 /// Lets the networks of every deformable layer learn, or not.
@@ -192,12 +200,11 @@ fn set_learns(spec: &DeformSpec, p: &mut Params<f32>, learns: bool) -> Result<()
 }
 
 /// The groups of networks and grids.
-fn networks(stage: &mut Stage, plan: &Plan) {
-    let r = &plan.recipe;
-    let rate = Rate { start: r.deform.lr_init, end: r.deform.lr_final };
-    let warm_up = WARM_UP.min(r.run.iterations / WARM_UP_SHARE);
-    let made = Deform::new(spec(plan), &mut Params::<f32>::new(0, 1, &[]));
-    let model = made.expect("a recipe's network is one that can be made: its knobs were checked");
+fn networks(stage: &mut Stage, plan: &Plan, deform: &DeformSettings) {
+    let rate = Rate { start: deform.lr_init, end: deform.lr_final };
+    let warm_up = WARM_UP.min(plan.iterations / WARM_UP_SHARE);
+    let made = Deform::new(spec(plan, deform), &mut Params::<f32>::new(0, 1, &[]));
+    let model = made.expect("a recipe's network can be built: its settings were checked");
     stage.groups.extend(model.network_columns().iter().map(|c| Group { warm_up, ..Group::new(c, rate) }));
     let fast = Rate { start: GRID_SPEEDUP * rate.start, end: GRID_SPEEDUP * rate.end };
     let levels = model.grid_columns();
@@ -205,7 +212,7 @@ fn networks(stage: &mut Stage, plan: &Plan) {
     let first = levels.len().div_ceil(2);
     for (l, columns) in levels.iter().enumerate() {
         let waits = (l + 1).saturating_sub(first) as f64 / (levels.len() - first).max(1) as f64;
-        let from = (waits * r.deform.unlock * r.run.iterations as f64) as usize;
+        let from = (waits * deform.unlock * plan.iterations as f64) as usize;
         stage.groups.extend(columns.iter().map(|c| Group { from, warm_up, ..Group::new(c, fast) }));
     }
 }

@@ -7,8 +7,8 @@
 
 use super::{Beginning, Group, Hook, Plan, Program, Stage};
 use crate::Result;
+use crate::loss::TransportSettings;
 use crate::loss::transport::{Align, Transport, TransportConfig};
-use crate::recipe::Recipe;
 use crate::settings::{Choice, settings};
 use crate::upkeep::Once;
 use splat4d::layers::{Layer, Scene};
@@ -56,33 +56,39 @@ impl Choice for Predictor {
     const NAMES: &'static [(&'static str, Self)] = &Self::ALL;
 }
 
-/// The program with what the recipe puts around it; as it is where that is nothing.
-pub(crate) fn wrap(inner: Box<dyn Program>, recipe: &Recipe) -> Box<dyn Program> {
-    if recipe.filter.fusion == Fusion::Off && recipe.transport.metric.is_none() {
+/// The program with a filter and transport losses around it; as it is where both are off.
+pub(crate) fn wrap(
+    inner: Box<dyn Program>,
+    filter: &FilterSettings,
+    transport: &TransportSettings,
+) -> Box<dyn Program> {
+    if filter.fusion == Fusion::Off && transport.metric.is_none() {
         return inner;
     }
-    Box::new(FilteredProgram { inner })
+    Box::new(FilteredProgram { inner, filter: filter.clone(), transport: transport.clone() })
 }
 
 /// See the module's documentation.
 pub(crate) struct FilteredProgram {
     inner: Box<dyn Program>,
+    filter: FilterSettings,
+    transport: TransportSettings,
 }
 
 impl Program for FilteredProgram {
     fn spec(&self, plan: &Plan) -> Spec {
-        let r = &plan.recipe;
+        let filter = &self.filter;
         let inner = self.inner.spec(plan);
-        if r.filter.fusion == Fusion::Off {
+        if filter.fusion == Fusion::Off {
             return inner;
         }
         Spec::Filtered(FilteredSpec {
-            predictor: r.filter.predictor,
-            gain: r.filter.gain,
-            baseline: r.filter.baseline,
-            history: r.filter.history,
-            gate: r.filter.gate,
-            stop_gradient: r.filter.stop_gradient,
+            predictor: filter.predictor,
+            gain: filter.gain,
+            baseline: filter.baseline,
+            history: filter.history,
+            gate: filter.gate,
+            stop_gradient: filter.stop_gradient,
             ..FilteredSpec::around(inner, 1.0 / plan.fps, plan.clip[0])
         })
     }
@@ -100,10 +106,10 @@ impl Program for FilteredProgram {
     }
 
     fn check(&self, plan: &Plan) -> Result<()> {
-        let r = &plan.recipe;
-        let off_early = r.filter.until < 1.0;
-        if r.filter.fusion != Fusion::Off && off_early && (r.filter.until <= r.filter.start || r.filter.keep) {
-            return Err(crate::Error::input(format!("the filter is taken off at filter.until={}", r.filter.until))
+        let filter = &self.filter;
+        let off_early = filter.until < 1.0;
+        if filter.fusion != Fusion::Off && off_early && (filter.until <= filter.start || filter.keep) {
+            return Err(crate::Error::input(format!("the filter is taken off at filter.until={}", filter.until))
                 .remedy("Let filter.start be less, and do not ask for filter.keep"));
         }
         self.inner.check(plan)
@@ -138,9 +144,9 @@ impl Program for FilteredProgram {
     }
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
-        let r = &plan.recipe;
+        let filter = &self.filter;
         let mut stages = self.inner.stages(plan);
-        if let Some(settings) = transport(plan) {
+        if let Some(settings) = self.transport(plan) {
             for stage in &mut stages {
                 stage.probes.push(Box::new(Transport::new(settings, 0)));
                 if settings.align > 0.0 {
@@ -148,20 +154,20 @@ impl Program for FilteredProgram {
                 }
             }
         }
-        let fusion = r.filter.fusion;
+        let fusion = filter.fusion;
         if fusion == Fusion::Off {
             return stages;
         }
         for stage in &mut stages {
-            stage.groups.push(Group { layer: super::EVERY, ..Group::new(GAINS, r.falling(r.filter.lr)) });
+            stage.groups.push(Group { layer: super::EVERY, ..Group::new(GAINS, plan.common.rates.falling(filter.lr)) });
             stage.start = stage.start.take().map(around);
             stage.end = stage.end.take().map(around);
         }
-        switch(&mut stages, r.filter.start, fusion);
-        if r.filter.until < 1.0 {
-            switch(&mut stages, r.filter.until, Fusion::Off);
+        switch(&mut stages, filter.start, fusion);
+        if filter.until < 1.0 {
+            switch(&mut stages, filter.until, Fusion::Off);
         }
-        if let (Some(last), false) = (stages.last_mut(), r.filter.keep) {
+        if let (Some(last), false) = (stages.last_mut(), filter.keep) {
             let before = last.end.take();
             last.end = Some(Box::new(move |scene, progress| {
                 if let Some(hook) = &before {
@@ -189,23 +195,25 @@ fn switch(stages: &mut [Stage], share: f64, fusion: Fusion) {
     }
 }
 
-/// The transport loss that a recipe asks for.
-fn transport(plan: &Plan) -> Option<TransportConfig> {
-    let r = &plan.recipe;
-    Some(TransportConfig {
-        metric: r.transport.metric?,
-        predictor: r.filter.predictor,
-        temporal: r.transport.temporal,
-        second: r.transport.second,
-        align: r.transport.align,
-        covariance: r.transport.covariance,
-        extent: plan.extent,
-        clip: plan.clip,
-        frame: 1.0 / plan.fps,
-        every: r.transport.every,
-        start: r.transport.start,
-        ramp: r.transport.ramp,
-    })
+impl FilteredProgram {
+    /// The transport loss, where the settings switch it on.
+    fn transport(&self, plan: &Plan) -> Option<TransportConfig> {
+        let transport = &self.transport;
+        Some(TransportConfig {
+            metric: transport.metric?,
+            predictor: self.filter.predictor,
+            temporal: transport.temporal,
+            second: transport.second,
+            align: transport.align,
+            covariance: transport.covariance,
+            extent: plan.extent,
+            clip: plan.clip,
+            frame: 1.0 / plan.fps,
+            every: transport.every,
+            start: transport.start,
+            ramp: transport.ramp,
+        })
+    }
 }
 
 fn set_fusion(layer: &mut Layer, fusion: Fusion) -> Result<()> {

@@ -7,7 +7,6 @@
 
 use super::{Group, Hook, Plan, Program, Rate, Stage, still};
 use crate::loss::planes::{PlaneWeights, SmoothPlanes};
-use crate::recipe::Recipe;
 use crate::settings::settings;
 use crate::{Error, Result};
 use splat4d::layers::Scene;
@@ -69,8 +68,10 @@ settings! {
 }
 
 /// A canonical cloud that six feature planes deform (Wu et al. 2024, "4DGaussians").
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct HexplaneProgram;
+#[derive(Clone, Debug)]
+pub(crate) struct HexplaneProgram {
+    pub hexplane: HexplaneSettings,
+}
 
 /// Frames a time step of the planes: half of the frames where the original reads half of its time axis.
 const FRAMES_PER_STEP: usize = 4;
@@ -87,7 +88,7 @@ const COARSE_PART: usize = 10;
 
 impl Program for HexplaneProgram {
     fn spec(&self, plan: &Plan) -> Spec {
-        Spec::Hexplane(spec(plan))
+        Spec::Hexplane(self.spec_of(plan))
     }
 
     fn one_moment(&self, _plan: &Plan) -> bool {
@@ -95,24 +96,23 @@ impl Program for HexplaneProgram {
     }
 
     fn check(&self, plan: &Plan) -> Result<()> {
-        planes(plan).check()
+        self.planes(plan).check()
     }
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
-        let r = &plan.recipe;
-        let coarse = coarse_steps(r).min(r.run.iterations);
+        let coarse = self.coarse_steps(plan.iterations).min(plan.iterations);
         let mut stages = Vec::new();
         if coarse > 0 {
-            let mut stage = self.whole(plan, r.hexplane.multires.len()).part(0, coarse);
+            let mut stage = self.whole(plan, self.hexplane.multires.len()).part(0, coarse);
             stage.name = "coarse".into();
             stage.groups.retain(|g| !g.column.starts_with("hexplane."));
             stage.params.retain(|l| l.name() != SmoothPlanes::NAME);
             stage.phase = Some(Phase { rests: true, levels: None });
             stages.push(stage);
         }
-        let ends = unlocks(r, coarse);
+        let ends = self.unlocks(plan.iterations, coarse);
         for (i, end) in ends.windows(2).enumerate() {
-            let all = r.hexplane.multires.len();
+            let all = self.hexplane.multires.len();
             let levels = if ends.len() > 2 { all.min(i + 1) } else { all };
             let mut stage = self.whole(plan, levels).part(end[0], end[1]);
             stage.name = if ends.len() > 2 { format!("fine {}", i + 1) } else { "fine".into() };
@@ -124,84 +124,82 @@ impl Program for HexplaneProgram {
     }
 }
 
-fn planes(plan: &Plan) -> PlaneShape {
-    let r = &plan.recipe;
-    let time_resolution = match r.hexplane.time_resolution {
-        0 => plan.times.div_ceil(FRAMES_PER_STEP).max(LEAST_STEPS),
-        n => n,
-    };
-    PlaneShape {
-        channels: r.hexplane.plane_channels,
-        resolution: r.hexplane.plane_resolution,
-        time_resolution,
-        multires: r.hexplane.multires.clone(),
-    }
-}
-
-fn spec(plan: &Plan) -> HexplaneSpec {
-    let r = &plan.recipe;
-    HexplaneSpec {
-        seed: r.run.seed,
-        low: [-plan.extent; 3],
-        high: [plan.extent; 3],
-        clip: plan.clip,
-        planes: planes(plan),
-        net_width: r.hexplane.net_width,
-        defor_depth: r.hexplane.defor_depth,
-        heads: Heads {
-            position: !r.hexplane.no_dx,
-            scale: !r.hexplane.no_ds,
-            rotation: !r.hexplane.no_dr,
-            opacity: !r.hexplane.no_do,
-            sh: !r.hexplane.no_dshs,
-        },
-        ..HexplaneSpec::default()
-    }
-}
-
-/// Steps of the coarse stage.
-fn coarse_steps(r: &Recipe) -> usize {
-    if r.hexplane.coarse_iterations == 0 { r.run.iterations / COARSE_PART } else { r.hexplane.coarse_iterations }
-}
-
-/// First steps of the fine stages, and the end.
-fn unlocks(r: &Recipe, coarse: usize) -> Vec<usize> {
-    let mut ends = vec![coarse];
-    if r.hexplane.unlock_interval > 0 {
-        let more = (1..r.hexplane.multires.len()).map(|k| coarse + k * r.hexplane.unlock_interval);
-        ends.extend(more.filter(|&step| step < r.run.iterations));
-    }
-    if coarse < r.run.iterations {
-        ends.push(r.run.iterations);
-    }
-    ends
-}
-
 impl HexplaneProgram {
+    fn planes(&self, plan: &Plan) -> PlaneShape {
+        let time_resolution = match self.hexplane.time_resolution {
+            0 => plan.times.div_ceil(FRAMES_PER_STEP).max(LEAST_STEPS),
+            n => n,
+        };
+        PlaneShape {
+            channels: self.hexplane.plane_channels,
+            resolution: self.hexplane.plane_resolution,
+            time_resolution,
+            multires: self.hexplane.multires.clone(),
+        }
+    }
+
+    fn spec_of(&self, plan: &Plan) -> HexplaneSpec {
+        HexplaneSpec {
+            seed: plan.seed,
+            low: [-plan.extent; 3],
+            high: [plan.extent; 3],
+            clip: plan.clip,
+            planes: self.planes(plan),
+            net_width: self.hexplane.net_width,
+            defor_depth: self.hexplane.defor_depth,
+            heads: Heads {
+                position: !self.hexplane.no_dx,
+                scale: !self.hexplane.no_ds,
+                rotation: !self.hexplane.no_dr,
+                opacity: !self.hexplane.no_do,
+                sh: !self.hexplane.no_dshs,
+            },
+            ..HexplaneSpec::default()
+        }
+    }
+
+    /// Steps of the coarse stage.
+    fn coarse_steps(&self, iterations: usize) -> usize {
+        if self.hexplane.coarse_iterations == 0 { iterations / COARSE_PART } else { self.hexplane.coarse_iterations }
+    }
+
+    /// First steps of the fine stages, and the end.
+    fn unlocks(&self, iterations: usize, coarse: usize) -> Vec<usize> {
+        let mut ends = vec![coarse];
+        if self.hexplane.unlock_interval > 0 {
+            let more = (1..self.hexplane.multires.len()).map(|k| coarse + k * self.hexplane.unlock_interval);
+            ends.extend(more.filter(|&step| step < iterations));
+        }
+        if coarse < iterations {
+            ends.push(iterations);
+        }
+        ends
+    }
+
     /// Everything in one stage, with so many levels; the others are parts of it.
-    fn whole(self, plan: &Plan, levels: usize) -> Stage {
-        let r = &plan.recipe;
+    fn whole(&self, plan: &Plan, levels: usize) -> Stage {
+        let c = &plan.common;
         let mut stage = still::stage("hexplane", plan);
         still::learn_life(&mut stage, plan, self.life(plan));
-        let spec = spec(plan);
-        let grids = Rate { start: r.hexplane.grid_lr_init, end: r.hexplane.grid_lr_final };
+        let spec = self.spec_of(plan);
+        let grids = Rate { start: self.hexplane.grid_lr_init, end: self.hexplane.grid_lr_final };
         for level in 0..spec.planes.multires.len() {
             for plane in 0..6 {
                 stage.groups.push(Group::new(&PlaneShape::name(level, plane), grids));
             }
         }
-        let networks = Rate { start: r.hexplane.deformation_lr_init, end: r.hexplane.deformation_lr_final };
+        let networks = Rate { start: self.hexplane.deformation_lr_init, end: self.hexplane.deformation_lr_final };
         // The names follow from the spec; an empty layer is quickly made.
         let mut empty =
-            splat4d::scene::Params::<f32>::new(0, (r.appearance.sh_degree + 1) * (r.appearance.sh_degree + 1), &[]);
+            splat4d::scene::Params::<f32>::new(0, (c.appearance.sh_degree + 1) * (c.appearance.sh_degree + 1), &[]);
         if let Ok(model) = Hexplane::new(spec.clone(), &mut empty) {
             stage.groups.extend(model.network_columns().iter().map(|name| Group::new(name, networks)));
         }
         let weights = PlaneWeights {
-            smoothness: r.hexplane.plane_tv_weight,
-            time_smoothness: r.hexplane.time_smoothness_weight,
-            l1_time: r.hexplane.l1_time_planes,
-            variation: r.hexplane.plane_variation_weight,
+            smoothness: self.hexplane.plane_tv_weight,
+            time_smoothness: self.hexplane.time_smoothness_weight,
+            l1_time: self.hexplane.l1_time_planes,
+            variation: self.hexplane.plane_variation_weight,
         };
         if weights.any() {
             stage.params.push(Box::new(SmoothPlanes::new(spec.planes, levels, weights)));

@@ -3,11 +3,13 @@
 //! `splat4d::motion::x` holds a model's mathematics, `methods::x` its stages, rates, losses and what it needs of a capture.
 
 pub(crate) mod auto;
+mod common;
 pub(crate) mod control;
 pub(crate) mod deform;
 pub(crate) mod filtered;
 pub(crate) mod hexplane;
 pub(crate) mod native4d;
+pub(crate) mod own;
 pub(crate) mod spacetime;
 pub(crate) mod ssm;
 pub mod still;
@@ -15,36 +17,47 @@ pub mod still;
 mod tests;
 pub(crate) mod tracked;
 
+pub use common::CommonSettings;
+pub(crate) use common::{AppearanceSettings, LifeSettings, RateSettings};
 pub(crate) use control::ControlSettings;
 pub(crate) use deform::DeformSettings;
 pub(crate) use filtered::FilterSettings;
 pub(crate) use hexplane::HexplaneSettings;
 pub(crate) use native4d::Native4dSettings;
+pub use own::OwnMotion;
 pub(crate) use spacetime::SpacetimeSettings;
 pub(crate) use ssm::SsmSettings;
-pub(crate) use still::{AppearanceSettings, LifeSettings, RateSettings};
 pub(crate) use tracked::TrackedSettings;
 
+use crate::Result;
 use crate::event::Progress;
 use crate::loss::image::ImageTerm;
 use crate::loss::terms::{Codec, ParamLoss, ProbeLoss};
 use crate::optim::Noise;
-use crate::recipe::Recipe;
 use crate::sampler::Sampler;
 use crate::upkeep::split::STILL_COLUMNS;
 use crate::upkeep::{Split, Upkeep};
-use crate::{Error, Result};
 use auto::Seen;
 use splat4d::layers::Scene;
-use splat4d::motion::{BUILT_IN, Capabilities, MODELS, Motion, Phase, Spec, build};
+use splat4d::motion::{Capabilities, Motion, Phase, Spec, build};
 use splat4d::scene::{LifeKind, Params};
 use std::sync::Arc;
 
 /// The capture and the wishes of the user, as far as a program may know them.
 #[derive(Clone, Debug, Default)]
 pub struct Plan {
-    /// All knobs, resolved.
-    pub recipe: Recipe,
+    /// Settings that every motion model is trained with, resolved.
+    pub common: CommonSettings,
+    /// Seed of the run.
+    pub seed: u64,
+    /// Steps of the run.
+    pub iterations: usize,
+    /// Views per step.
+    pub batch_size: usize,
+    /// Share of the steps, from the first, that use images at half size.
+    pub half_size_until: f64,
+    /// Whether the end of the clip is kept from training, to be predicted.
+    pub predicted: bool,
     /// 1.1 times the largest distance of a camera from the cameras' centroid, scene units (Kerbl et al. 2023).
     pub extent: f64,
     /// The cameras' centroid, scene units.
@@ -91,13 +104,6 @@ impl Rate {
             return self.start.max(0.0) * (1.0 - progress) + self.end.max(0.0) * progress;
         }
         (self.start.ln() * (1.0 - progress) + self.end.ln() * progress).exp()
-    }
-}
-
-impl Recipe {
-    /// A rate that falls to `lr_decay` of itself over the stage.
-    pub(crate) fn falling(&self, rate: f64) -> Rate {
-        Rate { start: rate, end: rate * self.rates.decay }
     }
 }
 
@@ -290,8 +296,8 @@ pub trait Program: Send + Sync {
     /// comes there (docs/models.md); a camera that moves sees every place at few moments, and lives gain nothing. Others, and
     /// those whose future is to be predicted, are there for ever.
     fn life(&self, plan: &Plan) -> LifeKind {
-        let lasting = self.one_moment(plan) && plan.fixed_cameras > 0 && plan.recipe.capture.observe >= 1.0;
-        plan.recipe.life.kind.unwrap_or(if lasting { LifeKind::Interval } else { LifeKind::Infinite })
+        let lasting = self.one_moment(plan) && plan.fixed_cameras > 0 && !plan.predicted;
+        plan.common.life.kind.unwrap_or(if lasting { LifeKind::Interval } else { LifeKind::Infinite })
     }
     /// The plan of the initial points: the whole clip, or what of it is learnt first.
     fn first(&self, plan: &Plan) -> Plan {
@@ -336,52 +342,13 @@ pub trait Program: Send + Sync {
     }
 }
 
-/// Makes a program.
-type Make = fn() -> Box<dyn Program>;
-
-/// The programs by the names of their models: how a model is learnt is its file and an entry here. `auto` asks them in
-/// this order.
-pub(crate) const PROGRAMS: [(&str, Make); 8] = [
-    ("still", || Box::new(still::StillProgram)),
-    ("tracked", || Box::new(tracked::TrackedProgram)),
-    ("spacetime", || Box::new(spacetime::SpacetimeProgram)),
-    ("control", || Box::new(control::ControlProgram)),
-    ("deform-mlp", || Box::new(deform::DeformProgram)),
-    ("hexplane", || Box::new(hexplane::HexplaneProgram)),
-    ("native4d", || Box::new(native4d::Native4dProgram)),
-    ("ssm", || Box::new(ssm::SsmProgram)),
-];
-
-/// The program of a built-in motion model.
-pub fn program(motion: &str) -> Result<Box<dyn Program>> {
-    if let Some((_, make)) = PROGRAMS.into_iter().find(|(name, _)| *name == motion) {
-        return Ok(make());
-    }
-    if BUILT_IN.contains(&motion) {
-        return Err(Error::input(format!("`{motion}` cannot be chosen: it wraps another motion model"))
-            .remedy("Name the motion to be filtered, and add --set filter=geodesic"));
-    }
-    Err(Error::input(format!("there is no motion model `{motion}`"))
-        .remedy(format!("Use one of: {}", MODELS.join(", "))))
-}
-
-/// The program of a recipe: that of its motion, with the losses over time and the filter that the recipe asks for.
-pub(crate) fn program_of(recipe: &Recipe) -> Result<Box<dyn Program>> {
-    let program = program(recipe.run.motion.as_str())?;
-    if recipe.spacetime.has_features() && !program.has_features() {
-        return Err(Error::input(format!("motion `{}` has no features", recipe.run.motion))
-            .remedy("Use --motion spacetime, or --set features=none"));
-    }
-    Ok(filtered::wrap(program, recipe))
-}
-
-/// The stages of a program as the recipe has them: with `static_split`, still Gaussians move into a layer of their own
+/// The stages of a program: with a static split, still Gaussians move into a layer of their own
 /// after that share of the last stage.
 pub(crate) fn stages(program: &dyn Program, plan: &Plan) -> Vec<Stage> {
     let mut stages = program.stages(plan);
     if let Some(last) = stages.last_mut()
         && program.capabilities(plan).moves
-        && let Some(split) = Split::of(&plan.recipe, plan.extent, last.iterations)
+        && let Some(split) = Split::of(plan.common.split, plan.extent, last.iterations)
     {
         last.keep(split);
         share_groups(last);
@@ -395,10 +362,10 @@ fn share_groups(stage: &mut Stage) {
     stage.groups.iter_mut().filter(common).for_each(|g| g.layer = EVERY);
 }
 
-/// A stage that tunes a trained scene on all frames alike: the recipe's losses and rates, and nothing that adds, moves or
+/// A stage that tunes a trained scene on all frames alike: the plan's losses and rates, and nothing that adds, moves or
 /// replaces Gaussians.
-pub(crate) fn tuning(plan: &Plan) -> Result<Stage> {
-    let mut stage = program_of(&plan.recipe)?.tuning(plan);
+pub(crate) fn tuning(program: &dyn Program, plan: &Plan) -> Stage {
+    let mut stage = program.tuning(plan);
     share_groups(&mut stage);
     stage.upkeep.retain(|u| u.in_tuning());
     stage.noise = None;
@@ -407,5 +374,5 @@ pub(crate) fn tuning(plan: &Plan) -> Result<Stage> {
     stage.time_noise = TimeNoise::default();
     // What came in late in training is there by now.
     stage.groups.iter_mut().for_each(|g| (g.from, g.warm_up) = (0, 0));
-    Ok(stage)
+    stage
 }

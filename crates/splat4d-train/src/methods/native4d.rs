@@ -33,19 +33,21 @@ settings! {
 }
 
 /// Gaussians of space and time, sliced at t (Yang et al. 2024, "Real-time 4DGS").
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Native4dProgram;
+#[derive(Clone, Debug)]
+pub(crate) struct Native4dProgram {
+    pub native4d: Native4dSettings,
+}
 
 impl Program for Native4dProgram {
     fn spec(&self, plan: &Plan) -> Spec {
-        let r = &plan.recipe;
+        let c = &plan.common;
         Spec::Native4d(Native4dSpec {
             speed: plan.extent / plan.seconds(),
-            min_life: r.life.min_frames / plan.fps,
-            max_life: (LONGEST_CLIPS * plan.seconds()).max(r.life.min_frames / plan.fps),
-            harmonics: r.native4d.harmonics,
+            min_life: c.life.min_frames / plan.fps,
+            max_life: (LONGEST_CLIPS * plan.seconds()).max(c.life.min_frames / plan.fps),
+            harmonics: self.native4d.harmonics,
             period: plan.seconds(),
-            split_time: r.native4d.split_time,
+            split_time: self.native4d.split_time,
         })
     }
 
@@ -67,31 +69,31 @@ impl Program for Native4dProgram {
     }
 
     fn check(&self, plan: &Plan) -> Result<()> {
-        if matches!(plan.recipe.life.kind, None | Some(LifeKind::Infinite)) {
+        if matches!(plan.common.life.kind, None | Some(LifeKind::Infinite)) {
             return Ok(());
         }
         Err(Error::input(format!(
             "native4d has a life of its own and takes no life=\"{}\"",
-            plan.recipe.life.kind.word()
+            plan.common.life.kind.word()
         ))
         .remedy("Leave life at auto, or train spacetime with it"))
     }
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
-        let r = &plan.recipe;
+        let c = &plan.common;
         let mut stage = still::stage("native4d", plan);
-        let turning = Rate { start: r.native4d.rotation_lr_init, end: r.native4d.rotation_lr_final };
+        let turning = Rate { start: self.native4d.rotation_lr_init, end: self.native4d.rotation_lr_final };
         stage.groups.iter_mut().filter(|g| g.column == "quats").for_each(|g| g.rate = turning);
         stage.groups.push(Group::new("right_quats", turning));
-        stage.groups.push(Group::new("time_means", r.falling(r.life.center_lr * plan.seconds())));
-        stage.groups.push(Group::new("log_time_scales", r.falling(r.life.width_lr)));
-        if r.native4d.harmonics > 0 {
-            let block = 3 * (r.appearance.sh_degree + 1) * (r.appearance.sh_degree + 1);
-            let rate = r.falling(r.rates.feature / SH_REST_SLOWDOWN);
-            stage.groups.push(Group { part: Some((block, block * r.native4d.harmonics)), ..Group::new("sh", rate) });
+        stage.groups.push(Group::new("time_means", c.rates.falling(c.life.center_lr * plan.seconds())));
+        stage.groups.push(Group::new("log_time_scales", c.rates.falling(c.life.width_lr)));
+        if self.native4d.harmonics > 0 {
+            let block = 3 * (c.appearance.sh_degree + 1) * (c.appearance.sh_degree + 1);
+            let rate = c.rates.falling(c.rates.feature / SH_REST_SLOWDOWN);
+            stage.groups.push(Group { part: Some((block, block * self.native4d.harmonics)), ..Group::new("sh", rate) });
         }
-        if r.loss.opacity_life > 0.0 {
-            stage.params.push(Box::new(LivingOpacity { weight: r.loss.opacity_life }));
+        if c.loss.opacity_life > 0.0 {
+            stage.params.push(Box::new(LivingOpacity { weight: c.loss.opacity_life }));
         }
         vec![stage]
     }

@@ -6,7 +6,7 @@ use super::still;
 use super::{Beginning, Group, Plan, Program, Rate, Stage};
 use crate::loss::scene::{LivingOpacity, VelocitySmoothness};
 use crate::settings::{choices, settings};
-use crate::upkeep::Guided;
+use crate::upkeep::{Guided, GuidedSettings};
 use splat4d::motion::spacetime::{FeatureSpec, TIME_FEATURES, VELOCITIES, VIEW_FEATURES};
 use splat4d::motion::{SpacetimeSpec, Spec};
 use splat4d::scene::head::{HEAD_IN, HEAD_OUT};
@@ -62,23 +62,25 @@ impl SpacetimeSettings {
 }
 
 /// Explicit kinematics (STG, FreeTimeGS).
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct SpacetimeProgram;
+#[derive(Clone, Debug)]
+pub(crate) struct SpacetimeProgram {
+    pub spacetime: SpacetimeSettings,
+    pub guided: GuidedSettings,
+}
 
 impl Program for SpacetimeProgram {
     fn spec(&self, plan: &Plan) -> Spec {
-        let r = &plan.recipe;
         Spec::Spacetime(SpacetimeSpec {
-            order: r.spacetime.order,
-            rotation: r.spacetime.rotation_rate,
-            detach: r.spacetime.detach,
+            order: self.spacetime.order,
+            rotation: self.spacetime.rotation_rate,
+            detach: self.spacetime.detach,
             origin: 0.5 * (plan.clip[0] + plan.clip[1]),
-            features: (r.spacetime.has_features()).then_some(FeatureSpec { seed: r.run.seed }),
+            features: (self.spacetime.has_features()).then_some(FeatureSpec { seed: plan.seed }),
         })
     }
 
     fn life(&self, plan: &Plan) -> LifeKind {
-        plan.recipe.life.kind.unwrap_or(LifeKind::GaussHalf)
+        plan.common.life.kind.unwrap_or(LifeKind::GaussHalf)
     }
 
     fn init(&self, _plan: &Plan, beginnings: &[Beginning], params: &mut Params) {
@@ -96,48 +98,50 @@ impl Program for SpacetimeProgram {
         if seen.depth && !seen.masks && !seen.predicted {
             let cameras = seen.cameras_in_words();
             return Some(format!(
-                "{cameras} a moment, and depth maps say where things are then: Gaussians begin there"
+                "{cameras} each time, and depth maps give positions at that time, from which Gaussians start"
             ));
         }
         let moving =
             seen.changing.map_or_else(String::new, |share| format!(", {:.1} % of the pixels move", 100.0 * share));
         (seen.cameras >= MANY_CAMERAS).then(|| {
             let cameras = seen.cameras;
-            format!("{cameras:.0} cameras see every moment{moving}: explicit motion with lives needs no network")
+            format!("{cameras:.0} cameras see every time{moving}: enough for explicit motion with lifespans")
         })
     }
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
-        let r = &plan.recipe;
+        let c = &plan.common;
         let clip = plan.seconds();
         // Velocities are there to compare (`VelocitySmoothness`), which costs no further instant.
-        let base = r.clone().with(|r| r.loss.velocity = 0.0);
-        let mut stage = still::stage("spacetime", &Plan { recipe: base, ..plan.clone() });
+        let mut base = plan.clone();
+        base.common.loss.velocity = 0.0;
+        let mut stage = still::stage("spacetime", &base);
         // Rates of v_k are extents per clip^k: in seconds they shrink by clip^k.
-        for k in 0..r.spacetime.order {
+        for k in 0..self.spacetime.order {
             let unit = plan.extent / clip.powi(k as i32 + 1);
-            let rate = Rate { start: r.spacetime.velocity_lr_init * unit, end: r.spacetime.velocity_lr_final * unit };
+            let rate =
+                Rate { start: self.spacetime.velocity_lr_init * unit, end: self.spacetime.velocity_lr_final * unit };
             stage.groups.push(Group { part: Some((3 * k, 3)), ..Group::new("velocities", rate) });
         }
-        if r.spacetime.rotation_rate {
-            stage.groups.push(Group::new("rotation_rates", r.falling(r.spacetime.rotation_rate_lr / clip)));
+        if self.spacetime.rotation_rate {
+            stage.groups.push(Group::new("rotation_rates", c.rates.falling(self.spacetime.rotation_rate_lr / clip)));
         }
-        if r.spacetime.has_features() {
-            stage.groups.push(Group::new(VIEW_FEATURES, r.falling(r.spacetime.view_features_lr)));
+        if self.spacetime.has_features() {
+            stage.groups.push(Group::new(VIEW_FEATURES, c.rates.falling(self.spacetime.view_features_lr)));
             // Time features are per clip in the recipe, per second in the model.
-            stage.groups.push(Group::new(TIME_FEATURES, r.falling(r.spacetime.time_features_lr / clip)));
-            stage.groups.push(Group::new(HEAD_IN, r.falling(r.spacetime.head_lr)));
-            stage.groups.push(Group::new(HEAD_OUT, r.falling(r.spacetime.head_lr)));
+            stage.groups.push(Group::new(TIME_FEATURES, c.rates.falling(self.spacetime.time_features_lr / clip)));
+            stage.groups.push(Group::new(HEAD_IN, c.rates.falling(self.spacetime.head_lr)));
+            stage.groups.push(Group::new(HEAD_OUT, c.rates.falling(self.spacetime.head_lr)));
         }
-        if let Some(guided) = Guided::of(r) {
+        if let Some(guided) = Guided::of(self.guided) {
             stage.keep(guided);
         }
         still::learn_life(&mut stage, plan, self.life(plan));
-        if r.loss.opacity_life > 0.0 {
-            stage.params.push(Box::new(LivingOpacity { weight: r.loss.opacity_life }));
+        if c.loss.opacity_life > 0.0 {
+            stage.params.push(Box::new(LivingOpacity { weight: c.loss.opacity_life }));
         }
-        if r.loss.velocity > 0.0 && r.spacetime.order > 0 {
-            stage.params.push(Box::new(VelocitySmoothness::new(r.loss.velocity, clip / plan.extent)));
+        if c.loss.velocity > 0.0 && self.spacetime.order > 0 {
+            stage.params.push(Box::new(VelocitySmoothness::new(c.loss.velocity, clip / plan.extent)));
         }
         vec![stage]
     }

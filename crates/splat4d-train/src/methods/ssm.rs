@@ -1,8 +1,9 @@
 //! `ssm`: how it is learnt. One joint stage, as of `control`, whose nodes, losses on nodes and upkeep it shares; before it,
 //! if the recipe says so, a still warm-up, after which nodes are placed anew on what became of the cloud.
 
-use super::{Group, Hook, Plan, Program, Rate, Stage, control, still};
+use super::{ControlSettings, Group, Hook, Plan, Program, Rate, Stage, control, still};
 use crate::settings::{Choice, settings};
+use crate::upkeep::NodeSettings;
 use crate::{Error, Result};
 use splat4d::layers::Layer;
 use splat4d::math::knn::mean_square_distance;
@@ -57,8 +58,12 @@ impl Choice for Equivariance {
 }
 
 /// Control nodes driven by a diagonal state-space model.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct SsmProgram;
+#[derive(Clone, Debug)]
+pub(crate) struct SsmProgram {
+    pub ssm: SsmSettings,
+    pub control: ControlSettings,
+    pub nodes: NodeSettings,
+}
 
 /// Distinct times a tick, where the recipe leaves the choice: on mutant (150 times) 16 ticks gained 1.5 dB over 75.
 const TIMES_PER_TICK: usize = 10;
@@ -69,29 +74,30 @@ const SOLID_LOGIT: f32 = -2.2;
 
 impl Program for SsmProgram {
     fn spec(&self, plan: &Plan) -> Spec {
-        let r = &plan.recipe;
-        let ticks = if r.ssm.ticks > 0 { r.ssm.ticks } else { plan.times.div_ceil(TIMES_PER_TICK) };
+        let ticks = if self.ssm.ticks > 0 { self.ssm.ticks } else { plan.times.div_ceil(TIMES_PER_TICK) };
         Spec::Ssm(SsmSpec {
-            seed: r.run.seed,
-            skin: control::skin(r),
+            seed: plan.seed,
+            skin: control::skin(&self.control),
             clip: plan.clip,
-            ticks: if r.ssm.ticks > 0 { ticks.max(2) } else { ticks.clamp(*TICKS.start(), *TICKS.end()) },
-            width: r.ssm.width,
-            states: r.ssm.states,
-            blocks: r.ssm.blocks,
+            ticks: if self.ssm.ticks > 0 { ticks.max(2) } else { ticks.clamp(*TICKS.start(), *TICKS.end()) },
+            width: self.ssm.width,
+            states: self.ssm.states,
+            blocks: self.ssm.blocks,
             extent: plan.extent,
-            mode: r.ssm.mode,
-            octaves: if r.ssm.mode == Mode::Causal { 0 } else { SsmSpec::default().octaves },
-            output: r.ssm.output,
-            equivariance: r.ssm.equivariance,
+            mode: self.ssm.mode,
+            octaves: if self.ssm.mode == Mode::Causal { 0 } else { SsmSpec::default().octaves },
+            output: self.ssm.output,
+            equivariance: self.ssm.equivariance,
             ..SsmSpec::default()
         })
     }
 
     fn check(&self, plan: &Plan) -> Result<()> {
         if plan.times < 2 {
-            return Err(Error::input("a scan over time learns from motion, and the capture has one moment only")
-                .remedy("Use --motion still"));
+            return Err(Error::input(
+                "a state-space model learns from motion, but all images of the capture have the same time",
+            )
+            .remedy("Use --motion still"));
         }
         Ok(())
     }
@@ -100,23 +106,22 @@ impl Program for SsmProgram {
         true
     }
 
-    fn nodes(&self, plan: &Plan) -> usize {
-        control::most_nodes(&plan.recipe)
+    fn nodes(&self, _plan: &Plan) -> usize {
+        control::most_nodes(&self.control, &self.nodes)
     }
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
-        let r = &plan.recipe;
-        let warm = (r.ssm.warm_up * r.run.iterations as f64) as usize;
+        let warm = (self.ssm.warm_up * plan.iterations as f64) as usize;
         let mut stages = Vec::new();
         if warm > 0 {
             let mut first = still::stage("ssm warm-up", plan).part(0, warm);
             still::learn_life(&mut first, plan, self.life(plan));
             stages.push(first);
         }
-        let mut all = still::stage("ssm", plan).part(warm, r.run.iterations);
+        let mut all = still::stage("ssm", plan).part(warm, plan.iterations);
         still::learn_life(&mut all, plan, self.life(plan));
-        control::add_nodes(&mut all, plan);
-        all.groups.extend(groups(self.spec(plan), plan));
+        control::add_nodes(&mut all, plan, &self.control, self.nodes);
+        all.groups.extend(groups(self.spec(plan), plan, &self.ssm));
         if warm > 0 {
             all.start = Some(place_nodes());
         }
@@ -126,14 +131,13 @@ impl Program for SsmProgram {
 }
 
 /// The network's groups.
-fn groups(spec: Spec, plan: &Plan) -> Vec<Group> {
-    let r = &plan.recipe;
-    let maps = Rate { start: r.ssm.lr_init, end: r.ssm.lr_final };
-    let mut groups = vec![Group::new("node_embeddings", r.falling(r.ssm.embedding_lr))];
+fn groups(spec: Spec, plan: &Plan, ssm: &SsmSettings) -> Vec<Group> {
+    let maps = Rate { start: ssm.lr_init, end: ssm.lr_final };
+    let mut groups = vec![Group::new("node_embeddings", plan.common.rates.falling(ssm.embedding_lr))];
     // A model of an empty layer has the same columns as any other.
     let Spec::Ssm(spec) = spec else { return groups };
     if let Ok((dynamics, others)) = splat4d::motion::ssm::columns(&spec) {
-        groups.extend(dynamics.iter().map(|c| Group::new(c, Rate::constant(r.ssm.dynamics_lr))));
+        groups.extend(dynamics.iter().map(|c| Group::new(c, Rate::constant(ssm.dynamics_lr))));
         groups.extend(others.iter().map(|c| Group::new(c, maps)));
     }
     groups

@@ -5,12 +5,11 @@
 //! lengths are in shares of the rig, so that the weights hold in any unit; the neighbours' weights do not know the unit.
 
 use super::auto::Seen;
-use super::{Group, Hook, Plan, Program, Rate, Stage, program, still};
+use super::{Group, Hook, Plan, Program, Rate, Stage, still};
 use crate::loss::graph::{LEAST_MEAN_WEIGHT, Weigh};
 use crate::loss::image::ImageTerm;
 use crate::loss::image::segmentation::Segmentation;
 use crate::loss::tracked::{Ties, Tracking, Weights};
-use crate::recipe::Recipe;
 use crate::sampler::Sampler;
 use crate::settings::settings;
 use crate::{Error, Result};
@@ -23,6 +22,8 @@ use splat4d::scene::params::{QUAT, page_name};
 use std::any::Any;
 use std::sync::Arc;
 
+/// The name of the model.
+const NAME: &str = "tracked";
 /// The extent, in metres, of the rig that the paper's weights are for (CMU Panoptic Studio).
 const PAPER_EXTENT: f64 = 3.0;
 /// Share of the masks' weight that frame 0 has. Nobody is known to be foreground yet, and at full weight opacities fall to
@@ -72,13 +73,15 @@ settings! {
 }
 
 /// Positions and rotations of the same Gaussians at every frame (Luiten et al. 2024, "Dynamic 3D Gaussians").
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct TrackedProgram;
+#[derive(Clone, Debug)]
+pub(crate) struct TrackedProgram {
+    pub tracked: TrackedSettings,
+}
 
 impl Program for TrackedProgram {
     fn spec(&self, plan: &Plan) -> Spec {
         let first = plan.moments.first().map_or(plan.clip[0], |m| m.0);
-        Spec::Tracked(TrackedSpec { times: vec![first], foreground: segments(plan) })
+        Spec::Tracked(TrackedSpec { times: vec![first], foreground: segments(plan, &self.tracked) })
     }
 
     fn first(&self, plan: &Plan) -> Plan {
@@ -90,17 +93,16 @@ impl Program for TrackedProgram {
         let least = self.capabilities(plan).fixed_cameras;
         let fewest = plan.moments.iter().min_by_key(|m| m.1).copied().unwrap_or_default();
         if fewest.1 < least {
-            let learns = |name: &&str| program(name).is_ok_and(|p| p.capabilities(plan).fixed_cameras < least);
-            let others: Vec<&str> = MODELS.iter().copied().filter(learns).collect();
+            let others: Vec<&str> = MODELS.iter().copied().filter(|name| *name != NAME).collect();
             return Err(Error::input(format!(
-                "`tracked` needs at least {least} fixed cameras that take their pictures together: it follows \
-                 every Gaussian from one moment to the next, and what fewer cameras see of one moment does not say where \
-                 things are. At {:.3} s this capture has {} training pictures of fixed cameras",
+                "`tracked` needs at least {least} fixed, synchronised cameras: it tracks every Gaussian from frame \
+                 to frame, and fewer cameras do not determine positions in a frame. At {:.3} s this capture has {} \
+                 training images of fixed cameras",
                 fewest.0, fewest.1
             ))
             .remedy(format!("Use another --motion: {}", others.join(", "))));
         }
-        if plan.recipe.prune.interval > 0 {
+        if plan.common.prune.interval > 0 {
             return Err(Error::input("`tracked` cannot prune while it trains: it does not know the frames to come")
                 .remedy("Leave prune_interval at 0, or prune afterwards with `splat4d compress`"));
         }
@@ -110,35 +112,35 @@ impl Program for TrackedProgram {
     fn suits(&self, seen: &Seen) -> Option<String> {
         (seen.predicted && seen.fewest >= LEAST_CAMERAS && !seen.is_long()).then(|| {
             let cameras = seen.cameras_in_words();
-            format!("{cameras} each moment, and what is to be predicted needs Gaussians that last and can be followed")
+            format!("{cameras} each time, and prediction needs persistent Gaussians that can be tracked")
         })
     }
 
     fn stages(&self, plan: &Plan) -> Vec<Stage> {
-        let r = &plan.recipe;
+        let tracked = &self.tracked;
         let frames = plan.moments.len();
-        let first = first_steps(r, frames);
-        let tracking = Tracking::new(ties(plan));
-        let mut stages = vec![first_stage(plan, first)];
-        let rest = r.run.iterations - first;
+        let first = first_steps(plan.iterations, tracked.first_share, frames);
+        let tracking = Tracking::new(ties(plan, tracked));
+        let mut stages = vec![self.first_stage(plan, first)];
+        let rest = plan.iterations - first;
         for k in 1..frames {
             let steps = rest * k / (frames - 1) - rest * (k - 1) / (frames - 1);
-            let positions = Rate { start: r.tracked.lr_init * plan.extent, end: r.tracked.lr_final * plan.extent };
+            let positions = Rate { start: tracked.lr_init * plan.extent, end: tracked.lr_final * plan.extent };
             let mut groups = vec![
                 Group::new(&page_name("means", k as u32), positions),
-                Group::new(&page_name("quats", k as u32), Rate::constant(r.tracked.rotation_lr)),
+                Group::new(&page_name("quats", k as u32), Rate::constant(tracked.rotation_lr)),
             ];
-            if r.tracked.feature_lr > 0.0 {
-                groups.push(Group { part: Some((0, 3)), ..Group::new("sh", Rate::constant(r.tracked.feature_lr)) });
+            if tracked.feature_lr > 0.0 {
+                groups.push(Group { part: Some((0, 3)), ..Group::new("sh", Rate::constant(tracked.feature_lr)) });
             }
             stages.push(Stage {
                 sampler: Sampler::Frame(k),
-                batch: r.run.batch_size,
+                batch: plan.batch_size,
                 groups,
                 params: vec![Box::new(tracking.frame(k))],
-                pictures: segmentation(plan, 1.0),
+                pictures: segmentation(plan, tracked, 1.0),
                 freeze_exposure: true,
-                start: Some(next_frame(plan, k, &tracking)),
+                start: Some(next_frame(plan, k, tracked.velocity_cap, &tracking)),
                 ..Stage::new(&format!("frame {k}"), steps)
             });
         }
@@ -153,82 +155,76 @@ impl Program for TrackedProgram {
 
     /// Every frame's page beside what all frames share; who is foreground is settled.
     fn tuning(&self, plan: &Plan) -> Stage {
-        let r = &plan.recipe;
+        let tracked = &self.tracked;
         let mut stage = still::stage("tracked", plan);
-        let positions = Rate { start: r.tracked.lr_init * plan.extent, end: r.tracked.lr_final * plan.extent };
+        let positions = Rate { start: tracked.lr_init * plan.extent, end: tracked.lr_final * plan.extent };
         for k in 1..plan.moments.len() as u32 {
             stage.groups.push(Group::new(&page_name("means", k), positions));
-            stage.groups.push(Group::new(&page_name("quats", k), Rate::constant(r.tracked.rotation_lr)));
+            stage.groups.push(Group::new(&page_name("quats", k), Rate::constant(tracked.rotation_lr)));
         }
         stage
     }
 }
 
 /// Whether Gaussians learn who is foreground.
-fn segments(plan: &Plan) -> bool {
-    plan.masks && plan.recipe.tracked.seg > 0.0
+fn segments(plan: &Plan, tracked: &TrackedSettings) -> bool {
+    plan.masks && tracked.seg > 0.0
 }
 
 /// Masks against the foreground logit, at a share of the recipe's weight.
-fn segmentation(plan: &Plan, share: f64) -> Vec<Box<dyn ImageTerm>> {
-    let r = &plan.recipe;
-    let term =
-        || -> Box<dyn ImageTerm> { Box::new(Segmentation::new(FOREGROUND, share * r.tracked.seg, r.loss.dssim)) };
-    segments(plan).then(term).into_iter().collect()
+fn segmentation(plan: &Plan, tracked: &TrackedSettings, share: f64) -> Vec<Box<dyn ImageTerm>> {
+    let (weight, dssim) = (share * tracked.seg, plan.common.loss.dssim);
+    let term = || -> Box<dyn ImageTerm> { Box::new(Segmentation::new(FOREGROUND, weight, dssim)) };
+    segments(plan, tracked).then(term).into_iter().collect()
 }
 
 /// Steps of frame 0.
-fn first_steps(r: &Recipe, frames: usize) -> usize {
-    if frames <= 1 {
-        r.run.iterations
-    } else {
-        ((r.run.iterations as f64 * r.tracked.first_share.min(1.0)) as usize).max(1)
-    }
+fn first_steps(iterations: usize, share: f64, frames: usize) -> usize {
+    if frames <= 1 { iterations } else { ((iterations as f64 * share.min(1.0)) as usize).max(1) }
 }
 
-fn ties(plan: &Plan) -> Ties {
-    let r = &plan.recipe;
+fn ties(plan: &Plan, tracked: &TrackedSettings) -> Ties {
     Ties {
-        neighbours: r.tracked.neighbours,
-        weigh: if r.tracked.beta > 0.0 { Weigh::Beta(r.tracked.beta) } else { Weigh::Median(1.0) },
+        neighbours: tracked.neighbours,
+        weigh: if tracked.beta > 0.0 { Weigh::Beta(tracked.beta) } else { Weigh::Median(1.0) },
         weights: Weights {
-            rigid: r.tracked.rigid,
-            rot: r.tracked.rot,
-            iso: r.tracked.iso,
-            bg: r.tracked.bg,
-            soft_col: if r.tracked.feature_lr > 0.0 { r.tracked.soft_col_cons } else { 0.0 },
-            floor: if r.tracked.floor_height.is_some() { r.tracked.floor } else { 0.0 },
+            rigid: tracked.rigid,
+            rot: tracked.rot,
+            iso: tracked.iso,
+            bg: tracked.bg,
+            soft_col: if tracked.feature_lr > 0.0 { tracked.soft_col_cons } else { 0.0 },
+            floor: if tracked.floor_height.is_some() { tracked.floor } else { 0.0 },
         },
-        floor: r.tracked.floor_height.unwrap_or(0.0),
+        floor: tracked.floor_height.unwrap_or(0.0),
         unit: plan.extent / PAPER_EXTENT,
     }
 }
 
-/// Frame 0 is a still scene; what the recipe schedules over all steps happens in this stage's.
-fn first_stage(plan: &Plan, steps: usize) -> Stage {
-    let share = steps as f64 / plan.recipe.run.iterations as f64;
-    let part = |steps: usize| ((steps as f64 * share) as usize).max(1);
-    let r = plan.recipe.clone().with(|r| {
-        r.run.iterations = steps;
-        r.appearance.sh_degree_interval = part(plan.recipe.appearance.sh_degree_interval);
-        r.densify.interval = part(plan.recipe.densify.interval);
-        r.densify.from = part(plan.recipe.densify.from);
-        r.densify.until = part(plan.recipe.densify.until);
-    });
-    let plan = Plan { recipe: r, ..plan.clone() };
-    let mut stage = still::stage("frame 0", &plan);
-    stage.sampler = Sampler::Frame(0);
-    still::learn_life(&mut stage, &plan, TrackedProgram.life(&plan));
-    if segments(&plan) {
-        stage.groups.push(Group::new(FOREGROUND, plan.recipe.falling(plan.recipe.rates.opacity)));
-        stage.pictures = segmentation(&plan, FIRST_MASKS);
+impl TrackedProgram {
+    /// Frame 0 is a still scene; what is scheduled over all steps happens in this stage's.
+    fn first_stage(&self, plan: &Plan, steps: usize) -> Stage {
+        let share = steps as f64 / plan.iterations as f64;
+        let part = |steps: &mut usize| *steps = ((*steps as f64 * share) as usize).max(1);
+        let mut first = Plan { iterations: steps, ..plan.clone() };
+        part(&mut first.common.appearance.sh_degree_interval);
+        part(&mut first.common.densify.interval);
+        part(&mut first.common.densify.from);
+        part(&mut first.common.densify.until);
+        let mut stage = still::stage("frame 0", &first);
+        stage.sampler = Sampler::Frame(0);
+        still::learn_life(&mut stage, &first, self.life(&first));
+        if segments(plan, &self.tracked) {
+            let rates = &plan.common.rates;
+            stage.groups.push(Group::new(FOREGROUND, rates.falling(rates.opacity)));
+            stage.pictures = segmentation(plan, &self.tracked, FIRST_MASKS);
+        }
+        stage
     }
-    stage
 }
 
 /// Adds frame k where everything goes on as it went.
-fn next_frame(plan: &Plan, k: usize, tracking: &Tracking<f32>) -> Hook {
-    let (t, cap) = (plan.moments[k].0, plan.recipe.tracked.velocity_cap * plan.extent);
+fn next_frame(plan: &Plan, k: usize, velocity_cap: f64, tracking: &Tracking<f32>) -> Hook {
+    let (t, cap) = (plan.moments[k].0, velocity_cap * plan.extent);
     let tracking = tracking.clone();
     Box::new(move |scene, progress| {
         let layer = &mut scene.layers[0];

@@ -1,7 +1,6 @@
 //! Position noise: after every step nearly transparent Gaussians are shaken, so that they find where they are of use.
 //! Source: Kheradmand et al. 2024 (3DGS as MCMC) §3.
 
-use crate::recipe::Recipe;
 use splat4d::layers::{Layer, Scene};
 use splat4d::math::{Real, Rng, sym3};
 use splat4d::motion::for_rows;
@@ -26,11 +25,10 @@ pub struct Noise {
 }
 
 impl Noise {
-    /// As a recipe has it, for cameras of this extent; `None`: its strategy takes none.
-    pub(crate) fn of(r: &Recipe, extent: f64) -> Option<Self> {
+    /// Noise of this strength at [`MCMC_EXTENT`], for cameras of another extent.
+    pub(crate) fn new(strength: f64, until: usize, extent: f64) -> Self {
         // A shift is covariance times rate, scene units³: only against the extent does it not depend on the unit.
-        let strength = r.mcmc.noise_lr * (MCMC_EXTENT / extent).powi(2);
-        (r.densify.is_mcmc()).then_some(Self { strength, until: r.densify.until })
+        Self { strength: strength * (MCMC_EXTENT / extent).powi(2), until }
     }
 
     /// The same as the steps `from..to` of a stage see it.

@@ -1,9 +1,10 @@
 //! [`OutputFolder`]: the folder that a command writes, from the first look at it to the last file.
 
+use super::cannot_write;
 use super::list::{self, List};
 use super::owner::{Owner, in_use};
 use super::place::{Input, check_apart};
-use super::write::{cannot_write, is_temporary};
+use super::temporary::is_temporary;
 use super::{STATE, legacy, write_atomically};
 use crate::path_text::in_command;
 use crate::{Error, Result};
@@ -100,7 +101,7 @@ impl OutputFolder {
         }
         let before = path.exists();
         std::fs::create_dir_all(path).map_err(|e| {
-            let error = Error::environment("the folder cannot be made", e).at(path.display());
+            let error = Error::environment("the folder cannot be created", e).at(path.display());
             error.remedy("Choose another place with -o: one where you may write, below a folder and not below a file")
         })?;
         let owner = Owner::of(path, request.command).inspect_err(|_| {

@@ -3,8 +3,7 @@
 //! A file's line is written before the file gets its name, so that the list never misses one. Lines that end with a slash are
 //! folders in which files were written; half-written files are looked for there.
 
-use super::STATE;
-use super::write::cannot_write;
+use super::{STATE, cannot_write, check_plain};
 use crate::Result;
 use crate::path_text::{escaped, of_escaped};
 use std::collections::BTreeSet;
@@ -35,6 +34,7 @@ impl List {
         let root = folder.canonicalize().map_err(fail)?;
         std::fs::create_dir_all(root.join(STATE)).map_err(fail)?;
         let file = root.join(STATE).join(FILE);
+        check_plain(&file)?;
         let known = Mutex::new(read(&file));
         let list = Arc::new(Self { root, file, known });
         let mut kept = KEPT.lock().unwrap_or_else(|e| e.into_inner());
@@ -86,6 +86,11 @@ pub(super) fn folders(folder: &Path) -> Vec<PathBuf> {
     std::iter::once(folder.to_owned()).chain(listed.iter().filter(|p| is_folder(p)).map(|p| folder.join(p))).collect()
 }
 
+/// What commands wrote into a folder, by its list: paths below it, folders with a slash at their end.
+pub fn written(folder: &Path) -> BTreeSet<PathBuf> {
+    read_of(folder)
+}
+
 /// What a folder's list names.
 pub(super) fn read_of(folder: &Path) -> BTreeSet<PathBuf> {
     read(&folder.join(STATE).join(FILE))
@@ -95,6 +100,11 @@ pub(super) fn read_of(folder: &Path) -> BTreeSet<PathBuf> {
 pub fn note(file: &Path) -> Result<()> {
     let Some((list, folder)) = kept(file) else { return Ok(()) };
     file.file_name().map_or(Ok(()), |name| list.add(&folder.join(name)))
+}
+
+/// Whether a file lies in a folder of which a list is kept.
+pub(super) fn keeps(file: &Path) -> bool {
+    kept(file).is_some()
 }
 
 /// Notes the folder of a file that is about to be written. Returns whether a list is kept there.

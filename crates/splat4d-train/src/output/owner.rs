@@ -7,7 +7,7 @@
 //! taken over: a clock that jumps makes no owner dead.
 
 use super::date::rfc3339;
-use super::{STATE, write};
+use super::{STATE, cannot_write, check_plain, temporary};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::fs::{File, TryLockError};
@@ -107,10 +107,12 @@ impl Owner {
         patience: Patience,
     ) -> Result<Result<Self, Option<Standing>>> {
         let state = folder.join(STATE);
-        let fail = |e| write::cannot_write(folder, e);
+        let fail = |e| cannot_write(folder, e);
         let record = state.join(RECORD);
         let lock = loop {
             std::fs::create_dir_all(&state).map_err(fail)?;
+            check_plain(&state.join(LOCK))?;
+            check_plain(&record)?;
             let opened = File::options().read(true).write(true).create(true).truncate(false).open(state.join(LOCK));
             let lock = match opened {
                 // Its owner has just removed the state of a folder in which nothing was begun.
@@ -131,7 +133,7 @@ impl Owner {
             return Ok(Err(Some(before)));
         }
         // What a dead owner left half-written. Workers on parts of a folder have folders and locks of their own.
-        write::remove_leftovers(folder);
+        temporary::remove_leftovers(folder);
         let standing = Standing::new(command);
         let opened = File::options().write(true).create(true).truncate(true).open(&record);
         let written = opened.and_then(|mut file| file.write_all(&standing.bytes()).map(|()| file));
@@ -185,8 +187,9 @@ impl Owner {
 
     /// Who has the folder now, without a trace in it; the inner `None`: somebody whose record cannot be read.
     pub fn holder(folder: &Path) -> Option<Option<Standing>> {
-        let record = folder.join(STATE).join(RECORD);
-        let lock = File::open(folder.join(STATE).join(LOCK)).ok()?;
+        let (record, lock) = (folder.join(STATE).join(RECORD), folder.join(STATE).join(LOCK));
+        check_plain(&lock).ok()?;
+        let lock = File::open(lock).ok()?;
         if let Err(TryLockError::WouldBlock) = lock.try_lock_shared() {
             return Some(Standing::read(&record));
         }
@@ -392,7 +395,7 @@ mod tests {
     }
 
     #[test]
-    fn of_many_who_find_a_dead_owner_one_takes_over() {
+    fn one_of_many_processes_takes_over_from_a_dead_owner() {
         let folder = tempfile::tempdir().unwrap();
         elsewhere(folder.path(), "1");
         set_time(folder.path(), SystemTime::now() - Duration::from_secs(3600));

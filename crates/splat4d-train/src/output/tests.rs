@@ -251,7 +251,7 @@ fn a_sequence_does_not_take_over_the_tail_of_another() {
     let folder = work.path().join("frames");
     let is = |n: &OsStr| n.to_string_lossy().starts_with("frame_");
     let written = |count: usize| move |n: &OsStr| (0..count).any(|i| n.to_string_lossy() == format!("frame_{i}.ply"));
-    let export = |count: usize, force: bool, fails: bool| -> crate::Result<()> {
+    let export = |count: usize, force: bool, fails: bool| -> Result<()> {
         let written = written(count);
         let mixes = Mixes::Frames { is: &is, written: &written };
         let (out, _) = OutputFolder::begin(&folder, &Request { mixes, ..request("", force) })?;
@@ -282,4 +282,46 @@ fn a_sequence_does_not_take_over_the_tail_of_another() {
         let error = export(12, force, false).unwrap_err().to_string();
         assert!(error.contains("frame_9.ply") && error.contains("no record"), "{error}");
     }
+}
+
+/// Folders come from other people, who can put a link or a pipe in place of any file that a command writes.
+#[cfg(unix)]
+#[test]
+fn links_and_pipes_in_place_of_our_files_lead_nowhere() {
+    use std::os::unix::fs::symlink;
+    let work = tempfile::tempdir().unwrap();
+    let (folder, mine) = (work.path().join("run"), work.path().join("mine.txt"));
+    run(&folder, "old");
+    std::fs::write(&mine, "mine").unwrap();
+    for name in ["lock", "owner.json", FILE] {
+        let place = folder.join(STATE).join(name);
+        let before = std::fs::read(&place).unwrap_or_default();
+        let _ = std::fs::remove_file(&place);
+        symlink(&mine, &place).unwrap();
+        let error = OutputFolder::amend(&folder, "eval").unwrap_err().to_string();
+        assert!(error.contains("not a regular file"), "{name}: {error}");
+        std::fs::remove_file(&place).unwrap();
+        if std::process::Command::new("mkfifo").arg(&place).status().is_ok_and(|s| s.success()) {
+            assert!(OutputFolder::amend(&folder, "eval").is_err(), "{name}");
+            assert_eq!(Owner::holder(&folder), None);
+            std::fs::remove_file(&place).unwrap();
+        }
+        std::fs::write(&place, before).unwrap();
+    }
+    let _ = std::fs::remove_file(folder.join(STATE).join("owner.json"));
+    symlink(&mine, folder.join("report.html")).unwrap();
+    let staged = |path: &Path| {
+        let staged = Staged::new(path).unwrap();
+        std::fs::write(staged.path(), "new").unwrap();
+        staged.keep().unwrap();
+    };
+    let owned = OutputFolder::amend(&folder, "eval").unwrap();
+    staged(&folder.join("report.html"));
+    drop(owned);
+    assert_eq!(std::fs::read(&mine).unwrap(), b"mine");
+    assert_eq!(std::fs::read(folder.join("report.html")).unwrap(), b"new");
+    // Elsewhere a link is the user's own.
+    symlink(&mine, work.path().join("link")).unwrap();
+    staged(&work.path().join("link"));
+    assert_eq!(std::fs::read(&mine).unwrap(), b"new");
 }

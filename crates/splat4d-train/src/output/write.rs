@@ -1,33 +1,11 @@
 //! Writes files so that nobody ever finds half of one: under a temporary name in the same folder, then renamed.
 
-use super::list;
 use super::owner::check_free;
+use super::temporary::{remove_leftovers_once, temporary_name};
+use super::{NO_SPACE, cannot_write, list};
 use crate::{Error, Result};
-use std::collections::BTreeSet;
-use std::ffi::{OsStr, OsString};
 use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::sync::Mutex;
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::Duration;
-
-/// What to do about a file that cannot be written.
-const NO_SPACE: &str = "Check that the folder exists, that you may write there and that the disk is not full";
-/// Ending of temporary names.
-const ENDING: &str = ".splat4d-tmp";
-/// Most bytes of a file's own name in its temporary one: names have 255 on all common systems.
-const NAME_BYTES: usize = 180;
-/// A temporary file of another machine is left over when it was not written for so long.
-const LEFT_OVER: Duration = Duration::from_secs(3600);
-/// Numbers of this process's temporary files.
-static NUMBER: AtomicU64 = AtomicU64::new(0);
-/// Folders in which this process has looked for leftovers.
-static LOOKED: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
-
-/// The error of a failed write.
-pub(super) fn cannot_write(path: &Path, error: std::io::Error) -> Error {
-    Error::environment("cannot be written", error).at(path.display()).remedy(NO_SPACE)
-}
 
 /// A file under a temporary name beside its place; [`keep`](Self::keep) renames it, dropping it removes it.
 #[derive(Debug)]
@@ -38,10 +16,13 @@ pub struct Staged {
 
 impl Staged {
     /// Prepares to write `path`. A link is followed, so that the file behind it is replaced and not the link; a device or
-    /// a pipe is written to.
+    /// a pipe is written to. In an output folder the link itself is replaced: folders come from other people.
     ///
     /// Errors: a folder is there; the list of the folder's files cannot be written.
     pub fn new(path: &Path) -> Result<Self> {
+        if path.is_symlink() && list::keeps(path) {
+            return Self::at(path.to_owned(), path);
+        }
         Self::at(std::fs::canonicalize(path).unwrap_or_else(|_| path.to_owned()), path)
     }
 
@@ -105,7 +86,7 @@ pub fn write_atomically_with(path: &Path, write: &mut dyn FnMut(&mut dyn Write) 
         return write(&mut file).map_err(|e| e.at(path.display()));
     }
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    std::fs::create_dir_all(folder).map_err(|e| place(e, "the folder cannot be made"))?;
+    std::fs::create_dir_all(folder).map_err(|e| place(e, "the folder cannot be created"))?;
     if path.is_dir() {
         return Err(failed(std::io::ErrorKind::IsADirectory.into()));
     }
@@ -118,71 +99,9 @@ pub fn write_atomically_with(path: &Path, write: &mut dyn FnMut(&mut dyn Write) 
     staged.keep()
 }
 
-/// `.NAME.MACHINE-PROCESS-NUMBER.splat4d-tmp`, of a long name only the beginning.
-fn temporary_name(name: &OsStr) -> OsString {
-    let own = format!("{}-{}-{}", machine(), std::process::id(), NUMBER.fetch_add(1, Ordering::Relaxed));
-    let mut out = OsString::from(".");
-    if name.len() <= NAME_BYTES {
-        out.push(name);
-    } else {
-        out.push(name.to_string_lossy().chars().take(NAME_BYTES / 4).collect::<String>());
-    }
-    out.push(format!(".{own}{ENDING}"));
-    out
-}
-
-/// Whether this is the temporary name of a file that nobody writes any more.
-fn is_left_over(path: &Path) -> bool {
-    let Some(name) = path.file_name().map(OsStr::to_string_lossy) else { return false };
-    let Some(name) = name.strip_prefix('.').and_then(|n| n.strip_suffix(ENDING)) else { return false };
-    let mut parts = name.rsplit('.').next().unwrap_or_default().split('-');
-    let (Some(of), Some(Ok(process))) = (parts.next(), parts.next().map(str::parse::<u32>)) else { return false };
-    // Of a process of this machine, as long as that runs, it is known; of others the time tells.
-    let procs = Path::new("/proc/self").exists();
-    if of == machine() && procs {
-        return process != std::process::id() && !Path::new(&format!("/proc/{process}")).exists();
-    }
-    let written = std::fs::symlink_metadata(path).and_then(|m| m.modified());
-    written.is_ok_and(|at| at.elapsed().is_ok_and(|age| age > LEFT_OVER))
-}
-
-/// Removes what dead processes left half-written in a folder and in those that its list names.
-pub(super) fn remove_leftovers(folder: &Path) {
-    for folder in list::folders(folder) {
-        for path in std::fs::read_dir(folder).into_iter().flatten().flatten().map(|e| e.path()) {
-            if is_left_over(&path) {
-                let _ = std::fs::remove_file(path);
-            }
-        }
-    }
-}
-
-/// The same for the folder of a file whose folder is not owned: once for each process.
-fn remove_leftovers_once(file: &Path) {
-    let folder = file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    if LOOKED.lock().unwrap_or_else(|e| e.into_inner()).insert(folder.to_owned()) {
-        remove_leftovers(folder);
-    }
-}
-
-/// Whether this is a name that [`Staged`] makes up.
-pub(super) fn is_temporary(name: &OsStr) -> bool {
-    name.as_encoded_bytes().ends_with(ENDING.as_bytes())
-}
-
-/// Tells processes of this machine, as long as it runs, from those of others: Linux' boot id and space of process numbers.
-fn machine() -> String {
-    const OFFSET: u64 = 0xcbf2_9ce4_8422_2325;
-    const PRIME: u64 = 0x0000_0100_0000_01b3;
-    let boot = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
-    let space = std::fs::read_link("/proc/self/ns/pid").unwrap_or_default();
-    let text = format!("{boot}{}", space.display());
-    let print = text.bytes().fold(OFFSET, |h, b| (h ^ u64::from(b)).wrapping_mul(PRIME));
-    format!("{:08x}", print >> 32)
-}
-
 #[cfg(test)]
 mod tests {
+    use super::super::temporary::{ENDING, machine};
     use super::*;
     use std::fs::File;
     use std::time::SystemTime;
@@ -229,6 +148,7 @@ mod tests {
     #[cfg(unix)]
     #[test]
     fn names_that_are_not_text_are_written() {
+        use std::ffi::OsStr;
         use std::os::unix::ffi::OsStrExt;
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join(OsStr::from_bytes(b"sc\xffne.ply"));

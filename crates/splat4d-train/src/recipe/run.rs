@@ -1,7 +1,7 @@
 //! The settings of a run as a whole.
 
-use super::Replans;
 use crate::settings::{Value, among, settings};
+use crate::step::replans::Replans;
 use splat4d::motion::MODELS;
 
 settings! {
@@ -41,7 +41,7 @@ impl MotionName {
     /// The choice that is left to the capture.
     pub const AUTO: Self = Self(AUTO);
 
-    /// The model with this name. Panics: there is none.
+    /// The model with this name, built-in or registered. Panics: there is none.
     pub fn of(name: &str) -> Self {
         Self::find(name).unwrap_or_else(|| panic!("there is no motion model `{name}`"))
     }
@@ -57,7 +57,8 @@ impl MotionName {
     }
 
     fn find(name: &str) -> Option<Self> {
-        Self::choices().into_iter().find(|known| *known == name).map(Self)
+        let built_in = Self::choices().into_iter().find(|known| *known == name);
+        built_in.or_else(|| crate::methods::own::name(name)).map(Self)
     }
 }
 

@@ -1,21 +1,22 @@
 use super::flat::FLAT;
 use super::*;
+use crate::step::replans::Replan;
 
 /// A recipe from before there were tables: all defaults, in order.
 const FLAT_DEFAULTS: &str = include_str!("tests/flat-defaults.toml");
 /// A resolved one with many knobs changed.
 const FLAT_CHANGED: &str = include_str!("tests/flat-changed.toml");
 
-/// The default recipe of then: its number of Gaussians did not follow from the capture, nor the rates of positions from it.
+/// The default recipe of then: its number of Gaussians did not follow from the capture, nor anything else from that.
 fn default_of_then() -> Recipe {
     Recipe::default().with(|r| {
-        r.densify.max_cap = 30_000;
+        (r.densify.max_cap, r.init.count, r.adc.percent_dense) = (30_000, 10_000, 0.01);
         (r.rates.position_init, r.rates.position_final) = (2e-3, 5e-5);
     })
 }
 
 #[test]
-fn every_knob_of_flat_recipes_is_still_there_with_its_default() {
+fn every_setting_of_flat_recipes_exists_with_its_default() {
     assert_eq!(FLAT_DEFAULTS.lines().count(), FLAT.len());
     assert_eq!(Recipe::from_toml(FLAT_DEFAULTS).unwrap(), default_of_then());
     for (line, (flat, key)) in FLAT_DEFAULTS.lines().zip(FLAT) {
@@ -25,7 +26,7 @@ fn every_knob_of_flat_recipes_is_still_there_with_its_default() {
 }
 
 #[test]
-fn flat_text_is_what_it_was_byte_for_byte() {
+fn flat_recipes_are_unchanged_byte_for_byte() {
     assert_eq!(default_of_then().flat_toml(), FLAT_DEFAULTS);
     let changed = Recipe::from_toml(FLAT_CHANGED).unwrap();
     assert_eq!(changed.flat_toml(), FLAT_CHANGED);
@@ -64,7 +65,7 @@ fn numbers_may_be_written_as_people_write_them() {
 }
 
 #[test]
-fn unknown_knobs_get_a_suggestion_and_wrong_values_a_reason() {
+fn unknown_settings_get_a_suggestion_and_wrong_values_a_reason() {
     let mut r = Recipe::default();
     let error = |r: &mut Recipe, s: &str| r.set(s).unwrap_err().to_string();
     assert!(error(&mut r, "iteration=3").contains("`iterations`"));
@@ -84,7 +85,7 @@ fn unknown_knobs_get_a_suggestion_and_wrong_values_a_reason() {
 }
 
 #[test]
-fn resolve_leaves_nothing_open_and_every_knob_is_documented() {
+fn resolve_sets_everything_and_every_setting_is_documented() {
     let r = Recipe::default().with(|r| r.run.iterations = 1000).resolve();
     assert_eq!((r.densify.from, r.densify.until, r.run.checkpoint_interval), (50, 750, 100));
     assert_eq!(r.resolve(), r);
@@ -120,7 +121,7 @@ fn words_come_back_and_wrong_ones_get_a_suggestion() {
 }
 
 #[test]
-fn conditions_name_knobs_and_defaults_are_never_idle() {
+fn conditions_name_settings_and_defaults_have_effect() {
     let recipe = Recipe::default();
     for (name, table) in recipe.tables() {
         let mut keys = table.when().keys();
@@ -137,7 +138,7 @@ fn conditions_name_knobs_and_defaults_are_never_idle() {
 }
 
 #[test]
-fn knobs_without_effect_are_found_with_what_they_need() {
+fn settings_without_effect_are_found_with_their_condition() {
     let idle = |sets: &[&str]| -> Vec<(String, bool, String)> {
         Recipe::of(sets).unwrap().without_effect().into_iter().map(|i| (i.key, i.off, i.needs)).collect()
     };

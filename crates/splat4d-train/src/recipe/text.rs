@@ -11,7 +11,7 @@ impl Recipe {
     pub fn from_toml(text: &str) -> Result<Self> {
         let file: toml::Table = toml::from_str(text).map_err(|e| {
             Error::input(format!("the recipe is not valid TOML: {}", e.message()))
-                .remedy("Write lines such as `iterations = 3000`; `splat4d train --help-knobs` lists the knobs")
+                .remedy("Write lines such as `iterations = 3000`; `splat4d train --help-knobs` lists the settings")
         })?;
         let mut recipe = Self::default();
         for (key, value) in &file {
@@ -35,7 +35,7 @@ impl Recipe {
             }
             text += &format!("[{name}]\n");
             for knob in table.knobs(name) {
-                text += &line(knob.field, &table.get(knob.field).expect("a knob has a value"));
+                text += &line(knob.field, &table.get(knob.field).expect("a setting has a value"));
             }
         }
         text
@@ -96,7 +96,7 @@ impl Recipe {
         let follows = Self::default().with(|r| r.run.iterations = self.run.iterations).resolve();
         let mut out = Vec::new();
         for key in Self::knobs().iter().map(Knob::key) {
-            let value = self.get(&key).expect("it is a knob");
+            let value = self.get(&key).expect("it is a setting");
             let follows = key != "run.iterations" && follows.get(&key).as_ref() == Some(&value);
             if defaults.get(&key).as_ref() != Some(&value) && !follows {
                 out.push((key, value));
@@ -107,7 +107,7 @@ impl Recipe {
 
     /// Knobs that were chosen and do nothing in this recipe.
     pub fn without_effect(&self) -> Vec<Idle> {
-        let get = |key: &str| self.get(key).expect("conditions name knobs");
+        let get = |key: &str| self.get(key).expect("conditions name settings");
         let chosen: Vec<String> = self.choices().into_iter().map(|(key, _)| key).collect();
         let mut out = Vec::new();
         for (name, table) in self.tables() {
@@ -144,7 +144,7 @@ impl Recipe {
         for (name, table) in self.tables() {
             table.check().map_err(|(field, need)| {
                 let key = format!("{name}.{field}");
-                let value = table.get(field).expect("a knob has a value");
+                let value = table.get(field).expect("a setting has a value");
                 wrong(&key, &value, &need)
             })?;
         }
@@ -155,11 +155,11 @@ impl Recipe {
     /// runs of then go on. Knobs that came later count where they are not at their default.
     pub fn flat_toml(&self) -> String {
         let mut text: String =
-            FLAT.iter().map(|(flat, key)| line(flat, &self.get(key).expect("FLAT names knobs"))).collect();
+            FLAT.iter().map(|(flat, key)| line(flat, &self.get(key).expect("FLAT names settings"))).collect();
         let defaults = Self::default();
         for key in Self::knobs().iter().map(Knob::key).filter(|key| FLAT.iter().all(|(_, k)| k != key)) {
             if self.get(&key) != defaults.get(&key) {
-                text += &line(&format!("\"{key}\""), &self.get(&key).expect("it is a knob"));
+                text += &line(&format!("\"{key}\""), &self.get(&key).expect("it is a setting"));
             }
         }
         text
@@ -207,7 +207,7 @@ impl std::fmt::Display for Idle {
 fn line(key: &str, value: &toml::Value) -> String {
     let mut table = toml::Table::new();
     table.insert("v".into(), value.clone());
-    let text = toml::to_string(&table).expect("knobs are plain numbers, flags and strings");
+    let text = toml::to_string(&table).expect("settings are plain numbers, flags and strings");
     format!("{key}{}", &text[1..])
 }
 

@@ -6,7 +6,7 @@
 
 use super::minutes::Timing;
 use crate::methods::Stage;
-use crate::recipe::Replan;
+use crate::step::replans::Replan;
 use crate::step::trainer::{Position, Trainer};
 use serde::{Deserialize, Serialize};
 
@@ -178,7 +178,7 @@ mod tests {
             })
             .resolve();
         let half_size_steps = STEPS * 2 / 5;
-        let stages = [Stage { upkeep: upkeep::of(&r), half_size_steps, ..Stage::new("all", STEPS) }];
+        let stages = [Stage { upkeep: r.plan().common.upkeep(), half_size_steps, ..Stage::new("all", STEPS) }];
         let timing = timing([START, CAP], [0.004, 0.012], [0.009, 0.025]);
         // What was planned is what fits.
         let planned = timing.rest(&stages, [0, 0], START, CAP) + FINISH * timing.last(&stages, CAP);

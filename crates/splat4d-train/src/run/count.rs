@@ -9,6 +9,7 @@ use super::open::OpenCapture;
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};
 use crate::event::Event;
+use crate::methods::still;
 use crate::recipe::Recipe;
 use crate::upkeep::LEAST;
 use std::collections::BTreeSet;
@@ -17,6 +18,10 @@ use std::collections::BTreeSet;
 /// four times the pixels of our copy of it, where 150,000 and 300,000 end 1.5 dB above 30,000 after the same processor time
 /// (studies/records/2026-11-26-real-size.md).
 const PIXELS: f64 = 350.0;
+/// The same for a static scene, whose Gaussians cost less to train. Source: a walk with 17 megapixels in four minutes ends at
+/// 22.5 dB (SSIM 0.728) with one for 350 pixels and at 23.0 dB (0.762) with one for 120
+/// (studies/records/2026-11-27-real-size.md).
+const PIXELS_STATIC: f64 = 120.0;
 /// Gaussians that one step can settle. Source: the same room in 480 processor seconds: 32 a step end at 27.58 dB (SSIM 0.843),
 /// 100 a step at 27.67 dB (0.849), 4 a step at 26.08 dB (0.788).
 const BY_STEP: f64 = 45.0;
@@ -35,11 +40,11 @@ impl OpenCapture {
         let views = self.distinct_views();
         let share = self.foreground()?;
         let pixels = share * views.iter().map(|&i| self.pixels(i)).sum::<f64>();
-        let scale = recipe.densify.count_scale;
-        let count = number(pixels, steps, scale);
+        let (needed, scale) = (pixels / each(recipe), recipe.densify.count_scale);
+        let count = number(needed, steps, scale);
         let of = if share < 1.0 { " of the object" } else { "" };
         let mut why = format!("{} distinct views show {:.1} megapixels{of}", views.len(), pixels / 1e6);
-        if count < number(pixels, f64::INFINITY, scale) {
+        if count < number(needed, f64::INFINITY, scale) {
             why += &format!(", and {steps} steps can train no more");
         }
         let limit = match recipe.run.memory_limit {
@@ -120,10 +125,14 @@ pub(super) fn settled(most: usize, scale: f64, steps: impl Fn(usize) -> Result<u
     Ok(rounded(low as f64))
 }
 
-/// The number of Gaussians for pixels of distinct views and steps.
-fn number(pixels: f64, steps: f64, scale: f64) -> usize {
-    let needed = (scale * pixels / PIXELS).min(BY_STEP * steps);
-    rounded(needed).max(fewest(scale))
+/// Pixels of distinct views for one Gaussian.
+fn each(recipe: &Recipe) -> f64 {
+    if recipe.run.motion == still::NAME { PIXELS_STATIC } else { PIXELS }
+}
+
+/// The number of Gaussians for those that distinct views need, and steps.
+fn number(needed: f64, steps: f64, scale: f64) -> usize {
+    rounded((scale * needed).min(BY_STEP * steps)).max(fewest(scale))
 }
 
 /// The fewest that a capture's number becomes without want of memory.
@@ -144,7 +153,7 @@ mod tests {
     #[test]
     fn the_number_follows_pixels_steps_and_scale() {
         // Fourteen cameras of 400x300; a room of 256 photos of 800x533; a walk of 600 photos of 4 megapixels.
-        let (toy, room, walk) = (14.0 * 120e3, 256.0 * 426.4e3, 600.0 * 4e6);
+        let [toy, room, walk] = [14.0 * 120e3, 256.0 * 426.4e3, 600.0 * 4e6].map(|pixels| pixels / PIXELS);
         assert_eq!(number(toy, 7000.0, 1.0), LEAST);
         assert_eq!(number(toy, 100.0, 1.0), LEAST, "few steps are no reason for fewer");
         assert_eq!(number(toy, 7000.0, 0.5), LEAST / 2);
@@ -152,6 +161,9 @@ mod tests {
         assert_eq!(number(room, 1000.0, 1.0), 45_000);
         assert_eq!(number(walk, 7000.0, 1.0), 315_000);
         assert_eq!(number(walk, 20_000.0, 2.0), 900_000);
+        // 132 frames of 480x270: the walk that stands still, and one in which something moves.
+        let of = |motion: &str| number(132.0 * 129.6e3 / each(&recipe(&[&format!("motion={motion}")])), 7000.0, 1.0);
+        assert_eq!([of("still"), of("spacetime")], [142_000, 48_000]);
     }
 
     #[test]

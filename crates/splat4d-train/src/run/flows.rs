@@ -39,7 +39,7 @@ pub(super) fn complete(
         // Of most pictures the pyramid is needed twice: as where flow comes from and where it goes.
         let mut last: Option<(usize, Pyramid)> = None;
         for (done, (frame, file)) in wanted.iter().enumerate() {
-            progress.phase("flow from pictures", done, wanted.len());
+            progress.phase("flow from images", done, wanted.len());
             let from = match last.take().filter(|(i, _)| i == frame) {
                 Some((_, pyramid)) => pyramid,
                 None => pyramid(&opened, *frame)?,
@@ -49,7 +49,7 @@ pub(super) fn complete(
             let picture = flow_picture(&dense(&from, &to));
             picture
                 .write_to(&mut bytes, image::ImageFormat::Png)
-                .map_err(|e| Error::input(format!("the flow picture cannot be made: {e}")).at(file.path.display()))?;
+                .map_err(|e| Error::input(format!("the flow image cannot be made: {e}")).at(file.path.display()))?;
             write_atomically(&file.path, &bytes.into_inner())?;
             last = Some((file.to, to));
         }
@@ -87,7 +87,7 @@ fn wanted(capture: &Capture, recipe: &Recipe, run: &Path) -> Vec<(usize, FlowFil
 }
 
 fn pyramid(opened: &OpenCapture, frame: usize) -> Result<Pyramid> {
-    let place = opened.capture.train.binary_search(&frame).expect("flow is between training pictures");
+    let place = opened.capture.train.binary_search(&frame).expect("flow is between training images");
     let mut picture = Picture::default();
     opened.frames.load(place, &mut picture)?;
     Ok(Pyramid::new(grey(&picture.color)))

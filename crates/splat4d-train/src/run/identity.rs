@@ -2,7 +2,8 @@
 
 use super::checkpoint::Identity;
 use crate::capture::Capture;
-use crate::recipe::{Recipe, Replans};
+use crate::recipe::Recipe;
+use crate::step::replans::Replans;
 
 /// The mark of a run: its capture, its recipe and, where there is more to say, `text`.
 pub(super) fn identity(capture: &Capture, recipe: &Recipe, text: &str) -> Identity {

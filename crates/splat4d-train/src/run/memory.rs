@@ -3,7 +3,7 @@
 
 use crate::Result;
 use crate::capture::Capture;
-use crate::methods::{Plan, Program, program_of};
+use crate::methods::{Plan, Program};
 use crate::recipe::Recipe;
 use splat4d::math::Rng;
 use splat4d::motion::Motion;
@@ -55,17 +55,17 @@ pub fn memory_estimate(capture: &Capture, recipe: &Recipe) -> u64 {
     }
     let plan = super::open::plan(capture, recipe);
     // A recipe that no model can be made of has an error of its own.
-    sum + model(&plan, recipe.densify.max_cap).unwrap_or(0)
+    sum + model(recipe, &plan, recipe.densify.max_cap).unwrap_or(0)
 }
 
 /// Bytes of a model's tables in training, and of what a step with it needs, at `rows` Gaussians.
-fn model(plan: &Plan, rows: usize) -> Result<u64> {
-    let program = program_of(&plan.recipe)?;
+fn model(recipe: &Recipe, plan: &Plan, rows: usize) -> Result<u64> {
+    let program = recipe.program()?;
     let few = Few::new(program.as_ref(), plan, rows)?;
     let tables = few.tables(rows);
     let checkpoint = tables * CHECKPOINT[0] / CHECKPOINT[1];
     let question = rows as u64 * ANSWER * F32 + few.motion.scratch_bytes(&few.params, rows);
-    Ok(tables + checkpoint + program.growth_bytes(plan, rows) + plan.recipe.run.batch_size as u64 * question)
+    Ok(tables + checkpoint + program.growth_bytes(plan, rows) + plan.batch_size as u64 * question)
 }
 
 /// A program's model on few rows: as many as it needs for its nodes.
@@ -79,7 +79,7 @@ struct Few {
 impl Few {
     fn new(program: &dyn Program, plan: &Plan, rows: usize) -> Result<Self> {
         let nodes = program.nodes(plan).min(rows);
-        let (few, coefficients) = (FEW.max(nodes), (plan.recipe.appearance.sh_degree + 1).pow(2));
+        let (few, coefficients) = (FEW.max(nodes), (plan.common.appearance.sh_degree + 1).pow(2));
         let mut params = Params::<f32>::new(few, coefficients, program.life(plan).columns());
         let rng = Rng::new(0, "memory", 0);
         for row in 0..few {
@@ -150,12 +150,12 @@ mod tests {
             let r = recipe(&line.split(' ').chain(["num_pts=4096", "max_cap=4096"]).collect::<Vec<_>>()).resolve();
             let opened = super::super::open::OpenCapture::new(place.open(&r), &r).unwrap();
             let plan = opened.plan(&r);
-            let trainer = opened.trainer(&plan, opened.initial_scene(&plan).unwrap()).unwrap();
+            let trainer = opened.trainer(&r, &plan, opened.initial_scene(&r, &plan).unwrap()).unwrap();
             let p = &trainer.scene().layers[0].params;
             let values: usize = p.keys().map(|k| size_of_val(p[k].data())).sum();
             let counted = values + splat4d::scene::Grads::new(p).bytes() + trainer.learner.moments()[0].bytes();
             let rows = trainer.scene().len();
-            let few = Few::new(program_of(&r).unwrap().as_ref(), &plan, rows).unwrap();
+            let few = Few::new(r.program().unwrap().as_ref(), &plan, rows).unwrap();
             let estimated = few.tables(rows) as f64;
             let off = counted as f64 / estimated;
             assert!((1.0 / ROUNDED..ROUNDED).contains(&off), "{line}: {counted} bytes, estimated {estimated}");

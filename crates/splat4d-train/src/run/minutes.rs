@@ -5,7 +5,7 @@
 use super::clock::Stopwatch;
 use super::open::OpenCapture;
 use crate::event::{Event, Progress};
-use crate::methods::{Stage, program_of, stages};
+use crate::methods::{Stage, stages};
 use crate::recipe::Recipe;
 use crate::step::engine::Blame;
 use crate::step::trainer::{Fault, Trainer};
@@ -73,9 +73,12 @@ impl Timing {
         };
         tell(listen, 0);
         // A filter would be switched on later than the probes look.
-        let plan = opened.plan(&recipe.unresolved().with(|r| r.filter.start = 0.0));
+        // The number of Gaussians may become smaller, and the initial one with it: the fewest are timed.
+        let least = recipe.clone().with(|r| r.densify.max_cap = 0).initial_count();
+        let recipe = recipe.unresolved().with(|r| (r.filter.start, r.init.count) = (0.0, least));
+        let plan = opened.plan(&recipe);
         let began = clock.seconds();
-        let scene = opened.initial_scene(&plan)?;
+        let scene = opened.initial_scene(&recipe, &plan)?;
         let first = clock.seconds() - began;
         // The scene is not made faster because steps are to be timed.
         let began = clock.seconds();
@@ -84,11 +87,11 @@ impl Timing {
         // Copies of initial Gaussians would cost far more than trained ones, which are small: the probe grows by the
         // recipe's own strategy, in a hurry. A probe's rates do not matter, its number of Gaussians does: nothing of it is
         // kept.
-        let mut probe = Probe { trainer: opened.trainer(&plan, scene.clone())?, clock };
+        let mut probe = Probe { trainer: opened.trainer(&recipe, &plan, scene.clone())?, clock };
         probe.trainer.check_not_empty()?;
         let few = probe.rates(until(PARTS[0]))?;
         tell(listen, 1);
-        let mut probe = Probe { trainer: opened.trainer(&plan, scene)?, clock };
+        let mut probe = Probe { trainer: opened.trainer(&recipe, &plan, scene)?, clock };
         probe.densify(Every { first: HURRIED, last: usize::MAX, interval: HURRIED });
         probe.trainer.stages.iter_mut().for_each(|s| s.half_size_steps = usize::MAX);
         probe.trainer.stages[0].iterations = ENDLESS;
@@ -128,8 +131,9 @@ impl Timing {
     /// Seconds of a whole recipe's steps, and of a step at its end.
     pub(super) fn of(&self, opened: &OpenCapture, recipe: &Recipe) -> Result<[f64; 2]> {
         let r = recipe.resolve();
-        let stages = stages(program_of(&r)?.as_ref(), &opened.plan(&r));
-        let (start, cap) = (self.stages[0].gaussians[0], r.densify.max_cap);
+        let stages = stages(r.program()?.as_ref(), &opened.plan(&r));
+        let (timed, cap) = (self.stages[0].gaussians[0], r.densify.max_cap);
+        let start = if recipe.init.count == 0 { timed.max(r.initial_count()).min(cap) } else { timed };
         Ok([self.rest(&stages, [0, 0], start, cap), self.last(&stages, cap)])
     }
 
@@ -224,7 +228,6 @@ impl Probe<'_> {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use crate::upkeep;
 
     /// Of steps that take so long [half size, full size] with either number of Gaussians, in every stage.
     pub(crate) fn timing(gaussians: [usize; 2], few: [f64; 2], many: [f64; 2]) -> Timing {
@@ -239,7 +242,7 @@ pub(super) mod tests {
         let (place, recipe) = (Place::new(), recipe(&["motion=spacetime"]).resolve());
         let opened = OpenCapture::new(place.open(&recipe), &recipe).unwrap();
         let plan = opened.plan(&recipe);
-        let mut trainer = opened.trainer(&plan, opened.initial_scene(&plan).unwrap()).unwrap();
+        let mut trainer = opened.trainer(&recipe, &plan, opened.initial_scene(&recipe, &plan).unwrap()).unwrap();
         trainer.set_engine(crate::step::resident::DeviceEngine::new(device));
         let mut probe = Probe { trainer, clock: &Stopwatch::start() };
         for step in 1..8 {
@@ -247,6 +250,21 @@ pub(super) mod tests {
             assert!(probe.trainer.progress.iteration >= step);
         }
         assert!(probe.trainer.settle().is_ok(), "the CPU has all there is");
+    }
+
+    /// Steps are timed with the fewest initial Gaussians; the run begins with those that its cap brings.
+    #[test]
+    fn the_cost_begins_with_the_initial_gaussians_of_the_cap() {
+        use crate::run::tests::{Place, recipe};
+        let place = Place::new();
+        let cost = |count: &str| {
+            let r = recipe(&["motion=still", "densify.max_cap=90000", "half_size_until=0", "iterations=100", count]);
+            let opened = OpenCapture::new(place.open(&r), &r).unwrap();
+            timing([1000, 91_000], [0.01; 2], [0.1; 2]).of(&opened, &r).unwrap()[0]
+        };
+        let (stated, chosen) = (cost("init.count=1000"), cost("init.count=0"));
+        // Nothing grows in the first steps: ten milliseconds each, or, with 30,000 Gaussians, 39.
+        assert!(stated < 10.0 && chosen > stated + 5.0 * 0.029, "{stated} {chosen}");
     }
 
     #[test]
@@ -258,7 +276,7 @@ pub(super) mod tests {
                 r.densify.max_cap = 2000;
             })
             .resolve();
-        let mut stage = Stage { upkeep: upkeep::of(&r), ..Stage::new("all", 1000) };
+        let mut stage = Stage { upkeep: r.plan().common.upkeep(), ..Stage::new("all", 1000) };
         let cost = |stages: &[Stage], t: Timing| t.rest(stages, [0, 0], 1000, r.densify.max_cap);
         let flat = cost(std::slice::from_ref(&stage), timing([1000, 1000], [0.01; 2], [0.01; 2]));
         assert!((flat - 10.0).abs() < 1e-9);

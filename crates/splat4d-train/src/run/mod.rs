@@ -9,6 +9,7 @@ mod count;
 pub mod dataset;
 mod flows;
 mod identity;
+mod info;
 mod memory;
 mod metrics;
 mod minutes;

@@ -8,7 +8,7 @@ use crate::event::Event;
 use crate::init::{self, Seeds, Source};
 use crate::learner::{Corrections, Exposure, Origin, RefineSettings, Scale};
 use crate::loss::image::terms;
-use crate::methods::{Plan, Program, Stage, auto, program_of, stages};
+use crate::methods::{Plan, Program, Stage, auto, stages};
 use crate::recipe::{MotionName, Recipe};
 use crate::step::emphasis::Emphasis;
 use crate::step::loss::TrainLoss;
@@ -103,9 +103,9 @@ pub(super) fn check_flow(capture: &Capture, recipe: &Recipe) -> Result<()> {
     if recipe.loss.flow == 0.0 || own || capture.train.iter().any(|&i| capture.frames[i].flow.is_some()) {
         return Ok(());
     }
-    Err(Error::input("lambda_flow compares flow, and the capture's training pictures have none").remedy(
-        "Give cameras a `flow` in capture.json (docs/capture-format.md), follow the pictures with --set \
-             capture.flow=own, or leave lambda_flow at 0",
+    Err(Error::input("lambda_flow compares flow, and the capture's training images have none").remedy(
+        "Give cameras a `flow` in capture.json (docs/capture-format.md), compute it from the images with --set \
+         capture.flow=own, or leave lambda_flow at 0",
     ))
 }
 
@@ -146,7 +146,6 @@ pub fn plan(capture: &Capture, recipe: &Recipe) -> Plan {
     // Cameras that all stand in one place say nothing of the scene's size.
     let (center, radius) = capture.center_and_radius();
     Plan {
-        recipe: recipe.resolve(),
         extent: if radius > SINGLE_PLACE { radius } else { 1.0 },
         center,
         clip,
@@ -155,6 +154,7 @@ pub fn plan(capture: &Capture, recipe: &Recipe) -> Plan {
         fixed_cameras: rigs.len(),
         moments,
         masks: capture.background.is_some() || capture.train.iter().any(|&i| capture.frames[i].mask.is_some()),
+        ..recipe.plan()
     }
 }
 
@@ -215,7 +215,7 @@ impl OpenCapture {
     /// The recipe with a motion model that suits the capture, and why it is that one.
     pub(super) fn chosen(&self, recipe: Recipe, listen: &mut dyn FnMut(&Event)) -> Result<(Recipe, auto::Choice)> {
         listen(&Event::Phase { name: "looking at the capture".into(), done: 0, total: 0 });
-        let choice = auto::choose(&self.plan(&recipe), self.frames.as_ref())?;
+        let choice = auto::choose(&self.plan(&recipe), recipe.programs(), self.frames.as_ref())?;
         Ok((recipe.with(|r| r.run.motion = MotionName::of(choice.motion)), choice))
     }
 
@@ -228,28 +228,29 @@ impl OpenCapture {
         }
     }
 
-    pub(crate) fn initial_scene(&self, plan: &Plan) -> Result<Scene<f32>> {
-        let seeds = self.seeds(plan)?;
-        self.scene(plan, program_of(&plan.recipe)?.as_ref(), &seeds, self.background()?)
+    pub(crate) fn initial_scene(&self, recipe: &Recipe, plan: &Plan) -> Result<Scene<f32>> {
+        let seeds = self.seeds(recipe, plan)?;
+        self.scene(recipe, plan, recipe.program()?.as_ref(), &seeds, self.background()?)
     }
 
     /// The capture's scene with Gaussians at these seeds.
     pub(super) fn scene(
         &self,
+        recipe: &Recipe,
         plan: &Plan,
         program: &dyn Program,
         seeds: &Seeds,
         background: [f32; 3],
     ) -> Result<Scene<f32>> {
-        let scene = init::scene(plan, program, seeds, background, self.capture.up)?;
+        let scene = init::scene(plan, &recipe.init, program, seeds, background, self.capture.up)?;
         Ok(Scene { offset: self.capture.offset, ..scene })
     }
 
     /// Where the first Gaussians of a plan are.
-    pub(super) fn seeds(&self, plan: &Plan) -> Result<Seeds> {
-        let program = program_of(&plan.recipe)?;
+    pub(super) fn seeds(&self, recipe: &Recipe, plan: &Plan) -> Result<Seeds> {
+        let program = recipe.program()?;
         let moving = program.capabilities(plan).moves && plan.times > 1;
-        let points = if let Source::File(path) = &plan.recipe.init.source {
+        let points = if let Source::File(path) = &recipe.init.source {
             let mut cloud = crate::capture::read_points(path)?;
             cloud.subtract(self.capture.offset);
             Some(Seeds::of(&cloud))
@@ -258,14 +259,14 @@ impl OpenCapture {
         };
         let (first, frames) = (program.first(plan), self.frames.as_ref());
         match moving && program.one_moment(plan) {
-            true => init::one_moment(&first, frames, points),
-            false => init::seeds(&first, frames, points, moving),
+            true => init::one_moment(&first, &recipe.initial(), frames, points),
+            false => init::seeds(&first, &recipe.initial(), frames, points, moving),
         }
     }
 
     /// What is to be learnt of cameras, where the recipe wants it.
-    fn corrections(&self, plan: &Plan) -> Option<Corrections> {
-        let settings = learnable(&plan.recipe);
+    fn corrections(&self, recipe: &Recipe, plan: &Plan) -> Option<Corrections> {
+        let settings = learnable(recipe);
         if !settings.poses && !settings.focal && !settings.times {
             return None;
         }
@@ -277,21 +278,27 @@ impl OpenCapture {
         Some(Corrections::new(&settings, scale(plan), &frames, self.capture.cameras.len(), true))
     }
 
-    pub(crate) fn trainer(&self, plan: &Plan, scene: Scene<f32>) -> Result<Trainer<'static>> {
-        let program = program_of(&plan.recipe)?;
-        let mut trainer = self.trainer_of(plan, scene, stages(program.as_ref(), plan));
-        trainer.replan(plan.recipe.run.replans.rows());
+    pub(crate) fn trainer(&self, recipe: &Recipe, plan: &Plan, scene: Scene<f32>) -> Result<Trainer<'static>> {
+        let program = recipe.program()?;
+        let mut trainer = self.trainer_of(recipe, plan, scene, stages(program.as_ref(), plan));
+        trainer.replan(recipe.run.replans.rows());
         // What a still scene cannot show must not draw it away from what it can.
-        let strength = if program.capabilities(plan).moves { plan.recipe.loss.moving } else { 0.0 };
+        let strength = if program.capabilities(plan).moves { plan.common.loss.moving } else { 0.0 };
         trainer.emphasise(Emphasis::new(self.frames.as_ref(), strength)?);
         Ok(trainer)
     }
 
     /// A trainer with stages that no program made.
-    pub(crate) fn trainer_of(&self, plan: &Plan, scene: Scene<f32>, stages: Vec<Stage>) -> Trainer<'static> {
-        let r = &plan.recipe;
+    pub(crate) fn trainer_of(
+        &self,
+        recipe: &Recipe,
+        plan: &Plan,
+        scene: Scene<f32>,
+        stages: Vec<Stage>,
+    ) -> Trainer<'static> {
+        let c = &plan.common;
         let config = RenderConfig {
-            antialias: if r.appearance.antialias { Antialias::On } else { Antialias::Off },
+            antialias: if c.appearance.antialias { Antialias::On } else { Antialias::Off },
             simd: self.simd,
             ..RenderConfig::default()
         };
@@ -299,25 +306,25 @@ impl OpenCapture {
         trained.sort_unstable();
         // Cameras of a rig have colours of their own, and one picture of each tells them. Photos of one camera differ where it
         // chose its exposure, which goes with the place and is then the scene's (docs/suite.md).
-        let pictures = if self.capture.named || r.appearance.exposure_single { 1 } else { 2 };
+        let pictures = if self.capture.named || c.appearance.exposure_single { 1 } else { 2 };
         let trained: Vec<usize> =
             trained.chunk_by(|a, b| a == b).filter(|c| c.len() >= pictures).map(|c| c[0]).collect();
         // A single camera's matrix is its own mean, which stays the identity.
         let exposure =
-            (r.appearance.exposure && trained.len() > 1).then(|| Exposure::new(self.capture.cameras.len(), trained));
+            (c.appearance.exposure && trained.len() > 1).then(|| Exposure::new(self.capture.cameras.len(), trained));
         let settings = Settings {
-            seed: r.run.seed,
-            limits: Limits { cap: r.densify.max_cap, extent: plan.extent, min_opacity: r.densify.min_opacity },
+            seed: plan.seed,
+            limits: Limits { cap: c.densify.max_cap, extent: plan.extent, min_opacity: c.densify.min_opacity },
             background: scene.background,
-            sh_degree: r.appearance.sh_degree,
-            exposure_lr: r.appearance.exposure_lr,
+            sh_degree: c.appearance.sh_degree,
+            exposure_lr: c.appearance.exposure_lr,
         };
-        let loss = TrainLoss::new(terms(r));
+        let loss = TrainLoss::new(terms(&c.loss));
         let drawing = device::open_to_train(self.device, config);
         let mut trainer = Trainer::new(scene, stages, self.frames.clone(), drawing.backend, loss, settings);
         trainer.device = TrainedOn { name: drawing.name, why: drawing.why, missed: drawing.fell_back };
         trainer.learner.exposure = exposure;
-        trainer.learner.corrections = self.corrections(plan);
+        trainer.learner.corrections = self.corrections(recipe, plan);
         trainer
     }
 }

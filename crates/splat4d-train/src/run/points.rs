@@ -8,7 +8,7 @@ use crate::Result;
 use crate::capture::{Capture, PointCloud, read_points};
 use crate::event::{Event, Progress};
 use crate::init::{self, Source};
-use crate::methods::{Plan, program_of};
+use crate::methods::Plan;
 use crate::recipe::Recipe;
 use crate::vision;
 use splat4d::scene::Camera;
@@ -40,8 +40,8 @@ pub(super) fn complete(
     if !wanted(capture, recipe) {
         return Ok(opened);
     }
-    let moments = moments(&plan)?;
-    let count = (WANTED * recipe.init.count as f64) as usize;
+    let moments = moments(recipe, &plan)?;
+    let count = (WANTED * recipe.initial_count() as f64) as usize;
     let mark = format!("comment of {} {} {count} {moments:?}", fingerprint(capture), env!("CARGO_PKG_VERSION"));
     let kept =
         crate::files::read(&run.join(FILE)).is_ok_and(|bytes| bytes.windows(mark.len()).any(|w| w == mark.as_bytes()));
@@ -77,7 +77,7 @@ fn wanted(capture: &Capture, recipe: &Recipe) -> bool {
         Source::Pictures => true,
         // Objects that are cut out of their background are carved from their masks; depth maps show all that there is.
         Source::Auto if capture.background.is_some() => false,
-        Source::Auto if (own.len() as f64) < FEW * recipe.init.count as f64 => true,
+        Source::Auto if (own.len() as f64) < FEW * recipe.initial_count() as f64 => true,
         Source::Auto => !capture.frames.iter().any(|f| f.depth.is_some()) && bare(capture, own) > BARE,
         _ => false,
     }
@@ -113,16 +113,16 @@ fn uncovered(camera: &Camera, points: &[[f64; 3]]) -> f64 {
 }
 
 /// The moments at which moving points are wanted.
-fn moments(plan: &Plan) -> Result<Vec<f64>> {
-    let program = program_of(&plan.recipe)?;
-    let mut first = program.first(plan);
+fn moments(recipe: &Recipe, plan: &Plan) -> Result<Vec<f64>> {
+    let program = recipe.program()?;
+    let mut settings = recipe.init.clone();
     if !program.capabilities(plan).moves || plan.times < 2 {
         return Ok(Vec::new());
     }
     if program.one_moment(plan) {
-        first.recipe.init.keyframes = 1;
+        settings.keyframes = 1;
     }
-    Ok(init::keyframes(&first))
+    Ok(init::keyframes(&program.first(plan), &settings))
 }
 
 #[cfg(test)]
@@ -139,7 +139,7 @@ mod tests {
         let train = || {
             let mut looked = false;
             let mut listen = |e: &Event| {
-                looked |= matches!(e, Event::Phase { name, .. } if name == "points from pictures");
+                looked |= matches!(e, Event::Phase { name, .. } if name == "points from images");
             };
             let options = TrainOptions::default();
             train(place.open(&recipe), recipe.clone(), &run, &options, &AtomicBool::new(false), &mut listen).unwrap();
@@ -173,7 +173,7 @@ mod tests {
     }
 
     #[test]
-    fn who_has_few_points_or_leaves_out_a_part_of_the_pictures_and_no_cut_out_object_is_looked_at() {
+    fn who_has_few_points_or_leaves_out_a_part_of_the_images_and_no_cut_out_object_is_looked_at() {
         let place = Place::new();
         let wants = |sets: &[&str], spread: &dyn Fn(&Capture) -> Vec<[f64; 3]>, background: Option<[f32; 3]>| {
             let recipe = recipe(sets);

@@ -136,8 +136,8 @@ fn flow_reads(capture: &Capture, store: &ImageStore, frame: usize) -> Result<Opt
     }
     Ok((forth > none).then(|| {
         format!(
-            "the flow of {} explains the next picture worse than no flow at all ({}): check its unit (pixels), its size \
-             and which frame it leads to",
+            "the flow of {} explains the next image worse than no flow ({}): check its unit (pixels), its size and \
+             its target frame",
             name(capture, frame),
             file.path.display()
         )
@@ -261,7 +261,7 @@ pub(super) fn after(opened: &OpenCapture, scene: &Scene<f32>, recipe: &Recipe) -
     let Some(first) = found.first() else { return Ok(Vec::new()) };
     let upside = "maps may be of another kind (depth_kind), unit (depth_scale) or frame, or simply wrong there";
     Ok(vec![format!(
-        "the scene contradicts {} of {looked} depth maps that were looked at, first of {first}: pictures were believed, and \
+        "the scene contradicts {} of {looked} checked depth maps, first that of {first}: the images were used, and \
          {upside}",
         found.len()
     )])

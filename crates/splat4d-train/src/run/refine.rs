@@ -7,14 +7,15 @@ use super::budget::Budget;
 use super::checkpoint;
 use super::dataset::Dataset;
 use super::identity::identity;
+use super::info::read_text;
 use super::memory::memory_estimate;
 use super::open::OpenCapture;
 use super::session::{Outcome, Session, TrainOptions};
-use super::start::read_text;
 use crate::event::Event;
 use crate::learner::Exposure;
 use crate::methods::Stage;
-use crate::recipe::{Recipe, Replans};
+use crate::recipe::Recipe;
+use crate::step::replans::Replans;
 use crate::{Error, Result};
 use splat4d::layers::Scene;
 use std::path::Path;
@@ -95,7 +96,7 @@ pub(crate) fn refine(
         own_loss: false,
         stop,
     };
-    let mut trainer = opened.trainer_of(&plan, job.scene, job.stages);
+    let mut trainer = opened.trainer_of(&recipe, &plan, job.scene, job.stages);
     trainer.replan(recipe.run.replans.rows());
     if job.exposure.is_some() {
         trainer.learner.exposure = job.exposure;

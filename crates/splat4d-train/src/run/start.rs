@@ -5,6 +5,7 @@ use super::checkpoint;
 use super::count::settled;
 use super::flows;
 use super::identity::identity;
+use super::info::{read_info, read_text};
 use super::memory::memory_estimate;
 use super::minutes::Timing;
 use super::open::{OpenCapture, check_flow, open_capture};
@@ -14,7 +15,6 @@ use super::session::{Outcome, Session, TrainOptions};
 use crate::capture::Capture;
 use crate::event::Event;
 use crate::init::Seeds;
-use crate::methods::program_of;
 use crate::path_text::of_text;
 use crate::recipe::Recipe;
 use crate::{Error, ErrorKind, Result};
@@ -50,7 +50,7 @@ pub fn train(
     // Before the model is chosen by what maps say; again where points have to be found first.
     let (opened, early) = priors::believed(opened, &recipe)?;
     let recipe = if recipe.run.motion.is_auto() { opened.choose(recipe, &mut listen)? } else { recipe };
-    program_of(&recipe)?.check(&opened.plan(&recipe))?;
+    recipe.program()?.check(&opened.plan(&recipe))?;
     recipe.without_effect().iter().for_each(|idle| listen(&Event::Warning { message: idle.to_string() }));
     let opened = points::complete(opened, &recipe, run, &mut listen)?;
     let opened = flows::complete(opened, &recipe, run, &mut listen)?;
@@ -84,8 +84,8 @@ pub fn train(
         .remedy("Lower max_cap or image_memory, or use --downscale 2"));
     }
     listen(&Event::Phase { name: "initial points".into(), done: 0, total: 0 });
-    let scene = opened.initial_scene(&plan)?;
-    let mut trainer = opened.trainer(&plan, scene)?;
+    let scene = opened.initial_scene(&recipe, &plan)?;
+    let mut trainer = opened.trainer(&recipe, &plan, scene)?;
     trainer.check_not_empty()?;
     options.add_loss(&mut trainer);
     let session = Session {
@@ -217,8 +217,8 @@ pub fn resume_with(
     // As it was settled at the start.
     let (opened, _) = priors::believed(opened, &recipe)?;
     let plan = opened.plan(&recipe);
-    let empty = opened.scene(&plan, program_of(&recipe)?.as_ref(), &Seeds::default(), opened.background()?)?;
-    let mut trainer = opened.trainer(&plan, empty)?;
+    let empty = opened.scene(&recipe, &plan, recipe.program()?.as_ref(), &Seeds::default(), opened.background()?)?;
+    let mut trainer = opened.trainer(&recipe, &plan, empty)?;
     options.add_loss(&mut trainer);
     let session = Session {
         run,
@@ -263,16 +263,6 @@ fn offset_of_scene(run: &Path) -> Result<Option<[f64; 3]>> {
     let finished = Some(run.join(SCENE)).filter(|path| path.is_file());
     let Some(path) = finished.or_else(|| checkpoint::list(run).pop()) else { return Ok(None) };
     let place = |e: Error| e.at(path.display());
-    let bytes = std::fs::read(&path).map_err(|e| place(Error::io("the scene cannot be read", e)))?;
+    let bytes = crate::files::read(&path)?;
     Ok(Some(splat4d::format::scene::read(&bytes).map_err(place)?.offset))
-}
-
-pub(super) fn read_info(run: &Path) -> Result<serde_json::Value> {
-    let path = run.join("run.json");
-    serde_json::from_str(&read_text(&path)?)
-        .map_err(|e| Error::input(format!("it is not JSON: {e}")).at(path.display()))
-}
-
-pub(super) fn read_text(path: &Path) -> Result<String> {
-    crate::files::read_text_with(path, "Give the folder of a run")
 }

@@ -10,8 +10,9 @@ use super::budget::Budget;
 use super::checkpoint::write_atomically;
 use super::dataset::Dataset;
 use super::identity::{identity, recipe_print};
+use super::info::read_text;
 use super::session::{MAX_STRIKES, ROLLBACK_RATE, Session, restore_newest};
-use super::start::{TRAIN, read_text};
+use super::start::TRAIN;
 use super::*;
 use crate::capture::frames::{Frames, Picture};
 use crate::capture::{Capture, ImageStore};
@@ -140,7 +141,7 @@ impl Place {
         let (run, recipe) = (self.run(name), recipe.resolve());
         let opened = OpenCapture::new(self.open(&recipe), &recipe)?;
         let plan = opened.plan(&recipe);
-        let mut trainer = opened.trainer(&plan, opened.initial_scene(&plan)?)?;
+        let mut trainer = opened.trainer(&recipe, &plan, opened.initial_scene(&recipe, &plan)?)?;
         trainer.set_engine(crate::step::resident::DeviceEngine::new(draw));
         let identity = identity(&opened.capture, &recipe, "");
         let (opened, recipe, run, made_by) = (&opened, &recipe, run.as_path(), TRAIN);
@@ -360,7 +361,7 @@ fn neither_prefetch_nor_image_memory_matters() {
     let r = plain.resolve();
     let opened = OpenCapture::new(place.open(&r), &r).unwrap();
     let plan = opened.plan(&r);
-    let mut trainer = opened.trainer(&plan, opened.initial_scene(&plan).unwrap()).unwrap();
+    let mut trainer = opened.trainer(&r, &plan, opened.initial_scene(&r, &plan).unwrap()).unwrap();
     trainer.set_frames(Arc::new(Plain(opened.frames.clone())));
     while !trainer.is_done() {
         trainer.step().unwrap().unwrap();
@@ -396,7 +397,7 @@ fn a_fault_rolls_back_with_smaller_steps_and_names_its_place() {
     // Half the rates, and they stay so in the checkpoint.
     let opened = OpenCapture::new(place.open(&recipe), &recipe).unwrap();
     let plan = opened.plan(&recipe);
-    let mut trainer = opened.trainer(&plan, opened.initial_scene(&plan).unwrap()).unwrap();
+    let mut trainer = opened.trainer(&recipe, &plan, opened.initial_scene(&recipe, &plan).unwrap()).unwrap();
     restore_newest(&place.run("once"), &mut trainer, &identity(&opened.capture, &recipe.resolve(), "")).unwrap();
     assert_eq!((trainer.progress.rate_scale, trainer.progress.strikes), (ROLLBACK_RATE, 1));
     let scene = splat4d::format::scene::read(&place.scene("once")).unwrap();
@@ -542,14 +543,14 @@ fn minutes_fix_a_recipe_that_repeats() {
 }
 
 #[test]
-fn where_no_gaussian_is_opaque_pictures_show_their_mean_colour_and_others_what_they_were_cut_out_of() {
+fn where_no_gaussian_is_opaque_images_show_their_mean_colour_and_others_what_they_were_cut_out_of() {
     let (place, recipe) = (Place::new(), recipe(&[]));
     let shown = |capture: Arc<Capture>| {
         let opened = OpenCapture::new(capture, &recipe).unwrap();
         let plan = opened.plan(&recipe);
-        let scene = opened.initial_scene(&plan).unwrap();
+        let scene = opened.initial_scene(&recipe, &plan).unwrap();
         let background = scene.background;
-        assert_eq!(opened.trainer(&plan, scene).unwrap().settings.background, background);
+        assert_eq!(opened.trainer(&recipe, &plan, scene).unwrap().settings.background, background);
         background
     };
     let capture = place.open(&recipe);
@@ -569,15 +570,15 @@ fn where_no_gaussian_is_opaque_pictures_show_their_mean_colour_and_others_what_t
 }
 
 #[test]
-fn photos_of_one_camera_learn_no_exposure_unless_told_and_a_rig_learns_them_from_one_picture_each() {
+fn exposure_is_learned_for_rigs_and_for_one_camera_only_if_set() {
     let place = Place::new();
     let exposed = |named: bool, changes: &[&str]| {
         let recipe = recipe(changes);
         let capture = Capture { named, ..Capture::clone(&place.open(&recipe)) };
         let opened = OpenCapture::new(Arc::new(capture), &recipe).unwrap();
         let plan = opened.plan(&recipe);
-        let scene = opened.initial_scene(&plan).unwrap();
-        opened.trainer(&plan, scene).unwrap().learner.exposure.is_some()
+        let scene = opened.initial_scene(&recipe, &plan).unwrap();
+        opened.trainer(&recipe, &plan, scene).unwrap().learner.exposure.is_some()
     };
     let moment = ["exposure=true", "max_frames=1"];
     assert!(exposed(true, &moment) && exposed(false, &["exposure=true"]) && !exposed(false, &moment));

@@ -129,7 +129,7 @@ impl<F: Real> Channels<F> {
         evaluation: &mut Evaluation<F>,
     ) {
         let truth = channel.way(source.view).expect("only views that know their flow ask for it");
-        let (_, all) = self.later.iter().find(|(c, _)| c == channel).expect("what goes back was drawn");
+        let (_, all) = self.later.iter().find(|(c, _)| c == channel).expect("what is backpropagated was rendered");
         let mut first = 0;
         for (&i, later) in source.asked.iter().zip(all) {
             // Where the flow goes nowhere in time, it tells the splats nothing.

@@ -5,7 +5,7 @@
 //! weighs pixels here: w = 1 + k·⅓ Σ_c ψ(I_c − median_c), ψ(x) = x²/(x² + γ²).
 
 use crate::Result;
-use crate::capture::frames::{Frames, Picture, halve};
+use crate::capture::frames::{Frames, Picture};
 use crate::vision::view::{self, Rigs};
 use rayon::prelude::*;
 use splat4d::scene::Planes;
@@ -54,12 +54,12 @@ impl Emphasis {
             0 => &picture.color,
             _ => {
                 small = picture.color.clone();
-                (0..halvings).for_each(|_| halve(&mut small));
+                (0..halvings).for_each(|_| small.halve());
                 &small
             }
         };
         self.moves.reset(1, color.height, color.width);
-        assert_eq!(still[0].len(), color.pixels(), "pictures of one camera have one size");
+        assert_eq!(still[0].len(), color.pixels(), "images of one camera have one size");
         // Rows in parallel: in series this was a twentieth of a step on two cores, and a quarter beside a graphics card.
         let simd = Simd::detect();
         self.moves.data.par_chunks_mut(color.width).with_min_len(ROWS).enumerate().for_each(|(y, row)| {
@@ -153,14 +153,14 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_emphasised_without_fixed_cameras_or_moments() {
+    fn nothing_is_emphasised_without_fixed_cameras_or_times() {
         assert!(Emphasis::new(&Made::new(3, 5, 4), 0.0).unwrap().is_none());
         assert!(Emphasis::new(&Made::new(3, 2, 4), 1.0).unwrap().is_none(), "two moments have no median");
     }
 
     /// Pictures that are larger than the size that is worked with: every pixel has a weight.
     #[test]
-    fn weights_are_those_of_the_place_in_a_smaller_picture() {
+    fn weights_are_those_of_the_place_in_a_smaller_image() {
         let (width, height) = (801, 603);
         let small = [width / 2, height / 2];
         let mut emphasis = Emphasis {

@@ -234,7 +234,7 @@ impl<'a> CpuEngine<'a> {
         let Stage { pictures, probes, params, .. } = &mut *plan.stage;
         let mut image = plan.loss.of_step(pictures, exposure);
         if !self.told && compares(self.backend.as_ref()) && plan.views.iter().any(|v| image.target(v).is_none()) {
-            out.notices.push("the CPU compares pictures: the recipe's loss on them is more than L1 and D-SSIM".into());
+            out.notices.push("the CPU compares images: the recipe's loss on them is more than L1 and D-SSIM".into());
             self.told = true;
         }
         let mut losses = Losses { image: &mut image, probes, params };

@@ -200,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn a_callers_own_term_sees_the_exposed_picture_and_its_gradient_joins_the_others() {
+    fn a_custom_loss_gets_the_exposed_render_and_adds_its_gradient() {
         let color = planes("color");
         let seen = std::sync::Arc::<std::sync::Mutex<Vec<f32>>>::default();
         let mut plain = TrainLoss::photometric(0.2);

@@ -8,6 +8,7 @@ pub(crate) mod emphasis;
 pub mod engine;
 pub mod loss;
 pub(crate) mod pace;
+pub mod replans;
 pub(crate) mod resident;
 pub mod trainer;
 

@@ -7,7 +7,7 @@
 //! are more, some steps stay where they are. So nothing of the past changes its meaning, a rate goes on from where it
 //! was, densifications neither get lost nor are repeated, and the same changes of plan give the same bits.
 
-use crate::recipe::Replan;
+use super::replans::Replan;
 
 /// How many steps of the schedule are behind a run after so many steps of its own: a pure function of the changes of plan.
 #[derive(Clone, Debug, PartialEq)]

@@ -10,11 +10,11 @@
 //! captures and nothing on an object (docs/suite.md).
 
 use super::{
-    At, Change, Context, Every, Limits, Order, Strategy, Upkeep, covariances, grow, is_dead, logit, opacity, sample,
+    At, Change, Context, DensifySettings, Every, Limits, Order, Strategy, Upkeep, covariances, grow, is_dead, logit,
+    opacity, sample,
 };
 use crate::Result;
 use crate::learner::Learner;
-use crate::recipe::Recipe;
 use crate::settings::settings;
 use rayon::prelude::*;
 use splat4d::layers::{Layer, Scene};
@@ -43,8 +43,9 @@ settings! {
         retime_clones: bool = false;
         /// Mean 2D gradient above which a Gaussian is cloned or split (NDC units).
         grad_threshold: f64 = 2e-4;
-        /// Gaussians larger than this share of the extent are split, smaller ones cloned.
-        percent_dense: f64 = 0.01 => any().unit("extents");
+        /// Gaussians larger than this share of the extent are split, smaller ones cloned; 0: 0.01, and less in proportion
+        /// for static scenes of more than 30,000 Gaussians.
+        percent_dense: f64 = 0.0 => any().unit("extents");
         /// Share of densification after which the cap may be reached: the number of Gaussians grows along a parabola
         /// (Mallick et al. 2024), largest gradients first; 0: no limit before the cap.
         full_at: f64 = 0.5 => share();
@@ -52,6 +53,12 @@ settings! {
         split_in_time: f64 = 1.0 => any().unit("own sizes");
     }
 }
+
+/// [`AdcSettings::percent_dense`] where it is 0, for few Gaussians (Kerbl et al. 2023).
+pub(crate) const DENSE: f64 = 0.01;
+/// The lowest that it becomes with many (Ren et al. 2026, FastGS). More Gaussians are smaller, and one that is large among them
+/// blurs what a copy in its place blurs as well (studies/records/2026-11-27-real-size.md).
+pub(crate) const FINEST: f64 = 1e-3;
 
 /// Adaptive density control (Kerbl et al. 2023).
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -105,10 +112,10 @@ impl Adc {
         1.0 - ((left - 1.0) / left).powi(2)
     }
 
-    /// As a recipe has it; `None`: another strategy.
-    pub(crate) fn of(r: &Recipe) -> Option<Self> {
-        let some = || Self { settings: r.adc, steps: r.densify.steps() };
-        (r.densify.strategy == Strategy::Adc).then(some)
+    /// With these settings; `None`: another strategy.
+    pub(crate) fn of(settings: AdcSettings, densify: &DensifySettings) -> Option<Self> {
+        let some = || Self { settings, steps: densify.steps() };
+        (densify.strategy == Strategy::Adc).then(some)
     }
 }
 
@@ -155,7 +162,8 @@ impl AdcSettings {
         wanting.iter().for_each(|&(_, r)| grows[r as usize] = true);
         let parted: Vec<f64> =
             (0..rows).map(|r| if grows[r] { self.part(scene, layer, r, sizes[r]) } else { 0.0 }).collect();
-        let large = |r: usize| sizes[r] > self.percent_dense * limits.extent;
+        let dense = if self.percent_dense == 0.0 { DENSE } else { self.percent_dense };
+        let large = |r: usize| sizes[r] > dense * limits.extent;
         let splits: Vec<bool> = (0..rows).map(|r| grows[r] && (parted[r] > 0.0 || large(r))).collect();
         let mut edit = RowEdit { space: Space::Gaussians, parent: Vec::new(), born: Vec::new() };
         for r in (0..rows).filter(|&r| keep[r]) {

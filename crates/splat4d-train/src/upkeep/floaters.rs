@@ -4,11 +4,10 @@
 //! between the other cameras, where it veils every view from there. What it showed is learnt again where others see it, or
 //! farther away. What stands before the camera that sees it may be there, and stays; so does all that two cameras see.
 
-use super::{At, Change, Context, Every, Order, Upkeep};
+use super::{At, Change, Context, DensifySettings, Every, Order, Upkeep};
 use crate::Result;
 use crate::capture::frames::Frames;
 use crate::learner::Learner;
-use crate::recipe::Recipe;
 use crate::settings::settings;
 use rayon::prelude::*;
 use splat4d::layers::{Evaluation, Scene};
@@ -34,6 +33,9 @@ const FEWEST: usize = 8;
 /// Moments, evenly over the clip, at which Gaussians are looked at; each counts where it is most visible.
 const MOMENTS: usize = 5;
 
+/// Rows in a task.
+const NEIGHBOURS: usize = 1024;
+
 /// See the module's documentation.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Floaters {
@@ -44,10 +46,10 @@ pub(crate) struct Floaters {
 }
 
 impl Floaters {
-    /// As a recipe has it; `None`: never.
-    pub(crate) fn of(r: &Recipe) -> Option<Self> {
-        let steps = Every { interval: r.floaters.interval, ..r.densify.steps() };
-        (r.floaters.interval > 0).then_some(Self { settings: r.floaters, steps })
+    /// With these settings; `None`: never.
+    pub(crate) fn of(settings: FloaterSettings, densify: &DensifySettings) -> Option<Self> {
+        let steps = Every { interval: settings.interval, ..densify.steps() };
+        (settings.interval > 0).then_some(Self { settings, steps })
     }
 }
 
@@ -134,10 +136,14 @@ impl<'a> Places<'a> {
         }
         let points: Vec<[f64; 3]> = most.into_iter().map(|(_, x)| x).collect();
         let Some(depth) = self.depth(&points) else { return vec![true; rows] };
-        let stays = |&x: &[f64; 3]| {
+        let stays = |hint: &mut [usize; 2], x: [f64; 3]| {
+            if hint[0] != hint[1] && hint.iter().all(|&k| seen(self.cameras[k].0, x).is_some()) {
+                return true;
+            }
             let (mut views, mut veils) = (0, false);
-            for (camera, place) in &self.cameras {
+            for (k, (camera, place)) in self.cameras.iter().enumerate() {
                 if seen(camera, x).is_some() {
+                    hint[views] = k;
                     views += 1;
                     if views > 1 {
                         return true;
@@ -148,7 +154,12 @@ impl<'a> Places<'a> {
             }
             !veils
         };
-        points.par_iter().map(stays).collect()
+        // Rows are neighbours: two cameras that see one of them mostly see the next one, and the others are not asked.
+        let rows = points.par_chunks(NEIGHBOURS).flat_map_iter(|points| {
+            let mut hint = [0; 2];
+            points.iter().map(move |&x| stays(&mut hint, x))
+        });
+        rows.collect()
     }
 }
 
@@ -168,7 +179,7 @@ mod tests {
     use splat4d::scene::GEOMETRY;
 
     #[test]
-    fn what_hangs_before_a_camera_and_one_other_alone_sees_goes() {
+    fn floaters_before_a_camera_are_removed() {
         let frames = Made::new(8, 1, 16);
         let places = Places::of(&frames);
         assert_eq!(places.cameras.len(), 8);

@@ -9,7 +9,6 @@ use super::{At, Change, Context, Order, Upkeep, logit};
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};
 use crate::learner::Learner;
-use crate::recipe::Recipe;
 use crate::settings::settings;
 use splat4d::device;
 use splat4d::layers::{Evaluation, Scene};
@@ -80,9 +79,9 @@ pub(crate) struct Guided {
 }
 
 impl Guided {
-    /// As a recipe has it; `None`: never.
-    pub(crate) fn of(r: &Recipe) -> Option<Self> {
-        (r.guided.from > 0.0 && r.guided.times > 0).then_some(Self { settings: r.guided })
+    /// With these settings; `None`: never.
+    pub(crate) fn of(settings: GuidedSettings) -> Option<Self> {
+        (settings.from > 0.0 && settings.times > 0).then_some(Self { settings })
     }
 }
 

@@ -4,10 +4,11 @@
 //! Where they go is drawn in space-time from opacity and screen gradient (FreeTimeGS): a row carries its life with it.
 //! Source: Kheradmand et al. 2024 (3DGS as MCMC) §3; Wang et al. 2025 (FreeTimeGS) §3.3.
 
-use super::{At, Change, Context, Every, Limits, Order, Strategy, Upkeep, grow, is_dead, logit, opacity};
+use super::{
+    At, Change, Context, DensifySettings, Every, Limits, Order, Strategy, Upkeep, grow, is_dead, logit, opacity,
+};
 use crate::Result;
 use crate::learner::Learner;
-use crate::recipe::Recipe;
 use crate::settings::settings;
 use splat4d::math::Rng;
 use splat4d::scene::params::OPACITY;
@@ -45,10 +46,10 @@ pub(crate) struct Mcmc {
 }
 
 impl Mcmc {
-    /// As a recipe has it; `None`: another strategy.
-    pub(crate) fn of(r: &Recipe) -> Option<Self> {
-        let some = || Self { settings: r.mcmc, gradient_share: r.relocate.gradient_share, steps: r.densify.steps() };
-        (r.densify.strategy == Strategy::Mcmc).then(some)
+    /// With these settings; `None`: another strategy.
+    pub(crate) fn of(settings: McmcSettings, gradient_share: f64, densify: &DensifySettings) -> Option<Self> {
+        let some = || Self { settings, gradient_share, steps: densify.steps() };
+        (densify.strategy == Strategy::Mcmc).then(some)
     }
 }
 

@@ -4,7 +4,6 @@
 use super::{At, Change, Context, Order, Upkeep, covariances, logit, opacity};
 use crate::Result;
 use crate::learner::Learner;
-use crate::recipe::Recipe;
 use crate::settings::{Choice, settings};
 use splat4d::layers::Scene;
 use splat4d::math::knn::knn;
@@ -83,9 +82,8 @@ impl Upkeep for Merge {
 }
 
 impl Merge {
-    /// As a recipe has it; `None`: never.
-    pub(crate) fn of(r: &Recipe) -> Option<Self> {
-        let settings = r.merge;
+    /// With these settings; `None`: never.
+    pub(crate) fn of(settings: MergeSettings) -> Option<Self> {
         (settings.pair != Pair::None && settings.interval > 0).then_some(Self { settings })
     }
 }

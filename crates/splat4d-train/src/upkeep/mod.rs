@@ -22,7 +22,7 @@ pub(crate) mod split;
 pub(crate) mod tests;
 pub mod worth;
 
-pub(crate) use adc::{Adc, AdcSettings};
+pub(crate) use adc::{Adc, AdcSettings, DENSE, FINEST};
 pub(crate) use densify::LEAST;
 pub use densify::{DensifySettings, Strategy};
 pub(crate) use floaters::{FloaterSettings, Floaters};
@@ -40,7 +40,6 @@ pub(crate) use split::{Split, SplitSettings};
 use crate::Result;
 use crate::capture::frames::Frames;
 use crate::learner::Learner;
-use crate::recipe::Recipe;
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::{Real, Rng, sym3};
 use splat4d::render::Antialias;
@@ -217,25 +216,6 @@ pub trait Upkeep: Send + Sync {
 
     /// Takes back what [`state`](Self::state) gave; nothing from a checkpoint that does not know the operation.
     fn restore(&mut self, _state: &[u32]) {}
-}
-
-/// The operations that a recipe asks of every motion model.
-pub(crate) fn of(r: &Recipe) -> Vec<Box<dyn Upkeep>> {
-    let all = [
-        boxed(Adc::of(r)),
-        boxed(Mcmc::of(r)),
-        boxed(MortonOrder::of(r)),
-        boxed(Relocate::of(r)),
-        boxed(Floaters::of(r)),
-        boxed(Prune::of(r)),
-        boxed(Merge::of(r)),
-        boxed(OpacityReset::of(r)),
-    ];
-    all.into_iter().flatten().collect()
-}
-
-fn boxed(operation: Option<impl Upkeep + 'static>) -> Option<Box<dyn Upkeep>> {
-    operation.map(|o| Box::new(o) as Box<dyn Upkeep>)
 }
 
 /// Lets every layer grow under the one cap: `layer` gets a layer's number, how many rows it may add (to be lowered by those

@@ -1,10 +1,9 @@
 //! Morton order: after the last densification rows are sorted by the places of their means, for the rest of the run.
 //! Neighbours in space become neighbours in memory, which every later step reads faster.
 
-use super::{At, Change, Context, Every, Order, Strategy, Upkeep};
+use super::{At, Change, Context, DensifySettings, Every, Order, Strategy, Upkeep};
 use crate::Result;
 use crate::learner::Learner;
-use crate::recipe::Recipe;
 use splat4d::format::quant::{MORTON_BITS, morton};
 use splat4d::layers::Scene;
 use splat4d::scene::{Born, GEOMETRY, RowEdit, Space};
@@ -17,9 +16,9 @@ pub(crate) struct MortonOrder {
 }
 
 impl MortonOrder {
-    /// As a recipe has it; `None`: nothing is densified.
-    pub(crate) fn of(r: &Recipe) -> Option<Self> {
-        (r.densify.strategy != Strategy::None).then(|| Self { densification: r.densify.steps() })
+    /// With these settings; `None`: nothing is densified.
+    pub(crate) fn of(densify: &DensifySettings) -> Option<Self> {
+        (densify.strategy != Strategy::None).then(|| Self { densification: densify.steps() })
     }
 }
 

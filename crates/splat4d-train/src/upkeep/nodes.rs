@@ -4,10 +4,9 @@
 //! Source: Huang et al. 2024 (SC-GS), there every 5,000 of 80,000 steps from 1,000 to 25,000 with the gradient to
 //! positions in space; here with that to positions in the picture, which densification gathers anyway.
 
-use super::{At, Change, Context, Every, Order, Upkeep};
+use super::{At, Change, Context, DensifySettings, Every, Order, Upkeep};
 use crate::Result;
 use crate::learner::Learner;
-use crate::recipe::Recipe;
 use crate::settings::settings;
 use splat4d::math::Rng;
 use splat4d::motion::skin::{NODE_HYPER, Skin, Weights};
@@ -42,9 +41,9 @@ pub(crate) struct AdaptNodes {
 }
 
 impl AdaptNodes {
-    /// As a recipe has it.
-    pub(crate) fn of(r: &Recipe) -> Self {
-        Self { settings: r.nodes, span: (r.densify.from, r.densify.until) }
+    /// With these settings.
+    pub(crate) fn of(settings: NodeSettings, densify: &DensifySettings) -> Self {
+        Self { settings, span: (densify.from, densify.until) }
     }
 
     fn edits_at(&self, step: usize) -> bool {

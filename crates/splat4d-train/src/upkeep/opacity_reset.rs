@@ -1,10 +1,9 @@
 //! Opacity reset: every so many steps all opacities are lowered, so that what the pictures do not ask for stays faint and
 //! is pruned. Source: Kerbl et al. 2023 §5.2.
 
-use super::{At, Change, Context, Every, Order, Strategy, Upkeep, logit};
+use super::{At, Change, Context, DensifySettings, Every, Order, Strategy, Upkeep, logit};
 use crate::Result;
 use crate::learner::Learner;
-use crate::recipe::Recipe;
 use crate::settings::settings;
 use splat4d::scene::GEOMETRY;
 use splat4d::scene::params::OPACITY;
@@ -32,10 +31,10 @@ pub(crate) struct OpacityReset {
 }
 
 impl OpacityReset {
-    /// As a recipe has it; `None`: never.
-    pub(crate) fn of(r: &Recipe) -> Option<Self> {
-        let some = || Self { settings: r.opacity_reset, densification: r.densify.steps() };
-        (r.densify.strategy == Strategy::Adc && r.opacity_reset.interval > 0).then(some)
+    /// With these settings; `None`: never.
+    pub(crate) fn of(settings: OpacityResetSettings, densify: &DensifySettings) -> Option<Self> {
+        let some = || Self { settings, densification: densify.steps() };
+        (densify.strategy == Strategy::Adc && settings.interval > 0).then(some)
     }
 }
 

@@ -5,7 +5,6 @@ use super::worth::{ScoreConfig, Scores, Spatial, prune, score};
 use super::{At, Change, Context, Order, Upkeep};
 use crate::Result;
 use crate::learner::Learner;
-use crate::recipe::Recipe;
 use crate::settings::{Choice, settings};
 
 impl Choice for Spatial {
@@ -44,9 +43,9 @@ pub(crate) struct Prune {
 }
 
 impl Prune {
-    /// As a recipe has it; `None`: never.
-    pub(crate) fn of(r: &Recipe) -> Option<Self> {
-        (r.prune.interval > 0).then_some(Self { settings: r.prune })
+    /// With these settings; `None`: never.
+    pub(crate) fn of(settings: PruneSettings) -> Option<Self> {
+        (settings.interval > 0).then_some(Self { settings })
     }
 
     /// The scores that it goes by.

@@ -5,10 +5,9 @@
 //! gradient and ½ opacity; the correction of opacity and scale is that of 3DGS as MCMC (Kheradmand et al. 2024).
 
 use super::mcmc::{Places, join};
-use super::{At, Change, Context, Every, Order, Upkeep, is_dead, opacity};
+use super::{At, Change, Context, DensifySettings, Every, Order, Upkeep, is_dead, opacity};
 use crate::Result;
 use crate::learner::Learner;
-use crate::recipe::Recipe;
 use crate::settings::settings;
 
 settings! {
@@ -40,10 +39,10 @@ pub(crate) struct Relocate {
 }
 
 impl Relocate {
-    /// As a recipe has it; `None`: never.
-    pub(crate) fn of(r: &Recipe) -> Option<Self> {
-        let some = || Self { settings: r.relocate, densification: r.densify.steps() };
-        (r.relocate.interval > 0).then(some)
+    /// With these settings; `None`: never.
+    pub(crate) fn of(settings: RelocateSettings, densify: &DensifySettings) -> Option<Self> {
+        let some = || Self { settings, densification: densify.steps() };
+        (settings.interval > 0).then(some)
     }
 }
 
@@ -124,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn the_faintest_move_a_few_at_a_time_and_the_picture_stays() {
+    fn the_faintest_move_a_few_at_a_time_and_the_image_stays() {
         let mut s = scene(200);
         let g = &mut s.layers[0].params[GEOMETRY];
         for r in 0..200 {

@@ -5,7 +5,6 @@
 use super::{At, Change, Context, Upkeep};
 use crate::Result;
 use crate::learner::Learner;
-use crate::recipe::Recipe;
 use crate::settings::settings;
 use splat4d::layers::{ALWAYS, Evaluation, Layer, Scene, freeze_rows};
 use splat4d::math::Rng;
@@ -48,10 +47,9 @@ pub(crate) struct Split {
 
 impl Split {
     /// As a recipe has it for a last stage of `steps`, in which Gaussians move; `None`: never.
-    pub(crate) fn of(r: &Recipe, extent: f64, steps: usize) -> Option<Self> {
-        let s = r.split;
-        let some = || Self { at: (steps as f64 * s.from) as usize, reach: s.reach * extent };
-        (s.reach > 0.0).then(some)
+    pub(crate) fn of(settings: SplitSettings, extent: f64, steps: usize) -> Option<Self> {
+        let some = || Self { at: (steps as f64 * settings.from) as usize, reach: settings.reach * extent };
+        (settings.reach > 0.0).then(some)
     }
 }
 

@@ -52,7 +52,7 @@ const AGREE_PIXELS: f32 = 0.5;
 /// pictures of two sizes.
 pub(crate) fn dense(from: &Pyramid, to: &Pyramid) -> Planes<f32> {
     let (a, b) = (&from.0[0], &to.0[0]);
-    assert_eq!((a.width, a.height), (b.width, b.height), "flow is between pictures of one size");
+    assert_eq!((a.width, a.height), (b.width, b.height), "flow is between images of one size");
     let (forth, back) = (one_way(from, to), one_way(to, from));
     let mut out = Planes::new(3, a.height, a.width);
     let n = a.pixels();

@@ -43,7 +43,7 @@ pub(crate) fn points(
     progress: &mut Progress<'_>,
 ) -> Result<Vec<Point>> {
     let parts = 3 + moments.len();
-    let mut tell = |done| progress.phase("points from pictures", done, parts);
+    let mut tell = |done| progress.phase("points from images", done, parts);
     tell(0);
     let rigs = Rigs::of(frames);
     let still = rigs.still(frames)?;

@@ -205,7 +205,7 @@ fn the_same_points_with_any_number_of_threads() {
 }
 
 #[test]
-fn pictures_without_texture_and_single_cameras_give_no_points() {
+fn images_without_texture_and_single_cameras_give_no_points() {
     assert!(Room { textured: false, ..Room::new(4, 1.0) }.points(&[], 100).is_empty());
     assert!(Room { moments: 3, ..Room::new(1, 1.0) }.points(&[0.1], 100).is_empty());
 }

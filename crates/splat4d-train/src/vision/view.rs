@@ -5,6 +5,7 @@ use super::raster::{blurred, grey};
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};
 use rayon::prelude::*;
+use splat4d::math::median_by;
 use splat4d::scene::{Camera, Planes};
 use std::collections::BTreeMap;
 
@@ -143,7 +144,7 @@ pub(crate) fn spread(count: usize, most: usize) -> impl Iterator<Item = usize> {
 
 /// How often a picture is halved to the size that is worked with.
 pub(crate) fn halvings(width: usize, height: usize) -> usize {
-    (0..).find(|&k| (width >> k) * (height >> k) <= PIXELS).expect("a picture can be halved to nothing")
+    (0..).find(|&k| (width >> k) * (height >> k) <= PIXELS).expect("an image can be halved to nothing")
 }
 
 /// A frame's picture at the size that is worked with, and its camera.
@@ -189,8 +190,7 @@ fn median(frames: &dyn Frames, rig: &[usize]) -> Result<View> {
         sorted.clear();
         sorted.push(*value);
         sorted.extend(values.iter().map(|v| v[p]));
-        let middle = sorted.len() / 2;
-        *value = *sorted.select_nth_unstable_by(middle, f32::total_cmp).1;
+        *value = median_by(&mut sorted, f32::total_cmp).expect("the first is there");
     }
     Ok(View::new(camera, &first.color, wanted))
 }

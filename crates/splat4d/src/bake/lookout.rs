@@ -1,5 +1,6 @@
 //! How large a length in the world looks to the cameras: the measure of every error.
 
+use crate::math::median;
 use crate::math::se3::{norm, sub};
 use crate::scene::Camera;
 
@@ -26,10 +27,7 @@ pub(super) struct Lookout {
 impl Lookout {
     /// From cameras (may be none) and the means of the scene.
     pub(super) fn new(cameras: &[Camera], means: &[[f64; 3]]) -> Self {
-        let median = |mut values: Vec<f64>| {
-            values.sort_by(f64::total_cmp);
-            values.get(values.len() / 2).copied().unwrap_or(0.0)
-        };
+        let median = |mut values: Vec<f64>| median(&mut values).unwrap_or(0.0);
         let middle: [f64; 3] = std::array::from_fn(|k| median(means.iter().map(|m| m[k]).collect()));
         let radius = median(means.iter().map(|&m| norm(sub(m, middle))).collect());
         let stride = cameras.len().div_ceil(MAX_CAMERAS).max(1);

@@ -205,7 +205,7 @@ fn leaps_become_key_states() {
 }
 
 #[test]
-fn every_visible_gaussian_is_shown_once_at_every_moment() {
+fn every_visible_gaussian_is_shown_once_at_every_time() {
     let lives = [LifeKind::Infinite, LifeKind::GaussHalf, LifeKind::Interval];
     for life in lives {
         let scene = scene(vec![layer(&spacetime(3, true), life, 80, 0.5, 2.9)], 2.9);

@@ -2,15 +2,15 @@
 
 use super::clock::{retime, seen_in, window};
 use super::limits::{Size, check_clip, check_room};
+use super::parts::{each_part, parts, pruned, wrap};
 use super::{Context, Expr, Place, PlaceKey, Selected, Step, drag, select};
 use crate::layers::{ALWAYS, Layer, Scene};
 use crate::math::se3::{add, norm, sub};
-use crate::math::{Rng, Sim3, quat};
-use crate::motion::edited::{Change, ColorMap, Edited, FadeKey, PathKey};
+use crate::math::{Sim3, quat};
+use crate::motion::edited::{Change, ColorMap, FadeKey, PathKey};
 use crate::scene::params::OPACITY;
-use crate::scene::{GEOMETRY, HeadKeys, RowEdit, SH, Space, labels};
+use crate::scene::{GEOMETRY, HeadKeys, SH, labels};
 use crate::{Error, Result};
-use std::sync::Arc;
 
 /// Weights of red, green and blue in brightness (ITU-R BT.709).
 const LUMA: [f64; 3] = [0.2126, 0.7152, 0.0722];
@@ -142,7 +142,7 @@ pub(super) fn run(step: &Step, scene: &mut Scene<f32>, context: &dyn Context) ->
         }
         Step::Floaters { strength } => {
             if !(0.0..=1.0).contains(strength) {
-                return Err(Error::input(format!("a strength of {strength}")).remedy("Give 0 to 1"));
+                return Err(Error::input(format!("invalid strength {strength}")).remedy("Give 0 to 1"));
             }
             let selected = context.floaters(scene, *strength)?;
             keep(scene, &selected, false);
@@ -159,13 +159,6 @@ fn span(from: f64, to: f64) -> Result<()> {
         .remedy("Swap `from` and `to`, or correct them"))
 }
 
-/// The rows for which `which` holds.
-fn pruned(layer: &Layer<f32>, which: impl Iterator<Item = bool>) -> Layer<f32> {
-    let mut out = layer.clone();
-    out.edit(&RowEdit::prune(Space::Gaussians, which), &Rng::new(0, "edit", 0));
-    out
-}
-
 /// Keeps the selected Gaussians, or all others.
 fn keep(scene: &mut Scene<f32>, selected: &Selected, wanted: bool) {
     for (layer, selected) in scene.layers.iter_mut().zip(selected) {
@@ -175,77 +168,6 @@ fn keep(scene: &mut Scene<f32>, selected: &Selected, wanted: bool) {
     }
     // The layer with a head's weights is needed even when it shows nothing.
     scene.layers.retain(|l| !l.params.is_empty() || HeadKeys::of(&l.params).is_some());
-}
-
-/// Puts what `shown` makes of the selected part of every layer in its place, behind what is left of the layer. With a
-/// name the parts are called so.
-fn each_part(
-    scene: &mut Scene<f32>,
-    selected: &Selected,
-    name: Option<&String>,
-    shown: &dyn Fn(&Layer<f32>) -> Vec<Layer<f32>>,
-) {
-    let mut layers = Vec::with_capacity(scene.layers.len() + 1);
-    for (layer, selected) in std::mem::take(&mut scene.layers).into_iter().zip(selected) {
-        if !selected.contains(&true) {
-            layers.push(layer);
-            continue;
-        }
-        let mut part = if selected.contains(&false) {
-            layers.push(pruned(&layer, selected.iter().map(|s| !s)));
-            pruned(&layer, selected.iter().copied())
-        } else {
-            layer
-        };
-        if let Some(name) = name {
-            part.name.clone_from(name);
-        }
-        layers.extend(shown(&part));
-    }
-    scene.layers = layers;
-}
-
-/// Puts a change around the models of the selected Gaussians, which get layers of their own. Changes are in the world: a
-/// frame goes inside first.
-pub(super) fn wrap(scene: &mut Scene<f32>, selected: &Selected, change: &dyn Fn(usize) -> Change) -> Result<()> {
-    each_part(scene, selected, None, &|layer| vec![layer.clone()]);
-    for (from, index) in parts(selected) {
-        let layer = &mut scene.layers[index];
-        unframe(layer)?;
-        layer.motion = Arc::new(Edited::around(layer.motion.clone(), change(from), &mut layer.params)?);
-    }
-    Ok(())
-}
-
-/// After [`each_part`] kept every part: (number of the layer before, place of its part now).
-pub(super) fn parts(selected: &Selected) -> Vec<(usize, usize)> {
-    let (mut out, mut at) = (Vec::new(), 0);
-    for (from, selected) in selected.iter().enumerate() {
-        match (selected.contains(&true), selected.contains(&false)) {
-            (true, true) => {
-                out.push((from, at + 1));
-                at += 2;
-            }
-            (part, _) => {
-                if part {
-                    out.push((from, at));
-                }
-                at += 1;
-            }
-        }
-    }
-    out
-}
-
-/// The layer's frame as a change around its model.
-fn unframe(layer: &mut Layer<f32>) -> Result<()> {
-    if !layer.frame.is_identity() {
-        let keys = vec![PathKey::new(0.0, &layer.frame)];
-        let change = Change::Path { about: [0.0; 3], keys };
-        layer.motion = Arc::new(Edited::around(layer.motion.clone(), change, &mut layer.params)?);
-        layer.frame = Sim3::default();
-    }
-    Ok(())
 }
 
 /// Whether opacity and colour at all times are what geometry and spherical harmonics say, times the life.

@@ -1,6 +1,6 @@
 //! Dragging: handles pull control nodes over time, the others follow as rigidly as possible, and Gaussians follow them.
 
-use super::act::{parts, wrap};
+use super::parts::{parts, wrap};
 use super::{Context, Selected};
 use crate::layers::{Evaluation, Layer, Scene, freeze_rows, sweep};
 use crate::math::quat;

@@ -181,7 +181,7 @@ fn alike(scene: &Scene<f32>, looks: &Looks, place: [f64; 3], least: f64) -> Resu
     }
     let (_, wanted) = nearest.ok_or_else(|| {
         Error::input("the scene has no features").remedy(
-            "Give the capture's cameras pictures of features, then: splat4d label RUN (docs/labels.md, \"Features\").",
+            "Give the capture's cameras images of features, then: splat4d label RUN (docs/labels.md, \"Features\").",
         )
     })?;
     let like = |layer: usize, row: usize| of(layer, row).is_some_and(|f| features::likeness(&f, &wanted) >= least);
@@ -312,7 +312,7 @@ pub fn mask_fits([width, height]: [usize; 2], camera: &Camera, name: &str) -> Re
         return Ok(());
     }
     let what = format!("the mask has {width} x {height} pixels, its camera {} x {}", camera.width, camera.height);
-    Err(Error::input(what).at(name).remedy("Give a mask of the size of the camera's pictures"))
+    Err(Error::input(what).at(name).remedy("Give a mask of the size of the camera's images"))
 }
 
 fn fits(mask: &Mask, camera: &Camera, name: &str) -> Result<()> {

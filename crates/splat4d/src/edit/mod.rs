@@ -9,6 +9,7 @@ mod clock;
 mod drag;
 mod limits;
 mod look;
+mod parts;
 mod select;
 #[cfg(test)]
 mod tests;

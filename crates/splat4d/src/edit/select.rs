@@ -434,7 +434,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_read_says_where() {
+    fn unreadable_input_is_located() {
         for (text, word) in [
             ("", "ends"),
             ("bux(1)", "bux"),

@@ -307,7 +307,7 @@ fn a_hidden_part_is_away_for_its_time() {
 }
 
 #[test]
-fn colours_and_opacity_change_as_told() {
+fn colours_and_opacity_change_as_specified() {
     for s in scenes() {
         let name = s.layers[0].motion.spec().name().to_owned();
         // The renderer cuts colours at zero, which commutes with a factor.
@@ -354,7 +354,7 @@ fn keys_move_over_time() {
 }
 
 #[test]
-fn clocks_run_as_told_on_every_model() {
+fn retiming_works_on_every_model() {
     for s in scenes() {
         let slow = run(r#"[{"do": "retime", "rate": 0.5, "from": 0.2, "to": 0.6}]"#, &s).unwrap();
         assert!((slow.clip[1] - 1.4).abs() < 1e-12);
@@ -492,7 +492,7 @@ fn edited_scenes_are_files_and_bake() {
 }
 
 #[test]
-fn what_cannot_be_done_says_why() {
+fn impossible_edits_give_a_reason() {
     let s = walker();
     for (step, word) in [
         (r#"{"do": "delete", "select": "sphere(9,9,9, 0.1)"}"#, "empty"),
@@ -574,7 +574,7 @@ fn a_subject_alone_has_no_halo() {
 }
 
 #[test]
-fn a_lasso_holds_what_lies_behind_what_was_drawn() {
+fn a_lasso_selects_behind_its_outline() {
     let scene = &scenes()[3];
     let camera = front();
     let world = camera.cam_from_world.inverse();
@@ -633,7 +633,7 @@ fn the_nodes_of_a_model_bend_what_is_on_them() {
 }
 
 #[test]
-fn what_is_bent_under_the_hand_is_what_the_step_makes_of_it() {
+fn the_preview_of_a_drag_equals_its_step() {
     for scene in scenes() {
         let bench = Bench::empty();
         let all: Selected = scene.layers.iter().map(|l| vec![true; l.params.len()]).collect();

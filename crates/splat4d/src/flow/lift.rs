@@ -199,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn slopes_tell_noise_from_bias() {
+    fn slopes_distinguish_noise_from_bias() {
         let rng = Rng::new(3, "walk", 0);
         let truth = vec![vec![[0.0; 3]; 101]; 2000];
         let walk = |i: u64| {

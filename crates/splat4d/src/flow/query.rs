@@ -394,7 +394,7 @@ mod tests {
     }
 
     #[test]
-    fn others_take_over_where_gaussians_live_for_moments() {
+    fn others_take_over_where_gaussians_live_briefly() {
         let v = [0.4, 0.0, 0.0];
         let s = scene(vec![wall(0.0, 3.0, v, Some(0.1))]);
         let query = Query { time: 0.0, place: Place::World([0.1, 0.2, 0.0]) };

@@ -117,7 +117,7 @@ mod tests {
     }
 
     #[test]
-    fn any_layer_comes_back_bit_for_bit() {
+    fn any_layer_round_trips_bit_for_bit() {
         for (i, rows) in [0, 1, 15, 16, 17, 33, 100].into_iter().enumerate() {
             let rng = Rng::new(7, "arrays", i as u64);
             let sh = [1, 4, 9, 16][rng.below(0, 4)];

@@ -3,8 +3,6 @@
 
 use super::DIALECTS;
 use super::mend::{self, Mended};
-use super::ply::PlyInfo;
-use super::spz;
 use super::warnings::Warnings;
 use crate::layers::{Layer, Scene, moment};
 use crate::motion::Still;
@@ -19,6 +17,9 @@ use std::sync::Arc;
 pub const Y_DOWN: [f64; 3] = [0.0, -1.0, 0.0];
 /// Upwards in files whose y axis points up (glTF).
 pub(crate) const Y_UP: [f64; 3] = [0.0, 1.0, 0.0];
+
+/// Version of .spz that is written by default: the one that most programs open.
+pub const SPZ_VERSION: u32 = 3;
 
 /// Files of Gaussians that other programs share. docs/formats.md tells what each holds and assumes.
 #[derive(Clone, Copy)]
@@ -72,15 +73,31 @@ pub struct WriteOptions {
 
 impl Default for WriteOptions {
     fn default() -> Self {
-        Self {
-            spz_version: spz::DEFAULT_VERSION,
-            cameras: Vec::new(),
-            exact: false,
-            up: Y_DOWN,
-            offset: [0.0; 3],
-            world: false,
-        }
+        Self { spz_version: SPZ_VERSION, cameras: Vec::new(), exact: false, up: Y_DOWN, offset: [0.0; 3], world: false }
     }
+}
+
+/// Metadata of a .ply, besides its numbers.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PlyInfo {
+    /// Rows.
+    pub gaussians: usize,
+    /// Degree of the spherical harmonics, 0-3.
+    pub sh_degree: usize,
+    /// Rows that hold a NaN or an infinity without a meaning; they are kept as they are.
+    pub non_finite_rows: usize,
+    /// Infinities that mean something, now finite.
+    pub mended: Mended,
+    /// Whether base colours are RGB (`red green blue`), not coefficients.
+    pub rgb: bool,
+    /// What was subtracted from positions in double precision that are far from the origin, or what the file says was.
+    pub offset: [f64; 3],
+    /// Whether the numbers were quantised (PlayCanvas' compressed layout).
+    pub compressed: bool,
+    /// The header's comments.
+    pub comments: Vec<String>,
+    /// Properties of a Gaussian that were ignored; normals are not listed.
+    pub extra_properties: Vec<String>,
 }
 
 /// An opened file.
@@ -214,7 +231,7 @@ mod tests {
     use super::*;
     use crate::format::kinematic::tests::moving as moving_scene;
     use crate::format::samples::gaussians;
-    use crate::format::{gltf, ply, sog, splat, splatv};
+    use crate::format::{gltf, ply, sog, splat, splatv, spz};
     use crate::scene::GEOMETRY;
 
     /// A scene that every dialect can hold.
@@ -223,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn every_dialect_is_written_told_and_opened() {
+    fn every_dialect_is_written_recognised_and_opened() {
         // What is not written needs a file made by hand.
         let glb = gltf::tests::sample(&gaussians(20, 4), [0.0; 3]);
         let by_hand = [(sog::DIALECT, sog::tests::sample(), 2), (gltf::DIALECT, glb, 20)];
@@ -265,7 +282,7 @@ mod tests {
     }
 
     #[test]
-    fn names_and_endings_are_told_apart() {
+    fn names_and_extensions_are_distinguished() {
         for (i, a) in DIALECTS.iter().enumerate() {
             assert!(a.ending.starts_with('.') && a.ending == a.ending.to_ascii_lowercase(), "{a:?}");
             assert_eq!(Dialect::by_ending(&format!("x{}", a.ending)), Some(*a));
@@ -284,7 +301,7 @@ mod tests {
     }
 
     #[test]
-    fn every_version_of_spz_is_told_by_its_bytes() {
+    fn every_version_of_spz_is_recognised_by_its_bytes() {
         for spz_version in spz::VERSIONS {
             let mut bytes = Vec::new();
             let options = WriteOptions { spz_version, ..WriteOptions::default() };

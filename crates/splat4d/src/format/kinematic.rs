@@ -268,7 +268,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn the_way_there_and_back_is_exact_for_every_life_and_order() {
+    fn the_round_trip_is_exact_for_every_lifespan_and_order() {
         let clock = Clock { clip: [2.0, 5.0], fps: 25.0, duration: 3.0 };
         for life in [LifeKind::Infinite, LifeKind::GaussHalf, LifeKind::GaussOne] {
             for (order, rotation) in [(0, false), (1, true), (3, true)] {

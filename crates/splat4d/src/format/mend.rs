@@ -4,6 +4,7 @@
 use super::warnings::Warnings;
 use crate::layers::Layer;
 use crate::math::se3::{norm, sub};
+use crate::math::{median, median_by};
 use crate::scene::params::{LOG_SCALE, OPACITY};
 use crate::scene::{GEOMETRY, Params};
 
@@ -132,12 +133,9 @@ pub(super) fn doubts(params: &Params) -> Vec<(Linear, String)> {
 fn radius(params: &Params, rows: &[usize]) -> f64 {
     let table = &params[GEOMETRY];
     let means: Vec<[f64; 3]> = rows.iter().map(|&r| table.read::<3>(r, 0).map(f64::from)).collect();
-    let median = |mut values: Vec<f64>| {
-        let at = values.len() / 2;
-        *values.select_nth_unstable_by(at, f64::total_cmp).1
-    };
-    let middle = std::array::from_fn(|k| median(means.iter().map(|m| m[k]).collect()));
-    median(means.iter().map(|m| norm(sub(*m, middle))).collect())
+    let of = |mut values: Vec<f64>| median(&mut values).expect("there are rows");
+    let middle = std::array::from_fn(|k| of(means.iter().map(|m| m[k]).collect()));
+    of(means.iter().map(|m| norm(sub(*m, middle))).collect())
 }
 
 /// Reads values that are stored as they are: lengths become logarithms, alphas logits. Says what was out of range.
@@ -176,8 +174,7 @@ pub(super) fn median_size(params: &Params) -> Option<f64> {
     let table = &params[GEOMETRY];
     let largest = |row: usize| table.read::<3>(row, LOG_SCALE).into_iter().fold(f32::NEG_INFINITY, f32::max);
     let mut sizes: Vec<f32> = (0..table.rows()).map(largest).filter(|s| s.is_finite()).collect();
-    let middle = sizes.len() / 2;
-    (!sizes.is_empty()).then(|| f64::from(*sizes.select_nth_unstable_by(middle, f32::total_cmp).1).exp())
+    median_by(&mut sizes, f32::total_cmp).map(|size| f64::from(size).exp())
 }
 
 /// Says how coarse f32 is at the largest coordinates, where that shows.

@@ -11,7 +11,7 @@ use super::safetensors::{Dtype, SafeTensors, Tensor, checksum, header, sealed};
 use super::{params_to_arrays, tensors_to_loaded};
 use crate::layers::{ALWAYS, Head, Layer, Scene};
 use crate::math::Sim3;
-use crate::motion::{BUILT_IN, Spec, build};
+use crate::motion::{BUILT_IN, Spec, build, is_registered};
 use crate::scene::features::{FEATURES, MOST_CHANNELS};
 use crate::scene::labels::LABEL_LOGITS;
 use crate::scene::masks::WORD;
@@ -108,6 +108,16 @@ pub fn spec_to_json(spec: &Spec) -> Value {
 /// A motion model's spec from JSON. Errors: a model that this version does not know, or a field that is missing or wrong.
 pub fn spec_from_json(v: &Value) -> Result<Spec> {
     let model = text(v, "model")?;
+    if v["custom"].as_bool() == Some(true) {
+        if is_registered(&model) {
+            return Ok(Spec::Custom(model));
+        }
+        return Err(Error::new(
+            ErrorKind::Unsupported,
+            format!("the scene moves by `{model}`, a motion model of another program"),
+        )
+        .remedy("Open it in the program that registers this model (Python: `motion=`), or open the baked .s4d file"));
+    }
     if !BUILT_IN.contains(&model.as_str()) {
         return Err(Error::new(
             ErrorKind::Unsupported,
@@ -533,7 +543,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scene_comes_back_bit_for_bit() {
+    fn a_scene_round_trips_bit_for_bit() {
         let s = scene();
         let mut bytes = Vec::new();
         write(&s, &mut bytes).unwrap();

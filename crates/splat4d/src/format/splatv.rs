@@ -172,7 +172,7 @@ fn splats(chunk: &Value, body: &[u8], mut warnings: Warnings) -> Result<(Scene<f
     let count = body.chunks_exact(ROW).rposition(|row| row.iter().any(|&b| b != 0)).map_or(0, |i| i + 1);
     let rows: Vec<Moving> = body.chunks_exact(ROW).take(count).map(unpack).collect();
     let damaged = rows.iter().filter(|m| !is_finite(m)).count();
-    warnings.counted(damaged, rows.len(), "hold NaN or infinity and were left out");
+    warnings.counted(damaged, rows.len(), "contain NaN or infinity and were left out");
     let sound: Vec<Moving> = rows.into_iter().filter(is_finite).collect();
     Ok((scene(&sound, clock)?, warnings))
 }

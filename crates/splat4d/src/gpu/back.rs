@@ -104,7 +104,7 @@ impl GpuRenderer {
         let shaped = |planes: Option<&Planes<f32>>, channels: usize| {
             if let Some(p) = planes {
                 let shape = [p.channels, p.height, p.width];
-                assert_eq!(shape, [channels, size[1], size[0]], "a picture's gradient has the picture's shape");
+                assert_eq!(shape, [channels, size[1], size[0]], "an image's gradient has the image's shape");
             }
         };
         shaped(Some(grads.color), 3);

@@ -190,9 +190,9 @@ impl Buffers {
             pair_values: [storage("pairs of tile and splat"), storage("pairs of tile and splat")],
             owners: storage("pairs of tile and splat"),
             ranges: storage("the tiles' lists"),
-            planes: storage("the picture's planes"),
-            bytes: storage("the picture's bytes"),
-            d_planes: storage("the gradient to the picture"),
+            planes: storage("the image's planes"),
+            bytes: storage("the image's bytes"),
+            d_planes: storage("the gradient to the image"),
             maps: storage("the loss's planes"),
             partials: storage("the loss's sums"),
             records: storage("gradients of pairs of tile and splat"),
@@ -200,7 +200,7 @@ impl Buffers {
             back: storage("gradients of the Gaussians"),
             cameras: storage("gradients of the camera"),
             times: Grown::new("timestamps", Usage::QUERY_RESOLVE | Usage::COPY_SRC),
-            staging: Grown::new("the picture", Usage::MAP_READ | Usage::COPY_DST),
+            staging: Grown::new("the image", Usage::MAP_READ | Usage::COPY_DST),
             back_staging: Grown::new("the gradients", Usage::MAP_READ | Usage::COPY_DST),
         }
     }

@@ -3,7 +3,8 @@
 use super::back::{Came, End};
 use super::buffers::UNIFORM_STRIDE;
 use super::clock::Recorder;
-use super::frame::{Back, Band, Frame, Groups, RECORD_BYTES, THREADS, TILE, count, slot};
+use super::frame::{Back, Band, Frame, Groups, RECORD_BYTES, TILE, count, slot};
+use super::limits::THREADS;
 use super::pictures::Held;
 use super::{GpuRenderer, GpuStats, GpuTimings, MOST_GROUPS, PLANES, Way, largest_binding, plane_bytes};
 use crate::Result;
@@ -92,7 +93,7 @@ impl GpuRenderer {
         let start = Instant::now();
         let (n, size) = (shot.splats.len(), [shot.camera.width, shot.camera.height]);
         let shape = [target.truth.channels, target.truth.width, target.truth.height];
-        assert_eq!(shape, [CHANNELS, size[0], size[1]], "a picture and its truth have one shape");
+        assert_eq!(shape, [CHANNELS, size[0], size[1]], "an image and its truth have one shape");
         if !self.can_compare(n, size) {
             return Ok(None);
         }

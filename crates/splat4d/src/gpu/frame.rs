@@ -5,13 +5,12 @@ use super::buffers::{Buffers, Grown, UNIFORM_STRIDE};
 use super::clock::{Recorder, Stage};
 use super::device::Gpu;
 use super::kernels::{BackKernels, Kernel, Kernels};
+use super::limits::THREADS;
 use super::upload::{Draw, Upload};
 use wgpu::{BindGroup, BindingResource, ComputePass};
 
 /// Pixels across and down a tile (tiles.wgsl, rasterize.wgsl).
 pub(super) const TILE: usize = 16;
-/// Threads of every workgroup.
-pub(super) const THREADS: usize = 256;
 /// Digits of a sort's pass; each has a workgroup in its scan.
 pub(super) const DIGITS: usize = 256;
 /// Passes that sort 32 bits.

@@ -19,6 +19,7 @@ mod compare;
 mod device;
 mod frame;
 mod kernels;
+mod limits;
 mod pictures;
 mod resident;
 mod roofline;
@@ -42,8 +43,9 @@ use crate::{Error, ErrorKind, Result};
 use back::Returned;
 use buffers::{Buffers, Grown, UNIFORM_STRIDE, largest_binding};
 use clock::{Queries, Recorder, TIMES_BYTES};
-use frame::{Band, DIGITS, Frame, Groups, RANGE_BYTES, THREADS, TILE, arguments, count, slot};
+use frame::{Band, DIGITS, Frame, Groups, RANGE_BYTES, TILE, arguments, count, slot};
 use kernels::{BackKernels, Kernels};
+use limits::THREADS;
 use pictures::Pictures;
 use rayon::prelude::*;
 use resident::{AHEAD, Flights, Tables as KeptTables};
@@ -184,7 +186,7 @@ impl GpuRenderer {
         if across > MOST_GROUPS || band_rows == 0 {
             return Err(Error::new(
                 ErrorKind::Unsupported,
-                format!("a picture {w} pixels wide is too large for the GPU"),
+                format!("an image {w} pixels wide is too large for the GPU"),
             )
             .remedy("Render on the CPU."));
         }
@@ -358,7 +360,7 @@ impl GpuRenderer {
         staging.map_async(wgpu::MapMode::Read, .., |_| ());
         gpu.wait()?;
         let lost = |e: wgpu::MapRangeError| {
-            Error::new(ErrorKind::Unsupported, format!("the picture cannot be read from the GPU ({e})"))
+            Error::new(ErrorKind::Unsupported, format!("the image cannot be read from the GPU ({e})"))
                 .at(gpu.name())
                 .remedy("Render on the CPU.")
         };

@@ -80,7 +80,7 @@ impl Pictures {
         let weight = target.weight.map_or(pixels, |w| w.data.iter().map(|x| f64::from(*x)).sum());
         let bytes = size_of_val(&self.words[..]) as u64;
         if self.bytes + bytes <= self.budget {
-            let mut fresh = Grown::storage("a picture's truth");
+            let mut fresh = Grown::storage("an image's truth");
             match fresh.fit(gpu, bytes) {
                 Ok(()) => {
                     gpu.queue.write_buffer(fresh.get(), 0, bytemuck::cast_slice(&self.words));
@@ -94,7 +94,7 @@ impl Pictures {
             }
         }
         let fits = self.spare.iter().position(|buffer| buffer.bytes() >= bytes);
-        let mut buffer = fits.map_or_else(|| Grown::storage("a picture's truth"), |at| self.spare.swap_remove(at));
+        let mut buffer = fits.map_or_else(|| Grown::storage("an image's truth"), |at| self.spare.swap_remove(at));
         if fits.is_none() {
             buffer.fit(gpu, bytes)?;
             self.passing += buffer.bytes();
@@ -107,7 +107,7 @@ impl Pictures {
     /// Takes back a picture that nobody compares with any more.
     pub(super) fn give_back(&mut self, held: Held) {
         if !held.stays {
-            self.spare.push(Grown::of("a picture's truth", held.buffer));
+            self.spare.push(Grown::of("an image's truth", held.buffer));
         }
     }
 

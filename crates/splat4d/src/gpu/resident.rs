@@ -15,8 +15,9 @@ mod uniforms;
 use super::buffers::{Buffers, Grown, UNIFORM_STRIDE, largest_binding};
 use super::clock::{Recorder, Stage};
 use super::device::Gpu;
-use super::frame::{THREADS, count, slot};
+use super::frame::{count, slot};
 use super::kernels::{Kernel, ResidentKernels};
+use super::limits::{GEOMETRY_WIDTH, THREADS};
 use super::upload::Upload;
 use super::{GpuRenderer, MOST_GROUPS};
 use crate::render::{
@@ -34,8 +35,7 @@ use uniforms::{Ask, MOST_COLUMNS, RecordRule, Rule};
 
 /// Number of the SH table; those before it lie side by side in one buffer.
 const SH: usize = KEPT - 1;
-/// Columns of the geometry that splats are made of (mean, covariance, opacity) and of a row's statistics.
-const GEOMETRY_WIDTH: usize = 10;
+/// Columns of a row's statistics.
 const STATS_WIDTH: usize = 3;
 /// Pieces in which Adam takes the widest table: three blocks of SH of degree 3.
 const PIECES: usize = 3;
@@ -658,11 +658,6 @@ fn page_rows(gpu: &Gpu, layer: &KeptLayer<'_>) -> usize {
     let bytes = 4 * widest.into_iter().max().expect("there are some") as u64;
     let rows = usize::try_from(largest_binding(gpu) / bytes).unwrap_or(usize::MAX);
     (rows / BLOCK).max(1) * BLOCK
-}
-
-/// Bytes of a layer's geometry as it is drawn.
-pub(super) fn geometry_bytes(rows: usize) -> u64 {
-    (4 * GEOMETRY_WIDTH * rows.next_multiple_of(BLOCK)) as u64
 }
 
 const _: () = assert!(count::PAIRS == 2 && count::STOP == 3, "the shaders read them there");

@@ -1,7 +1,7 @@
 //! Constants of the kernels that decide how fast they are, and of what they compute nothing but, where it says so, last bits: what
 //! a sweep on a card varies.
 
-use super::frame::THREADS;
+use super::limits::THREADS;
 
 /// See the module's documentation. The defaults are the portable ones, chosen without a card.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -5,11 +5,10 @@
 
 use super::buffers::{Grown, largest_binding};
 use super::device::Gpu;
-use super::frame::THREADS;
-use super::resident::geometry_bytes;
+use super::limits::{THREADS, geometry_bytes};
 use super::{MOST_GROUPS, Tables};
-use crate::scene::splats::{Part, Rows, SPLAT_OPACITY};
-use crate::scene::{BLOCK, Color, Splats, Table};
+use crate::scene::splats::{Part, SPLAT_OPACITY};
+use crate::scene::{BLOCK, Color, Rows, Splats, Table};
 use crate::{Error, ErrorKind, Result};
 
 /// Bits of [`Piece::flags`], as in splats.wgsl.

@@ -45,7 +45,7 @@ pub fn to_spacetime<F: Real>(layer: &Layer<F>) -> Result<Layer<F>> {
         ));
     }
     if layer.life != LifeKind::Infinite {
-        return Err(cannot("this layer has a life besides native4d's own", "Bake the scene"));
+        return Err(cannot("this layer has a lifespan in addition to native4d's own", "Bake the scene"));
     }
     let own = layer.params.find(TABLE).expect("a native4d layer has its table");
     let rows = layer.params.len();

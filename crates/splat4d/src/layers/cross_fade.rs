@@ -144,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn coinciding_layers_show_one_picture_throughout_and_linear_opacities_do_not() {
+    fn cross_faded_equal_layers_render_equally() {
         // So large that every pixel sees a splat's centre.
         let wide = pair(12.0);
         let one = drawn(&wide, 0.5);

@@ -126,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn a_turned_scene_seen_by_a_turned_camera_is_the_same_picture() {
+    fn a_turned_scene_seen_by_a_turned_camera_is_the_same_image() {
         the_same_picture(&moving(None));
         let featured = moving(Some(FeatureSpec { seed: 3 }));
         the_same_picture(&featured);

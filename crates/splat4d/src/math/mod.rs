@@ -1,11 +1,13 @@
-//! Small mathematics: quaternions, symmetric 3x3 matrices, rigid motions, similarities, spherical harmonics, counter-based random
+//! Small mathematics: vectors, quaternions, medians, image halving, symmetric 3x3 matrices, rigid motions, similarities, spherical harmonics, counter-based random
 //! numbers, and the [`Real`] trait that lets every kernel run in f32 and be checked in f64.
 
 pub mod align;
 pub mod cholesky;
+pub mod image;
 pub mod jacobi;
 pub mod knn;
 pub mod mat3;
+mod median;
 pub mod quat;
 pub(crate) mod real;
 pub(crate) mod rng;
@@ -16,7 +18,9 @@ pub(crate) mod sim3;
 pub mod spd;
 pub mod sym3;
 pub(crate) mod twist;
+pub mod vec3;
 
+pub use median::{median, median_by};
 pub use real::Real;
 pub use rng::Rng;
 pub use se3::Se3;

@@ -1,5 +1,7 @@
 //! Rigid motions and 3-vectors in f64: poses are few, so they are kept exact.
 
+pub use super::vec3::{cross, dot};
+
 /// A rotation and a translation, named by direction at the use (`cam_from_world`): y = R x + t.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Se3 {
@@ -86,16 +88,6 @@ pub fn mat_mul(a: &[[f64; 3]; 3], b: &[[f64; 3]; 3]) -> [[f64; 3]; 3] {
 /// Transpose.
 pub fn transpose(m: &[[f64; 3]; 3]) -> [[f64; 3]; 3] {
     std::array::from_fn(|i| std::array::from_fn(|j| m[j][i]))
-}
-
-/// Scalar product.
-pub fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
-
-/// Vector product.
-pub fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
-    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
 /// a − b

@@ -108,7 +108,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_similarity_is_told_apart() {
+    fn non_similarities_are_recognised() {
         let mirror = [[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
         assert!(!Sim3::from_rotation(mirror).is_sound());
         assert!(!Sim3::from_rotation([[1.0, 0.1, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]).is_sound());

@@ -4,6 +4,7 @@
 //! c = (θ − sin θ)/θ³. Source: Murray, Li and Sastry 1994, §2.3; Park et al. 2021 (Nerfies) §3.2.
 
 use super::Real;
+use super::vec3::{cross, dot};
 
 /// Below this |w|² the coefficients come from their series, whose next term is then below 1e-13.
 const SERIES: f64 = 1.0;
@@ -66,16 +67,6 @@ fn coefficients<F: Real>(s: F) -> ([F; 3], [F; 3]) {
     let c = (F::ONE - a) / s;
     let d_a = (cos - a) / (F::TWO * s);
     ([a, b, c], [d_a, (F::HALF * a - b) / s, (-d_a - c) / s])
-}
-
-#[inline(always)]
-fn dot<F: Real>(a: [F; 3], b: [F; 3]) -> F {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
-
-#[inline(always)]
-fn cross<F: Real>(a: [F; 3], b: [F; 3]) -> [F; 3] {
-    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
 #[cfg(test)]

@@ -26,6 +26,7 @@ pub use path::{FadeKey, PathKey};
 use super::{At, Cache, Capabilities, Model, Motion, Phase, Spec, Tape, central_velocity};
 use crate::math::sh::{MAX_COEFFS, degree_of};
 use crate::math::sh_rotation::sh_rotation;
+use crate::math::vec3::dot;
 use crate::math::{Real, Rng, Sim3};
 use crate::scene::splats::{COV, SPLAT_COLUMNS, SPLAT_OPACITY};
 use crate::scene::table::par_split;
@@ -261,7 +262,7 @@ impl<F: Real> Edited<F> {
                 let mut row = inner.read::<WIDTH>(j, 0);
                 row[SPLAT_OPACITY] *= factor;
                 if let Some(a) = placed.of(q.rows.id(j)) {
-                    let mean: [F; 3] = std::array::from_fn(|i| dot3(a.m[i], [row[0], row[1], row[2]]) + a.b[i]);
+                    let mean: [F; 3] = std::array::from_fn(|i| dot(a.m[i], [row[0], row[1], row[2]]) + a.b[i]);
                     let cov = congruence(&a.q, std::array::from_fn(|k| row[COV + k]));
                     row[..3].copy_from_slice(&mean);
                     row[COV..SPLAT_OPACITY].copy_from_slice(&cov);
@@ -407,17 +408,12 @@ impl<F: Real> Placed<'_, F> {
     }
 }
 
-#[inline(always)]
-fn dot3<F: Real>(a: [F; 3], b: [F; 3]) -> F {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
-
 /// Q S Qᵀ of a symmetric matrix as xx, xy, xz, yy, yz, zz.
 #[inline(always)]
 fn congruence<F: Real>(q: &[[F; 3]; 3], [xx, xy, xz, yy, yz, zz]: [F; 6]) -> [F; 6] {
     let s = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
-    let half: [[F; 3]; 3] = std::array::from_fn(|i| std::array::from_fn(|k| dot3(q[i], [s[0][k], s[1][k], s[2][k]])));
-    let at = |i: usize, k: usize| dot3(half[i], q[k]);
+    let half: [[F; 3]; 3] = std::array::from_fn(|i| std::array::from_fn(|k| dot(q[i], [s[0][k], s[1][k], s[2][k]])));
+    let at = |i: usize, k: usize| dot(half[i], q[k]);
     [at(0, 0), at(0, 1), at(0, 2), at(1, 1), at(1, 2), at(2, 2)]
 }
 

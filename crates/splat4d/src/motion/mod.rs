@@ -12,6 +12,7 @@ pub mod filtered;
 pub mod hexplane;
 pub(crate) mod lanes;
 pub mod native4d;
+mod outside;
 pub(crate) mod registry;
 pub mod skin;
 pub mod spacetime;
@@ -31,6 +32,7 @@ use std::sync::Arc;
 
 use registry::registry;
 
+pub use outside::{MakeMotion, is_registered, register};
 pub use registry::{Capabilities, Model, Phase, Polynomial, Slices};
 pub use spacetime::{Spacetime, SpacetimeSpec};
 pub use still::Still;

@@ -2,7 +2,6 @@
 //! [`motion`](super) into [`Spec`](super::Spec), its names and [`build`](super::build).
 
 use super::Motion;
-use super::spacetime::MAX_ORDER;
 use crate::Result;
 use crate::math::Real;
 use crate::scene::life::CENTER;
@@ -151,7 +150,8 @@ macro_rules! registry {
         pub enum Spec {
             $($(#[$doc])* #[serde(rename = $name)] $variant $(($spec))?,)*
             $($(#[$w_doc])* #[serde(rename = $w_name)] $w_variant($w_spec),)*
-            /// A model from outside this library; it cannot be built from a file.
+            /// A model from outside this library; it can be built from a file where it is
+            /// [registered](super::register).
             #[serde(skip)]
             Custom(String),
         }
@@ -198,7 +198,8 @@ macro_rules! registry {
 
         /// Makes the model, and in `p` the tables it needs (or claims the loaded ones).
         ///
-        /// Errors: `Spec::Custom`; numbers out of their ranges; loaded arrays of the wrong shape.
+        /// Errors: a `Spec::Custom` that nobody has registered; numbers out of their ranges; loaded arrays of the wrong
+        /// shape.
         pub fn build(spec: &Spec, p: &mut Params) -> Result<Arc<dyn Motion>> {
             build_as(spec, p)
         }
@@ -209,10 +210,15 @@ macro_rules! registry {
             match spec {
                 $(Spec::$variant $(($bound))? => Model::build($model, p),)*
                 $(Spec::$w_variant($w_bound) => Model::build($wrapper, p),)*
-                Spec::Custom(name) => Err(Error::input(format!("motion model `{name}` is not one of this version's"))
-                    .remedy(format!("It knows: {}. A newer splat4d may know more", BUILT_IN.join(", ")))),
+                Spec::Custom(name) => outside::build(name, p).unwrap_or_else(|| {
+                    Err(Error::input(format!("motion model `{name}` is not one of this version's"))
+                        .remedy(format!("It knows: {}. A newer splat4d may know more", BUILT_IN.join(", "))))
+                }),
             }
         }
     };
 }
 pub(super) use registry;
+
+/// Highest order of the polynomial.
+pub(crate) const MAX_ORDER: usize = 3;

@@ -17,6 +17,7 @@
 
 mod blend;
 mod offset;
+mod tasks;
 #[cfg(test)]
 mod tests;
 mod weights;

@@ -8,6 +8,7 @@
 //! Source: Li et al. 2024 (STG) §3; Wang et al. 2025 (FreeTimeGS) §3.
 
 use super::lanes::{Batch, Lane, Work, fill, scatter};
+use super::registry::MAX_ORDER;
 use super::still::{activate_backward_lanes, activate_lanes};
 use super::{At, Cache, Capabilities, Model, Motion, Polynomial, Spec, Tape, fill_rows};
 use crate::math::{Real, Sim3, quat, sh};
@@ -19,9 +20,6 @@ use crate::simd::each;
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
-
-/// Highest order of the polynomial.
-pub(crate) const MAX_ORDER: usize = 3;
 
 /// The model as plain data.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]

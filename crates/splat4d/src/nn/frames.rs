@@ -9,6 +9,7 @@
 
 use crate::math::knn::knn;
 use crate::math::sym3;
+use crate::math::vec3::{cross, dot};
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
 
@@ -194,14 +195,6 @@ fn across_any(frame: &Frame, axis: [f64; 3]) -> [f64; 3] {
 
 fn minus(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     [0, 1, 2].map(|k| a[k] - b[k])
-}
-
-fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
-
-fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
-    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
 #[cfg(test)]

@@ -125,7 +125,7 @@ fn memory_and_bytes_read_are_bounded() {
 }
 
 #[test]
-fn a_cut_file_plays_up_to_there_and_then_says_so() {
+fn a_truncated_file_plays_to_its_end_and_reports_it() {
     let mut file = take();
     file.truncate(file.len() - 300);
     let length = file.len() as u64;

@@ -1,9 +1,11 @@
 //! The seam between a scene and whatever draws it: [`Backend`], implemented by the renderer of the CPU, by the oracle and
 //! (feature `gpu`) by the renderer of the GPU, so that training, evaluation and the command know none of them by name.
 
-use super::{Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Resident, oracle};
+use super::compare::{Comparison, Target};
+use super::resident::Resident;
+use super::{Image, ImageGrads, RenderConfig, RenderGrads, Renderer};
 use crate::math::{Real, sh};
-use crate::scene::{Camera, Planes, Splats, Table};
+use crate::scene::{Camera, Splats, Table};
 use crate::{Error, ErrorKind, Result};
 
 /// Abilities that not every backend has. Colour, alpha and depth over a background are drawn by all.
@@ -46,34 +48,6 @@ impl<'a, F: Real> Shot<'a, F> {
     pub fn wanted(&self) -> Wanted {
         Wanted { extra: self.extra.is_some(), head: self.splats.head.is_some(), ..Wanted::default() }
     }
-}
-
-/// What a picture is compared with, and how: the loss of 3DGS, (1 − λ)·L1 + λ·(1 − SSIM), as plain data.
-#[derive(Clone, Copy, Debug)]
-pub struct Target<'a, F = f32> {
-    /// The truth, [3, h, w].
-    pub truth: &'a Planes<F>,
-    /// Weights of pixels, ≥ 0, [1, h, w]; one of weight 0 is as one outside of the picture. None: 1.
-    pub weight: Option<&'a Planes<F>>,
-    /// The truth's number: under one number and size there is always the same truth, which a device may keep.
-    pub picture: usize,
-    /// λ: the share of 1 − SSIM.
-    pub dssim: f64,
-    /// How the camera shows what is drawn: a matrix without the identity, row by row, then an offset a channel.
-    pub response: Option<[F; 12]>,
-}
-
-/// The result of a comparison, its means weighted.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Comparison {
-    /// Mean |picture − truth| over pixels and channels.
-    pub l1: f64,
-    /// Mean of the SSIM map.
-    pub ssim: f64,
-    /// Mean of (picture − truth)², the picture clamped to [0, 1].
-    pub mse: f64,
-    /// Gradient to the camera's response, where there is one.
-    pub d_response: Option<[f64; 12]>,
 }
 
 /// Whether a scene's tables change between renders.
@@ -164,7 +138,7 @@ pub(crate) fn refusal(who: &str, what: &str) -> Error {
 
 impl<F: Real> Backend<F> for Renderer<F> {
     fn can(&self, wanted: &Wanted) -> Result<()> {
-        if wanted.compare { Err(refusal("the renderer of the CPU", "compare pictures")) } else { Ok(()) }
+        if wanted.compare { Err(refusal("the renderer of the CPU", "compare images")) } else { Ok(()) }
     }
 
     fn render(&mut self, shot: &Shot<'_, F>, out: &mut Image<F>) -> Result<()> {
@@ -193,45 +167,5 @@ impl<F: Real> Backend<F> for Renderer<F> {
 
     fn name(&self) -> &str {
         "the CPU"
-    }
-}
-
-/// [`oracle::render`] as a backend: forward only.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct Oracle {
-    /// Limits of the blend.
-    pub config: RenderConfig,
-}
-
-impl Backend<f64> for Oracle {
-    fn can(&self, wanted: &Wanted) -> Result<()> {
-        if wanted.backward || wanted.compare { Err(refusal("the oracle", "take gradients back")) } else { Ok(()) }
-    }
-
-    fn render(&mut self, shot: &Shot<'_, f64>, out: &mut Image<f64>) -> Result<()> {
-        *out = oracle::render(shot, &self.config);
-        Ok(())
-    }
-
-    fn vjp(
-        &mut self,
-        _: &Shot<'_, f64>,
-        _: &ImageGrads<'_, f64>,
-        _: &mut [Option<&mut Table<f64>>],
-        _: &mut RenderGrads<f64>,
-    ) -> Result<()> {
-        self.can(&Wanted { backward: true, ..Wanted::default() })
-    }
-
-    fn radii(&self) -> &[f64] {
-        &[]
-    }
-
-    fn config(&self) -> &RenderConfig {
-        &self.config
-    }
-
-    fn name(&self) -> &str {
-        "the oracle"
     }
 }

@@ -80,7 +80,7 @@ impl<F: Real> Headed<F> {
         let chunk = TASK_ROWS * w.max(1);
         by_task(&mut image.color, chunk).into_par_iter().enumerate().for_each(|(task, color)| {
             let further = each(|c| part(self.further.plane(c), task, chunk));
-            let [r, g, b] = color.try_into().unwrap_or_else(|_| unreachable!("a picture has three channels"));
+            let [r, g, b] = color.try_into().unwrap_or_else(|_| unreachable!("an image has three channels"));
             dispatch(simd, Forward { net: &net, width: w, row: task * TASK_ROWS, further, color: [r, g, b] });
         });
     }

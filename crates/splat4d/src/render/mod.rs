@@ -16,6 +16,7 @@
 pub(crate) mod backend;
 pub mod bin;
 mod blend;
+mod compare;
 mod count;
 mod gather;
 mod head;
@@ -31,9 +32,11 @@ pub mod shade;
 mod tests;
 
 pub use crate::simd::Simd;
-pub use backend::{Backend, Comparison, Oracle, Shot, Tables, Target, Wanted};
+pub use backend::{Backend, Shot, Tables, Wanted};
+pub use compare::{Comparison, Target};
 pub(crate) use count::PairCounts;
 pub use importance::{Importance, Sensitivity};
+pub use oracle::Oracle;
 pub use project::{Projected, ProjectedGrads, View};
 pub use resident::{
     KEPT, KeptCameras, KeptLayer, KeptNoise, KeptNumbers, KeptRule, KeptStep, KeptStepped, KeptTable, KeptTies,
@@ -358,7 +361,7 @@ impl<F: Real> Renderer<F> {
         let plane = |planes: Option<&'_ Planes<F>>, channels: usize| {
             if let Some(p) = planes {
                 let shape = [p.channels, p.height, p.width];
-                assert_eq!(shape, [channels, size[1], size[0]], "a picture's gradient has the picture's shape");
+                assert_eq!(shape, [channels, size[1], size[0]], "an image's gradient has the image's shape");
             }
         };
         plane(Some(grads.color), 3);

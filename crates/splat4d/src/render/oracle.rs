@@ -2,7 +2,9 @@
 //!
 //! Shares no code with the fast path but the spherical-harmonics constants. For tests, goldens and doubts.
 
-use super::{Antialias, Image, RenderConfig, Shot};
+use super::backend::{Backend, Shot, Wanted, refusal};
+use super::{Antialias, Image, ImageGrads, RenderConfig, RenderGrads};
+use crate::Result;
 use crate::math::{Real, se3, sh};
 use crate::scene::head::{BASE, FEATURES, FURTHER, HIDDEN, INPUTS};
 use crate::scene::splats::{COV, SPLAT_OPACITY};
@@ -192,4 +194,44 @@ fn headed<F: Real>(head: &HeadWeights<'_, F>, base: [f64; 3], further: &[f64; FU
         let logit = (near / (1.0 - near)).ln() + (base[c] - near) / (near * (1.0 - near));
         1.0 / (1.0 + (-(logit + z)).exp())
     })
+}
+
+/// [`render`] as a backend: forward only.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Oracle {
+    /// Limits of the blend.
+    pub config: RenderConfig,
+}
+
+impl Backend<f64> for Oracle {
+    fn can(&self, wanted: &Wanted) -> Result<()> {
+        if wanted.backward || wanted.compare { Err(refusal("the oracle", "take gradients back")) } else { Ok(()) }
+    }
+
+    fn render(&mut self, shot: &Shot<'_, f64>, out: &mut Image<f64>) -> Result<()> {
+        *out = render(shot, &self.config);
+        Ok(())
+    }
+
+    fn vjp(
+        &mut self,
+        _: &Shot<'_, f64>,
+        _: &ImageGrads<'_, f64>,
+        _: &mut [Option<&mut Table<f64>>],
+        _: &mut RenderGrads<f64>,
+    ) -> Result<()> {
+        self.can(&Wanted { backward: true, ..Wanted::default() })
+    }
+
+    fn radii(&self) -> &[f64] {
+        &[]
+    }
+
+    fn config(&self) -> &RenderConfig {
+        &self.config
+    }
+
+    fn name(&self) -> &str {
+        "the oracle"
+    }
 }

@@ -7,6 +7,7 @@ use super::bin::{BIN, Footprint, MASK_SIDE};
 use super::simd::{Kernel, Simd, dispatch, greatest, least, select};
 use super::{Antialias, PartGrads, RenderConfig};
 use crate::math::Real;
+use crate::math::vec3::dot;
 use crate::scene::splats::{COV, SPLAT_OPACITY};
 use crate::scene::{BLOCK, Camera, Splats, Table};
 use rayon::prelude::*;
@@ -154,11 +155,6 @@ struct Ellipse<F> {
     det0: F,
     /// Determinant after the low-pass.
     det1: F,
-}
-
-#[inline(always)]
-fn dot<F: Real>(a: [F; 3], b: [F; 3]) -> F {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
 #[inline(always)]

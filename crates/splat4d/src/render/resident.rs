@@ -1,6 +1,6 @@
 //! The seam between a scene that learns and a device that keeps its tables: [`Resident`].
 
-use super::{Comparison, Target};
+use super::compare::{Comparison, Target};
 use crate::Result;
 use crate::math::Rng;
 use crate::scene::{Camera, LifeKind, Time};

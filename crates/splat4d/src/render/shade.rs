@@ -9,8 +9,8 @@ use super::project::{CHUNK_ROWS, Lanes, Projected, Projection};
 use super::simd::{Kernel, dispatch, select};
 use super::{PartGrads, project};
 use crate::math::{Real, sh};
-use crate::scene::splats::{Part, Rows};
-use crate::scene::{BLOCK, Color, Table};
+use crate::scene::splats::Part;
+use crate::scene::{BLOCK, Color, Rows, Table};
 use rayon::prelude::*;
 use std::ops::Range;
 

@@ -528,7 +528,7 @@ fn threads_change_no_bit() {
 }
 
 #[test]
-fn a_picture_of_too_many_pairs_is_drawn_in_runs_of_bins() {
+fn a_render_of_too_many_pairs_is_split_into_runs_of_bins() {
     // Wide and small splats, on a picture of more than 8 bins across.
     for (size, (w, h)) in [(0.8, (300, 100)), (0.05, (150, 131))] {
         let s = scene(17, 40, size);
@@ -608,7 +608,7 @@ fn contributions_are_the_oracles_and_sum_to_alpha() {
 }
 
 #[test]
-fn contributions_do_not_disturb_the_way_back_and_know_no_threads() {
+fn contributions_change_no_gradient_and_do_not_depend_on_threads() {
     let s = scene(9, 300, 0.1).cast::<f32>();
     let view = camera(150, 90);
     let pool = |threads: usize| rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
@@ -631,7 +631,7 @@ fn contributions_do_not_disturb_the_way_back_and_know_no_threads() {
 
 /// A splat's removal is drawn: the same splats with its opacity at 0.
 #[test]
-fn removals_are_what_a_picture_loses_with_each_splat() {
+fn removals_are_what_an_image_loses_with_each_splat() {
     let mut s = scene(12, 12, 0.15);
     // No pixel stops early, since one that has would go on without the splat.
     s.outs.iter_mut().for_each(|out| (0..out.rows()).for_each(|j| out.set(j, 9, 0.5 * out.get(j, 9))));
@@ -765,7 +765,7 @@ fn f32_gradients_are_those_of_f64() {
 }
 
 #[test]
-fn touched_pixels_are_those_of_the_ellipse_inside_the_picture() {
+fn touched_pixels_are_those_of_the_ellipse_inside_the_image() {
     // One round splat of 10 px standard deviation: α = o·exp(−r²/200) is 1/255 on a circle of known radius.
     let (mut out, mut colors) = (Table::<f64>::new(&SPLAT_COLUMNS, 1), Table::<f64>::new(&[("rgb", 3)], 1));
     out.write(0, 3, [0.01, 0.0, 0.0, 0.01, 0.0, 0.01]);

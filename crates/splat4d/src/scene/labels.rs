@@ -124,7 +124,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn softmax_and_its_way_back() {
+    fn softmax_and_its_gradient() {
         let mut params = Params::<f64>::new(2, 1, &[]);
         let key = claim(&mut params, 4).unwrap();
         params[key].write(1, 0, [0.3, -1.2, 2.0, 0.7]);

@@ -417,15 +417,15 @@ impl<F: Real> Grads<F> {
     }
 
     /// Marks rows of a space as taking part in this step.
-    pub fn activate(&mut self, space: Space, rows: super::Rows<'_>) {
+    pub fn activate(&mut self, space: Space, rows: super::rows::Rows<'_>) {
         let flags = match space {
             Space::Fixed => return,
             Space::Gaussians => &mut self.gaussians,
             Space::Nodes => &mut self.nodes,
         };
         match rows {
-            super::Rows::All => flags.fill(true),
-            super::Rows::Some(ids) => ids.iter().for_each(|&i| flags[i as usize] = true),
+            super::rows::Rows::All => flags.fill(true),
+            super::rows::Rows::Some(ids) => ids.iter().for_each(|&i| flags[i as usize] = true),
         }
     }
 

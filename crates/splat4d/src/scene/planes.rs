@@ -1,6 +1,6 @@
 //! An image as planes: every channel is one contiguous [height, width] array.
 
-use crate::math::Real;
+use crate::math::{Real, image};
 
 /// Channels first, rows from the top, linear in memory: `data[(c·height + y)·width + x]`.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -26,6 +26,12 @@ impl<F: Real> Planes<F> {
         (self.channels, self.height, self.width) = (channels, height, width);
         self.data.clear();
         self.data.resize(channels * height * width, F::ZERO);
+    }
+
+    /// Halves the image: the mean of 2×2 boxes; an odd last row or column is left out.
+    pub fn halve(&mut self) {
+        image::halve(&mut self.data, [self.channels, self.height, self.width]);
+        (self.height, self.width) = (self.height / 2, self.width / 2);
     }
 
     /// Pixels in one plane.

@@ -54,7 +54,7 @@ fn page(folder: &Path) -> String {
 }
 
 #[test]
-fn the_section_tells_both_sides_their_pictures_and_how() {
+fn the_section_shows_before_after_images_and_settings() {
     let (before, after) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     run(before.path(), 100);
     run(after.path(), 120);
@@ -94,7 +94,7 @@ fn what_is_missing_or_strange_costs_no_page() {
     let html = page(folder.path());
     assert!(html.contains("<table>") && !html.contains("NaN") && !html.contains("Stages"), "{html}");
     std::fs::write(folder.path().join(FILE), "{\"after\": 3}").unwrap();
-    assert!(page(folder.path()).contains("not as this version"));
+    assert!(page(folder.path()).contains("written by another version"));
     std::fs::write(folder.path().join(FILE), "{\"after\":").unwrap();
     assert!(Run::open(folder.path()).unwrap_err().to_string().contains(FILE));
 }
@@ -108,7 +108,7 @@ fn the_guard_warns_where_too_much_is_lost() {
 }
 
 #[test]
-fn bytes_are_told_by_part() {
+fn the_report_lists_bytes_by_part() {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/knight.s4d");
     let chart = parts(&file).unwrap();
     for part in ["Gaussians", "palette", "poster", "index"] {

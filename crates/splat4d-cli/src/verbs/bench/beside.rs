@@ -207,7 +207,7 @@ pub(super) fn measure(
     let text = serde_json::to_string_pretty(&ran).expect("plain data is JSON");
     files::write(&folder.join(OURS), text.as_bytes())?;
     let verdicts = verdicts(&ran, &folder)?;
-    let stage = "step, still, beside others".into();
+    let stage = "step, still, against others".into();
     Ok((Row { scene: pinned.name, stage, threads: way.threads, ms: ran.ms, ..Row::default() }, verdicts))
 }
 

@@ -169,7 +169,7 @@ pub(super) fn beside(
         let mut renderer = renderer(Tuning::default())?;
         renderer.config = super::beside::config();
         let name = renderer.gpu().describe();
-        note(&format!("scene {} on {name}, beside others ...", pinned.name));
+        note(&format!("scene {} on {name}, against others ...", pinned.name));
         let measured = pool.install(|| super::beside::measure(pinned, folder, way, Box::new(renderer), &name));
         let (row, verdicts) = measured?;
         verdicts.iter().for_each(|verdict| note(&format!("scene {}: {verdict}", pinned.name)));

@@ -25,6 +25,7 @@ use splat4d_train::capture::{Capture, CaptureKind, Convention, Extent, Frame, Im
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::dataset::Dataset;
 use splat4d_train::run::peak_memory;
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -179,8 +180,9 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
         }
     };
     Capture {
-        name: "made up".into(),
+        name: "synthetic".into(),
         root: root.to_owned(),
+        elsewhere: BTreeSet::new(),
         kind: CaptureKind::Own,
         cameras: (0..pinned.views.len()).map(|i| Rig { name: format!("camera {i}"), fixed: true }).collect(),
         named: true,
@@ -214,7 +216,7 @@ fn write_pictures(folder: &Path, pictures: &[Planes<f32>]) -> Result<Vec<PathBuf
         let mut file = Vec::new();
         JpegEncoder::new_with_quality(&mut file, JPEG_QUALITY)
             .encode(&bytes, picture.width as u32, picture.height as u32, ExtendedColorType::Rgb8)
-            .map_err(|e| Error::input(format!("a picture cannot be written as JPEG: {e}")))?;
+            .map_err(|e| Error::input(format!("an image cannot be written as JPEG: {e}")))?;
         crate::files::write(&path, &file)?;
         Ok(path)
     };

@@ -82,8 +82,8 @@ fn cells(rows: &[Played]) -> Vec<Vec<String>> {
     let number = |v: Option<f64>, digits: usize| v.map_or_else(String::new, |v| format!("{v:.digits$}"));
     let quantities: [Quantity<'_>; 13] = [
         ("Gaussians", &|s| grouped(s.gaussians)),
-        ("alive, mean", &|s| grouped(s.active_mean.round() as usize)),
-        ("alive, most", &|s| grouped(s.active_max)),
+        ("active, mean", &|s| grouped(s.active_mean.round() as usize)),
+        ("active, maximum", &|s| grouped(s.active_max)),
         ("bytes", &|s| human_bytes(s.bytes)),
         ("as 32-bit floats", &|s| human_bytes(s.float_bytes)),
         ("Mbit/s", &|s| number(s.mbit_per_s, 1)),
@@ -92,8 +92,8 @@ fn cells(rows: &[Played]) -> Vec<Vec<String>> {
         ("frames/s, end to end", &|s| number(Some(s.fps), 1)),
         ("frames/s, blend alone", &|s| number(Some(s.raster_fps), 1)),
         ("pairs tested, million", &|s| number(Some(1e-6 * s.pairs), 2)),
-        ("bytes to first picture, ms", &|s| number(Some(s.decode_ms), 1)),
-        ("frames/s to the first's", &|s| {
+        ("bytes to first image, ms", &|s| number(Some(s.decode_ms), 1)),
+        ("frames/s, ratio to the first", &|s| {
             rows.first().map_or_else(String::new, |r| format!("{:.2}x", s.fps / r.side.fps))
         }),
     ];
@@ -134,7 +134,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rows_are_told_in_three_ways() {
+    fn rows_are_printed_in_three_formats() {
         let row = |name: &str, fps: f64, psnr: Option<f64>| Played {
             file: name.into(),
             threads: 2,

@@ -114,7 +114,7 @@ impl Pinned {
         let Some(path) = path.filter(|p| p.exists()) else {
             let letter = name.letter();
             let missing =
-                path.map_or_else(|| "its file is not known".into(), |p| format!("there is no {}", p.display()));
+                path.map_or_else(|| "its file was not given".into(), |p| format!("{} does not exist", p.display()));
             return Ok(Err(Skipped(format!("scene {letter} is skipped: {missing}; name it with {option}"))));
         };
         let source = Source::open(path)?;
@@ -178,7 +178,7 @@ pub(super) fn made_up(name: &str, count: usize, [width, height]: [usize; 2]) -> 
 fn of_the_capture(source: &Source, path: &Path, size: usize) -> Result<Vec<View>> {
     let cameras = source.views()?;
     if cameras.is_empty() {
-        return Err(Error::input("it names no cameras to look from")
+        return Err(Error::input("it has no cameras to render from")
             .at(path.display())
             .remedy("Give a run, or a .s4d that was baked from one."));
     }

@@ -12,7 +12,7 @@ use splat4d::render::{Backend, Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::{Camera, Planes, SH, Time};
 use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::capture::frames::{Frames, Picture};
-use splat4d_train::methods::{Group, Plan, Stage, program};
+use splat4d_train::methods::{Group, Plan, Stage};
 use splat4d_train::recipe::{MotionName, Recipe};
 use splat4d_train::run::peak_memory;
 use splat4d_train::step::loss::TrainLoss;
@@ -124,7 +124,6 @@ fn stage(scene: &Scene<f32>, extent: f64) -> Result<Stage> {
         r.run.half_size_until = 0.0;
     });
     let plan = Plan {
-        recipe: recipe.resolve(),
         extent,
         center: [0.0; 3],
         clip: scene.clip,
@@ -133,8 +132,9 @@ fn stage(scene: &Scene<f32>, extent: f64) -> Result<Stage> {
         fixed_cameras: 8,
         moments: vec![(scene.clip[0], 8)],
         masks: false,
+        ..recipe.plan()
     };
-    let mut stages = program(motion.name())?.stages(&plan);
+    let mut stages = recipe.program()?.stages(&plan);
     let mut stage = stages.swap_remove(0);
     (stage.iterations, stage.sh_interval, stage.half_size_steps) = (FOR_EVER, 0, 0);
     // Programs speak of layer 0; here all layers learn.

@@ -24,7 +24,7 @@ pub(super) fn of(capture: &Capture, folder: &Path, console: &Console) -> anyhow:
     if !report.leave_out.is_empty() {
         let _ = writeln!(text, "leave out: {}", report.leave_out.join(", "));
     }
-    let _ = writeln!(text, "wrote {} and doctor.json beside it", html.display());
+    let _ = writeln!(text, "wrote {} and doctor.json next to it", html.display());
     let troubles = report.findings.iter().filter(|f| f.grade > Grade::Note).map(sentence).collect();
     let mut json = serde_json::to_value(&report)?;
     json["type"] = json!("doctor");

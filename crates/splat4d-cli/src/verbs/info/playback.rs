@@ -34,7 +34,7 @@ pub(super) fn of_index(index: &Index) -> ToldIndex {
     line(&mut text, "degree", &format!("{} of the spherical harmonics", meta.sh_degree));
     let extras = [("cameras", meta.cameras.len()), ("keys of a camera path", meta.path.len())];
     for (name, count) in extras.into_iter().filter(|(_, count)| *count > 0) {
-        line(&mut text, "brings along", &format!("{count} {name}"));
+        line(&mut text, "contains", &format!("{count} {name}"));
     }
     let _ = writeln!(
         text,
@@ -63,7 +63,7 @@ pub(super) fn of_index(index: &Index) -> ToldIndex {
         .map(|(name, bytes)| format!("{name} {}", human_bytes(bytes)))
         .collect();
     line(&mut text, "bytes", &parts.join(", "));
-    line(&mut text, "first picture", &format!("after {}", human_bytes(first_picture(index))));
+    line(&mut text, "first image", &format!("after {}", human_bytes(first_picture(index))));
     if let Some(rate) = rate {
         line(&mut text, "stream", &format!("{rate:.1} Mbit/s over {seconds:.3} s"));
     }

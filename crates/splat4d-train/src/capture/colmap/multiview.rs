@@ -1,9 +1,9 @@
 //! 4DGaussians' "multipleview" layout: a folder of frames per camera (`cam01/frame_00001.jpg`), and a COLMAP model of the first
 //! frames in `sparse_/` whose images are called `image1.jpg` by the number of their camera's folder.
 
+use super::super::account::Severity;
 use super::super::account::{Account, Aspect};
 use super::super::points::read_ply;
-use super::super::preflight::Severity;
 use super::super::{PointCloud, rig};
 use super::Shot;
 use splat4d::Result;

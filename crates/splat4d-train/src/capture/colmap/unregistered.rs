@@ -1,7 +1,7 @@
 //! Images on disk that a reconstruction does not pose: they share their camera's pose where it is fixed, else are left out.
 
+use super::super::account::Severity;
 use super::super::account::{Account, Aspect, first_names};
-use super::super::preflight::Severity;
 use super::super::{CaptureOptions, Unregistered, rig, sequence};
 use super::Shot;
 use std::collections::{BTreeMap, BTreeSet};

@@ -1,6 +1,7 @@
 //! Focal lengths: the one that right poses need for matches to lie on their epipolar lines.
 
-use super::super::preflight::{Finding, Severity};
+use super::super::account::Severity;
+use super::super::preflight::Finding;
 use super::Aspect;
 use super::look::Look;
 use super::pairs::{self, Match};

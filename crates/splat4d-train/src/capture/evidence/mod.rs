@@ -14,8 +14,9 @@ mod silhouettes;
 #[cfg(test)]
 mod tests;
 
+use super::account::Severity;
 use super::account::first_names;
-use super::preflight::{Finding, Severity};
+use super::preflight::Finding;
 use super::{Aspect, Capture, DepthFile, Frame, Poses};
 use look::Look;
 pub use motion::Agreement;

@@ -1,9 +1,10 @@
 //! Single wrong poses among right ones: the identity, the pose of another image, a jump out of a path. Each is compared with
 //! matches between its image and others; nothing else raises a warning.
 
+use super::super::account::Severity;
 use super::super::account::first_names;
-use super::super::assemble::same_pose;
-use super::super::preflight::{Finding, Severity};
+use super::super::pose::same_pose;
+use super::super::preflight::Finding;
 use super::super::{Aspect, Capture, Frame};
 use super::look::{self, Look};
 use super::pairs::{self, Match};

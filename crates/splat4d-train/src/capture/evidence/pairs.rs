@@ -1,6 +1,6 @@
 //! Features that two images share, and whether poses put them on each other's epipolar lines, in front of both cameras.
 
-use super::super::assemble::same_pose;
+use super::super::pose::same_pose;
 use super::look::{Look, Mark};
 use rayon::prelude::*;
 use splat4d::math::Se3;

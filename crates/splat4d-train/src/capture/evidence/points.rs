@@ -1,7 +1,8 @@
 //! Initial points: which part is in front of the cameras and in their images, and whether their colours are those there.
 
+use super::super::account::Severity;
 use super::super::lens::Distortion;
-use super::super::preflight::{Finding, Severity};
+use super::super::preflight::Finding;
 use super::super::{Aspect, Capture, DepthFile, DepthKind, Frame, PointCloud, depth};
 use super::look::{Look, pixel_of};
 use super::pairs;

@@ -270,7 +270,7 @@ fn points_of_another_world_are_no_evidence_of_health() {
 }
 
 #[test]
-fn what_says_too_little_is_not_checked() {
+fn weak_evidence_is_not_checked() {
     let mut capture = photos(false);
     capture.train.truncate(1);
     let check = capture.check_poses();

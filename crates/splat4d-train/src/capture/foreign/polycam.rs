@@ -67,8 +67,7 @@ fn read(root: &Path, folder: &Path, options: &CaptureOptions) -> Result<Take> {
     }
     if options.sequence == Sequence::Auto {
         notes.push(
-            "Keyframes are taken for photos of one moment. If they are a film, say --set capture.sequence=video."
-                .into(),
+            "Keyframes are read as photos of one time. If they are a video, use --set capture.sequence=video.".into(),
         );
     }
     let points = only_points(root, &mut notes)?;

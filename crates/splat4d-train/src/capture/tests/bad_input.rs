@@ -55,7 +55,7 @@ fn no_capture_and_no_frames() {
 }
 
 #[test]
-fn missing_and_truncated_pictures() {
+fn missing_and_truncated_images() {
     let sample = samples::own();
     for name in ["0005", "0006"] {
         std::fs::remove_file(sample.path(&format!("images/cam00/{name}.png"))).unwrap();
@@ -149,11 +149,11 @@ fn copies_of_poses_and_instants() {
     assert_says(&message(&sample), &["cam01 and cam02", "one pose"]);
     let sample = samples::nerfstudio();
     sample.edit("transforms.json", |v| v["frames"][1]["time"] = json!(0.0));
-    assert_says(&message(&sample), &["cam0", "two pictures", "0000.png", "0001.png"]);
+    assert_says(&message(&sample), &["cam0", "two images", "0000.png", "0001.png"]);
     let sample = samples::panoptic();
     sample.edit("train_meta.json", |v| v["cam_id"][0][1] = json!(1));
     let text = message(&sample);
-    assert!(text.contains("two pictures"), "{text}");
+    assert!(text.contains("two images"), "{text}");
     let sample = samples::own();
     sample.edit("capture.json", |v| v["cameras"][2]["name"] = json!("cam00"));
     assert_says(&message(&sample), &["cam00", "given twice"]);

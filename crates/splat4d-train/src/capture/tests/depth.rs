@@ -112,7 +112,7 @@ fn windows(bytes: &[u8]) -> Vec<usize> {
 }
 
 #[test]
-fn sizes_are_compared_with_the_picture_before_anything_is_decoded() {
+fn sizes_are_compared_with_the_image_before_decoding() {
     use exr::prelude::*;
     let sample = sample();
     let mut bytes = std::io::Cursor::new(Vec::new());
@@ -127,14 +127,14 @@ fn sizes_are_compared_with_the_picture_before_anything_is_decoded() {
     places.iter().for_each(|&at| bytes[at..at + 4].copy_from_slice(&(1i32 << 29).to_le_bytes()));
     (0..2).for_each(|frame| sample.write(&name(frame, "exr"), &bytes));
     sample.edit("capture.json", |v| v["cameras"][1]["depth"] = json!("depth/cam01/%04d.exr"));
-    assert_says(&load(&sample, 1, 2).unwrap_err().to_string(), &["0005.exr", "536870913x", "its picture"]);
+    assert_says(&load(&sample, 1, 2).unwrap_err().to_string(), &["0005.exr", "536870913x", "its image"]);
     // The same for PNG.
     let mut png = std::io::Cursor::new(Vec::new());
     let side = 9 * WIDTH as u32;
     ImageBuffer::<Luma<u16>, _>::new(side, 1).write_to(&mut png, image::ImageFormat::Png).unwrap();
     (0..2).for_each(|frame| sample.write(&name(frame, "png"), png.get_ref()));
     sample.edit("capture.json", |v| v["cameras"][1]["depth"] = json!("depth/cam01/%04d.png"));
-    assert_says(&load(&sample, 1, 2).unwrap_err().to_string(), &["0005.png", "its picture", "8 times"]);
+    assert_says(&load(&sample, 1, 2).unwrap_err().to_string(), &["0005.png", "its image", "8 times"]);
 }
 
 #[test]

@@ -56,7 +56,7 @@ fn maps_coordinates_become_small_and_the_offset_is_kept() {
 }
 
 #[test]
-fn a_run_of_world_coordinates_is_measured_there_and_said_to_be_coarse() {
+fn a_run_in_world_coordinates_is_measured_there_with_a_precision_warning() {
     let far = samples::photos(9, cam, Some(&Sim3 { translation: SHIFT, ..Sim3::default() }));
     let run = tempfile::tempdir().unwrap();
     let write = |name: &str, text: &str| std::fs::write(run.path().join(name), text).unwrap();

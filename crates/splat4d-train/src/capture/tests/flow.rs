@@ -61,7 +61,7 @@ fn vectors_are_read_where_they_are_known() {
 }
 
 #[test]
-fn flow_is_undistorted_with_its_picture() {
+fn flow_is_undistorted_with_its_image() {
     // Rays move by a constant on the pinhole's picture; the distorted picture shows something else.
     let lens = Lens::Brown { k: [-0.2, 0.03, 0.0, 0.0, 0.0, 0.0], p: [2e-3, -1e-3], s: [0.0; 4] };
     let distortion = Distortion::new(lens);
@@ -132,7 +132,7 @@ fn flo(mark: f32, vectors: &[[f32; 2]]) -> Vec<u8> {
 }
 
 #[test]
-fn flo_and_npy_are_read_as_pictures_are() {
+fn flo_and_npy_are_read_as_images_are() {
     let sample = sample(|_, _| Some([0.0; 2]));
     let mut vectors = vec![[1.5f32, -2.25]; WIDTH * HEIGHT];
     vectors[3] = [1e10, 1e10];

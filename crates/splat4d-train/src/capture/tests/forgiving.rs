@@ -62,7 +62,7 @@ fn split_files_with_intrinsics_in_pixels() {
 }
 
 #[test]
-fn times_above_one_are_seconds_and_cameras_are_told_by_their_poses() {
+fn times_above_one_are_seconds_and_poses_identify_cameras() {
     let sample = samples::dnerf();
     sample.edit("transforms_train.json", |v| {
         let of = |c: usize, t: usize| {
@@ -80,7 +80,7 @@ fn times_above_one_are_seconds_and_cameras_are_told_by_their_poses() {
 }
 
 #[test]
-fn one_file_with_a_test_set_beside_it() {
+fn one_file_with_a_test_set_next_to_it() {
     let sample = samples::photos(9, cam, None);
     let frames = |v: &serde_json::Value| v["frames"].as_array().unwrap().clone();
     let all: serde_json::Value =
@@ -93,7 +93,7 @@ fn one_file_with_a_test_set_beside_it() {
 }
 
 #[test]
-fn resized_pictures_scale_their_intrinsics_and_cropped_ones_are_refused() {
+fn resized_images_scale_their_intrinsics_and_cropped_ones_are_refused() {
     let sample = samples::photos(9, cam, None);
     sample.edit("transforms.json", |v| {
         let double =
@@ -103,7 +103,7 @@ fn resized_pictures_scale_their_intrinsics_and_cropped_ones_are_refused() {
     let capture = open(&sample);
     let view = &capture.frames[3].view;
     assert_eq!((view.width, view.height, view.intrinsics.fx, view.intrinsics.cy), (WIDTH, HEIGHT, FOCAL, 8.0));
-    assert!(says(&capture.warnings, &["9 pictures", "cam00.png is 24x16, not 48x32"]), "{:?}", capture.warnings);
+    assert!(says(&capture.warnings, &["9 images", "cam00.png is 24x16, not 48x32"]), "{:?}", capture.warnings);
     sample.edit("transforms.json", |v| v["h"] = json!(2 * HEIGHT + 6));
     assert_says(&refuse(&sample), &["cam00", "24x16", "48x38"]);
     // Any picture is looked at, not only the first.
@@ -113,7 +113,7 @@ fn resized_pictures_scale_their_intrinsics_and_cropped_ones_are_refused() {
 }
 
 #[test]
-fn points_of_a_model_beside_the_poses() {
+fn points_of_a_model_next_to_the_poses() {
     let near = |capture: &Capture| {
         let points = &capture.points.as_ref().unwrap().points;
         assert!(points.len() == 1 && norm(sub(points[0], [0.1, 0.2, 0.3])) < 1e-9, "{points:?}");
@@ -169,14 +169,18 @@ fn one_of_several_layouts_is_read_and_said() {
 }
 
 #[test]
-fn photos_without_times_are_one_moment() {
+fn photos_without_times_are_one_time() {
     let sample = samples::photos(20, cam, Some(&Sim3::default()));
     for path in [sample.root().to_owned(), sample.path("sparse")] {
         let capture = Capture::open(&path, &CaptureOptions::default()).unwrap();
         assert_eq!((capture.timing, capture.times()), (Timing::Moment, vec![0.0]));
         assert!(capture.cameras.len() == 20 && capture.fixed_cameras());
         assert_eq!((capture.cameras[7].name.as_str(), capture.held.as_slice()), ("cam07", &[0, 8, 16][..]));
-        assert!(says(&capture.notes, &["20 pictures are one moment", "capture.sequence=video"]), "{:?}", capture.notes);
+        assert!(
+            says(&capture.notes, &["20 images are given the same time", "capture.sequence=video"]),
+            "{:?}",
+            capture.notes
+        );
         assert!(capture.warnings.is_empty());
     }
     let held = CaptureOptions { hold_out: Some("camera=cam00".parse().unwrap()), ..CaptureOptions::default() };
@@ -192,7 +196,7 @@ fn numbered_frames_without_times_are_a_film() {
     for path in [sample.root().to_owned(), sample.path("sparse")] {
         let capture = Capture::open(&path, &CaptureOptions::default()).unwrap();
         assert_eq!((capture.timing, capture.times().len(), capture.cameras.len()), (Timing::Numbers, 20, 1));
-        let parts = ["20 pictures", "frame_0001.png", "film of one moving camera", "capture.sequence=photos"];
+        let parts = ["20 images", "frame_0001.png", "video of one moving camera", "capture.sequence=photos"];
         assert!(says(&capture.warnings, &parts), "{:?}", capture.warnings);
     }
     let photos = open_as(&sample, Sequence::Photos);
@@ -208,7 +212,7 @@ fn numbered_frames_without_times_are_a_film() {
 }
 
 #[test]
-fn split_files_without_times_are_one_moment_even_where_they_share_poses() {
+fn split_files_without_times_are_one_time_even_where_they_share_poses() {
     let sample = samples::dnerf();
     for name in &sample.files {
         sample.edit(name, |v| {

@@ -208,7 +208,7 @@ fn images_without_a_mark_of_their_format_are_named_by_their_ending() {
 }
 
 #[test]
-fn files_that_are_no_readable_images_say_what_they_are() {
+fn unreadable_images_are_named_by_their_format() {
     let heads: [(&[u8], &[&str]); 8] = [
         (b"\0\0\0\x18ftypheic\0\0\0\0", &["HEIC", "Convert"]),
         (b"\0\0\0\x18ftypavif\0\0\0\0", &["AVIF", "Convert"]),

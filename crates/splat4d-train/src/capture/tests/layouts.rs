@@ -104,12 +104,12 @@ fn own_format_with_a_table_of_times() {
 }
 
 #[test]
-fn eight_bits_of_any_picture() {
+fn eight_bits_of_any_image() {
     let sample = samples::own();
     let read = Rgb8::read(&sample.path("images/cam01/0006.png")).unwrap();
     assert_eq!((read.width, read.height, read.data.len()), (WIDTH, HEIGHT, WIDTH * HEIGHT * 3));
     assert_eq!(read.data[2], 47, "the blue of camera 1, frame 1");
-    assert!(Rgb8::decode(b"no picture", &sample.path("x.png")).unwrap_err().to_string().contains("x.png"));
+    assert!(Rgb8::decode(b"no image", &sample.path("x.png")).unwrap_err().to_string().contains("x.png"));
 }
 
 #[test]
@@ -320,7 +320,7 @@ fn camera_extent() {
 }
 
 #[test]
-fn a_part_of_a_take_is_what_the_whole_says_of_it() {
+fn a_part_of_a_capture_equals_that_part_of_the_whole() {
     let part = 1..2;
     for (sample, hold_out) in [
         (samples::own(), None),

@@ -76,7 +76,7 @@ fn mutated_metadata_never_breaks_a_reader() {
 }
 
 #[test]
-fn mutated_pictures_never_break_the_store() {
+fn mutated_images_never_break_the_store() {
     let sample = samples::own();
     sample.rgba("a.png", |x, y| [x as u8, y as u8, 7, (x * 10) as u8]);
     sample.write("a.jpg", include_bytes!("tiny.jpg"));

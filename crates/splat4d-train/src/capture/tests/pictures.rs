@@ -37,7 +37,7 @@ fn downscaling_composites_then_averages_boxes() {
 }
 
 #[test]
-fn eight_bit_pictures_stay_exact_and_small() {
+fn eight_bit_images_stay_exact_and_small() {
     let sample = samples::own();
     let capture = open(sample.root(), 1);
     let stored = ImageStore::new(Arc::clone(&capture), 0).load(3).unwrap();
@@ -105,7 +105,7 @@ fn fisheye_borders_are_marked() {
 }
 
 #[test]
-fn undistortion_inverts_a_distorted_picture() {
+fn undistortion_inverts_a_distorted_image() {
     // A picture whose colours are linear in its ray is distorted by the closed model and must come back linear.
     let sample = samples::own();
     let lens = splat4d::scene::Lens::Brown { k: [-0.2, 0.03, 0.0, 0.0, 0.0, 0.0], p: [2e-3, -1e-3], s: [0.0; 4] };
@@ -159,7 +159,7 @@ fn cache_keeps_its_budget_and_never_changes_pixels() {
 }
 
 #[test]
-fn a_picture_is_undistorted_while_all_workers_are_busy() {
+fn an_image_is_undistorted_while_all_workers_are_busy() {
     // A worker that waits for a picture cannot help to make it: whoever makes one must not need the workers.
     let sample = samples::own();
     sample.edit("capture.json", |v| {
@@ -238,7 +238,7 @@ fn every_part_of_a_take_has_the_borders_of_the_whole() {
             sample.save(&format!("images/cam{c:02}/{:04}.png", 5 + t), image);
         }
     }
-    let part = |frames: std::ops::Range<usize>, lenses: &Lenses| {
+    let part = |frames: Range<usize>, lenses: &Lenses| {
         let options = CaptureOptions { frames: vec![frames], lenses: lenses.clone(), ..CaptureOptions::default() };
         Capture::open(sample.root(), &options).unwrap()
     };

@@ -3,7 +3,7 @@
 
 use super::super::*;
 use super::samples::{self, FOCAL, HEIGHT, Sample, WIDTH};
-use crate::capture::assemble::same_pose;
+use crate::capture::pose::same_pose;
 use serde_json::{Value, json};
 use std::path::PathBuf;
 
@@ -214,7 +214,7 @@ fn orientations_follow_whose_pixels_the_poses_describe() {
 }
 
 #[test]
-fn poses_of_another_convention_are_read_as_told() {
+fn poses_of_a_given_convention_are_read() {
     for (layout, sample) in samples::all() {
         let plain = open(&sample);
         let told = CaptureOptions { poses: "inverse".parse().unwrap(), ..CaptureOptions::default() };
@@ -385,7 +385,7 @@ fn keys_of_lenses_are_used_or_refused() {
 }
 
 #[test]
-fn masks_beside_images_are_found_in_every_layout() {
+fn masks_next_to_images_are_found_in_every_layout() {
     let names: [fn(&str) -> String; 5] = [
         |n| format!("masks/{n}.png"),
         |n| format!("masks/{}_mask.png", n.trim_end_matches(".png")),
@@ -436,7 +436,7 @@ fn masks_beside_images_are_found_in_every_layout() {
 }
 
 #[test]
-fn two_poses_of_one_image_are_said() {
+fn two_poses_of_one_image_are_reported() {
     let sample = samples::photos(4, |c| format!("cam{c}.png"), None);
     sample.edit("transforms.json", |v| v["frames"][3]["file_path"] = json!("images/cam1.png"));
     assert_said(&open(&sample), Aspect::Assumed, Severity::Warning, &["1 frames have the image", "cam1", "both have"]);
@@ -510,7 +510,7 @@ fn standard_folders_of_colmap_are_read() {
         let view = &capture.frames[3].view;
         assert_eq!((view.width, view.height, view.intrinsics.fx), (WIDTH / 2, HEIGHT / 2, FOCAL / 2.0));
         assert!(capture.warnings.is_empty() && capture.frames[3].image.starts_with(sample.path("images_2")));
-        assert_said(&capture, Aspect::Assumed, Severity::Note, &["9 pictures", "12x8, not 24x16"]);
+        assert_said(&capture, Aspect::Assumed, Severity::Note, &["9 images", "12x8, not 24x16"]);
     }
     assert_eq!(open(&colmap_at("sparse/0", &["images_2"])).frames[0].view.width, WIDTH / 2);
 }

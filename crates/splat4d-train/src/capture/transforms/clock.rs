@@ -1,10 +1,9 @@
 //! Times of a transforms file, and the cameras that took its frames.
 
-use super::super::account::{Account, Aspect};
+use super::super::account::{Account, Aspect, Severity};
 use super::super::frames::half_frame;
-use super::super::preflight::Severity;
 use super::super::sequence::{Order, Timing};
-use super::super::{CaptureOptions, Sequence, Times, assemble, rig};
+use super::super::{CaptureOptions, Sequence, Times, pose, rig};
 use super::frame::Entry;
 use splat4d::math::Se3;
 use std::collections::BTreeMap;
@@ -209,7 +208,7 @@ fn crowded(entries: &[Entry], times: &[f64], of: &[usize]) -> bool {
     let mut seen: BTreeMap<(usize, u64), &Entry> = BTreeMap::new();
     entries.iter().zip(times).zip(of).any(|((entry, time), &camera)| {
         let other = seen.entry((camera, (time + 0.0).to_bits())).or_insert(entry);
-        !assemble::same_pose(&other.source, &entry.source)
+        !pose::same_pose(&other.source, &entry.source)
     })
 }
 

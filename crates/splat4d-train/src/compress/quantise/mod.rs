@@ -11,7 +11,7 @@ mod tests;
 
 use crate::loss::terms::Codec;
 use crate::methods::spacetime::SpacetimeProgram;
-use crate::methods::{EVERY, Group, Plan, Program, Rate, Stage, program_of};
+use crate::methods::{EVERY, Group, Plan, Program, Rate, RateSettings, SpacetimeSettings, Stage};
 use crate::recipe::Recipe;
 use crate::upkeep::Strategy;
 use crate::{Error, Result};
@@ -178,27 +178,28 @@ pub(crate) fn tuned(groups: Vec<Group>, share: f64) -> Vec<Group> {
 }
 
 /// The rate of a palette that goes with [`tuned`].
-pub(crate) fn palette_rate(recipe: &Recipe, share: f64) -> Rate {
-    let rate = share * recipe.rates.feature * recipe.rates.decay / SH_SLOWDOWN;
+pub(crate) fn palette_rate(rates: &RateSettings, share: f64) -> Rate {
+    let rate = share * rates.feature * rates.decay / SH_SLOWDOWN;
     Rate { start: rate, end: FALL * rate }
 }
 
 /// A stage on the pages of a file, whatever model they were baked from: all groups of kinematic primitives with a life,
 /// in every layer. Its `start` is still to be told: it ends with [`Quantised::begin`].
-pub(crate) fn stage(plan: &Plan, iterations: usize, share: f64, codec: Arc<Quantised>) -> Stage {
-    let rotates = program_of(&plan.recipe).is_ok_and(|p| p.capabilities(plan).rotates);
-    let recipe = plan.recipe.clone().with(|r| {
-        r.spacetime.order = 1;
+pub(crate) fn stage(recipe: &Recipe, plan: &Plan, iterations: usize, share: f64, codec: Arc<Quantised>) -> Stage {
+    let rotates = recipe.program().is_ok_and(|p| p.capabilities(plan).rotates);
+    let spacetime = SpacetimeSettings {
+        order: 1,
         // A turn that no model asked for would cost two bytes a Gaussian.
-        r.spacetime.rotation_rate = plan.recipe.spacetime.rotation_rate || rotates;
-        r.life.kind = Some(LifeKind::Interval);
-        r.densify.strategy = Strategy::None;
-        r.appearance.sh_degree = 0;
-        r.run.iterations = iterations;
-        r.loss.opacity_life = 0.0;
-        r.loss.velocity = 0.0;
-    });
-    let base = SpacetimeProgram.stages(&Plan { recipe, ..plan.clone() }).remove(0);
+        rotation_rate: recipe.spacetime.rotation_rate || rotates,
+        ..recipe.spacetime.clone()
+    };
+    let mut plan = Plan { iterations, ..plan.clone() };
+    let c = &mut plan.common;
+    c.life.kind = Some(LifeKind::Interval);
+    c.densify.strategy = Strategy::None;
+    c.appearance.sh_degree = 0;
+    (c.loss.opacity_life, c.loss.velocity) = (0.0, 0.0);
+    let base = SpacetimeProgram { spacetime, guided: recipe.guided }.stages(&plan).remove(0);
     Stage {
         name: "quantised".into(),
         iterations,

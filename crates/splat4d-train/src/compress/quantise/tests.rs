@@ -98,7 +98,7 @@ fn assert_same(a: &Scene<f32>, b: &Scene<f32>, t: Time) {
 }
 
 #[test]
-fn what_is_shown_step_by_step_is_what_the_file_will_say() {
+fn previews_equal_the_saved_file() {
     let (codec, mut scene, pages) = begun(1500, coarse());
     assert!(scene.layers.len() >= 2 && pages.palette.is_some());
     codec.reset();

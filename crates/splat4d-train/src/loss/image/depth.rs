@@ -4,7 +4,7 @@ use super::{ImageTerm, Needs, PictureGrads, SEEN, Shown, View, expected_depth_ba
 use crate::capture::DepthKind;
 use crate::capture::frames::DepthTruth;
 use crate::loss::terms::StepInfo;
-use splat4d::math::Real;
+use splat4d::math::{Real, median_by};
 use splat4d::scene::Planes;
 
 /// [`depth`] of views that know theirs, times a weight that falls to [`LAST`] of it by the end: a map that is wrong bends
@@ -153,8 +153,7 @@ pub(crate) fn apart([depth, alpha]: [&Planes<f32>; 2], truth: DepthTruth<'_>) ->
     let told = |p: usize| truth.values.data[p];
     if truth.kind == DepthKind::Metric {
         let mut ratios: Vec<f32> = pixels.iter().map(|&p| expected[p] / told(p)).collect();
-        let middle = ratios.len() / 2;
-        let median = |values: &mut Vec<f32>| f64::from(*values.select_nth_unstable_by(middle, f32::total_cmp).1);
+        let median = |values: &mut [f32]| f64::from(median_by(values, f32::total_cmp).expect("there are enough"));
         let ratio = median(&mut ratios);
         ratios.iter_mut().for_each(|r| *r = (*r - 1.0).abs());
         return Some(Apart::Ratio(ratio, median(&mut ratios)));
@@ -219,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn maps_of_another_unit_or_upside_down_are_told_apart() {
+    fn maps_of_another_unit_or_upside_down_are_recognised() {
         let like = |data: Vec<f32>| Planes { channels: 1, height: 10, width: 10, data };
         let z: Vec<f32> = (0..100).map(|i| 2.0 + 0.01 * i as f32).collect();
         let (depth, alpha) = (like(z.clone()), like(vec![1.0; 100]));

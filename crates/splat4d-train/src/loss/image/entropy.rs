@@ -29,7 +29,7 @@ pub(crate) fn binary_entropy<F: Real>(p: F) -> (F, F) {
 ///
 /// Source: the opacity entropy of SuGaR (Guédon and Lepetit 2024) on what a pixel shows.
 pub(crate) fn mask_entropy<F: Real>(alpha: &Planes<F>, weight: f64, d_alpha: &mut Planes<F>) -> f64 {
-    assert_eq!(alpha.data.len(), d_alpha.data.len(), "a gradient has its picture's shape");
+    assert_eq!(alpha.data.len(), d_alpha.data.len(), "a gradient has its image's shape");
     let scale = weight / alpha.data.len().max(1) as f64;
     scale
         * super::over_rows(&mut d_alpha.data, alpha.width, |y, d| {

@@ -58,7 +58,7 @@ impl<F: Real> Frequency<F> {
         weight: f64,
         d: &mut Planes<F>,
     ) -> f64 {
-        assert!(image.data.len() == truth.data.len() && d.data.len() == image.data.len(), "pictures of one shape");
+        assert!(image.data.len() == truth.data.len() && d.data.len() == image.data.len(), "images of one shape");
         let (w, h) = (image.width, image.height);
         if w == 0 || h == 0 {
             return 0.0;
@@ -211,7 +211,7 @@ mod tests {
     }
 
     #[test]
-    fn equal_pictures_are_free_and_the_band_grows() {
+    fn equal_images_are_free_and_the_band_grows() {
         let truth = check::planes("truth", [1, 16, 16], 0.0, 1.0);
         assert!(run(&truth, &truth, 1.0, &mut Planes::new(1, 16, 16)) < 1e-12);
         // A chequerboard is the highest frequency there is: only the whole band sees it.

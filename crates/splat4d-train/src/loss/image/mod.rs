@@ -17,32 +17,31 @@ mod term;
 mod tests;
 pub(crate) mod tv;
 
-pub use term::{Channel, Gradient, ImageTerm, Needs, PictureGrads, Shown, View};
+pub use term::{Channel, Gradient, ImageTerm, LossValue, Needs, PictureGrads, Shown, View};
 
-use super::Photometric;
-use crate::recipe::Recipe;
+use super::{LossSettings, Photometric};
 use rayon::prelude::*;
 use splat4d::math::Real;
 
 /// Alpha from which on a pixel shows something: below it depth, normal and flow are those of haze.
 pub(crate) const SEEN: f64 = 0.5;
 
-/// The terms of a recipe, in the order in which values and gradients are summed: colours as 3DGS compares them, then what
+/// The terms that have a weight, in the order in which values and gradients are summed: colours as 3DGS compares them, then what
 /// has a weight.
-pub(crate) fn terms(r: &Recipe) -> Vec<Box<dyn ImageTerm>> {
+pub(crate) fn terms(settings: &LossSettings) -> Vec<Box<dyn ImageTerm>> {
     type Make = fn(f64) -> Box<dyn ImageTerm>;
     let weighted: [(f64, Make); 9] = [
-        (r.loss.tv, |w| Box::new(tv::TotalVariation(w))),
-        (r.loss.frequency, |w| Box::new(frequency::FrequencyTerm::new(w))),
-        (r.loss.mask, |w| Box::new(mask::Mask(w))),
-        (r.loss.mask_entropy, |w| Box::new(entropy::MaskEntropy(w))),
-        (r.loss.depth_tv, |w| Box::new(tv::DepthSmoothness(w))),
-        (r.loss.depth_normal, |w| Box::new(normal::DepthNormal(w))),
-        (r.loss.depth, |w| Box::new(depth::Depth(w))),
-        (r.loss.flow, |w| Box::new(flow::Flow(w))),
-        (r.loss.tracks, |w| Box::new(flow::Tracks(w))),
+        (settings.tv, |w| Box::new(tv::TotalVariation(w))),
+        (settings.frequency, |w| Box::new(frequency::FrequencyTerm::new(w))),
+        (settings.mask, |w| Box::new(mask::Mask(w))),
+        (settings.mask_entropy, |w| Box::new(entropy::MaskEntropy(w))),
+        (settings.depth_tv, |w| Box::new(tv::DepthSmoothness(w))),
+        (settings.depth_normal, |w| Box::new(normal::DepthNormal(w))),
+        (settings.depth, |w| Box::new(depth::Depth(w))),
+        (settings.flow, |w| Box::new(flow::Flow(w))),
+        (settings.tracks, |w| Box::new(flow::Tracks(w))),
     ];
-    let photometric: Box<dyn ImageTerm> = Box::new(Photometric::new(r.loss.dssim as f32));
+    let photometric: Box<dyn ImageTerm> = Box::new(Photometric::new(settings.dssim as f32));
     let weighted = weighted.into_iter().filter(|(weight, _)| *weight > 0.0).map(|(weight, make)| make(weight));
     std::iter::once(photometric).chain(weighted).collect()
 }

@@ -3,6 +3,7 @@
 use super::{Channel, ImageTerm, Needs, PictureGrads, SEEN, Shown, View, expected_depth_backward, over_rows};
 use crate::loss::terms::StepInfo;
 use splat4d::math::Real;
+use splat4d::math::vec3::{cross, dot};
 use splat4d::scene::{Camera, Planes};
 
 /// [`depth_normal`], times a weight.
@@ -26,14 +27,6 @@ impl<F: Real> ImageTerm<F> for DepthNormal {
 
 /// A cross product shorter than this share of the squared depth has no direction.
 const DEGENERATE: f64 = 1e-12;
-
-fn cross<F: Real>(a: [F; 3], b: [F; 3]) -> [F; 3] {
-    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-}
-
-fn dot<F: Real>(a: [F; 3], b: [F; 3]) -> F {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
 
 /// Mean over inner pixels that, with their four neighbours, show something of A − ⟨S, N⟩, A held constant: S = Σ α T n blends
 /// the splats' normals (their shortest axes, towards the camera, camera axes), N is the unit normal of the expected

@@ -2,11 +2,23 @@
 //! truth, and adds its gradient.
 
 use crate::capture::frames::{DepthTruth, FlowTruth};
-use crate::loss::LossValue;
 use crate::loss::terms::StepInfo;
 use splat4d::math::Real;
 use splat4d::render::{Comparison, Image, ImageGrads, Target};
 use splat4d::scene::{Camera, Planes, Time};
+
+/// The loss of one image.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct LossValue {
+    /// (1 − λ)·l1 + λ·(1 − ssim)
+    pub total: f64,
+    /// Weighted mean |render − truth| over pixels and channels.
+    pub l1: f64,
+    /// Weighted mean of the SSIM map over pixels and channels; 1 for equal images.
+    pub ssim: f64,
+    /// Weighted mean of (render − truth)², the render clamped to [0, 1]; no part of `total`.
+    pub mse: f64,
+}
 
 /// One picture that the scene is compared with.
 #[derive(Clone, Copy, Debug)]

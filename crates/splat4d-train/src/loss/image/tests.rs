@@ -3,6 +3,7 @@
 use super::*;
 use crate::loss::image::segmentation::Segmentation;
 use crate::loss::terms::StepInfo;
+use crate::recipe::Recipe;
 use splat4d::math::Se3;
 use splat4d::render::Image;
 use splat4d::scene::{Camera, Planes, Time};
@@ -118,7 +119,7 @@ fn what_terms_need_is_drawn_once_and_in_one_order() {
 fn a_recipe_lists_the_terms_that_have_a_weight() {
     // Known depth costs nothing where there is none, and counts where there is.
     let mut recipe = Recipe::default().with(|r| r.loss.depth = 0.0);
-    let count = |r: &Recipe| terms(r).len();
+    let count = |r: &Recipe| terms(&r.loss).len();
     assert_eq!(count(&recipe), 1, "colours alone");
     for knob in ["tv", "frequency", "mask", "mask_entropy", "depth_tv", "depth_normal", "depth", "flow", "tracks"] {
         let before = count(&recipe);

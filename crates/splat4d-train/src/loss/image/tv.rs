@@ -81,7 +81,7 @@ fn variation<F: Real>(plane: &[F], [width, height]: [usize; 2], pair: &Pair<'_, 
 ///
 /// Source: Rudin, Osher, Fatemi 1992, anisotropic.
 pub(crate) fn total_variation<F: Real>(image: &Planes<F>, weight: f64, d: &mut Planes<F>) -> f64 {
-    assert_eq!(image.data.len(), d.data.len(), "a gradient has its picture's shape");
+    assert_eq!(image.data.len(), d.data.len(), "a gradient has its image's shape");
     let scale = weight / image.data.len().max(1) as f64;
     let size = [image.width, image.height];
     (0..image.channels).map(|c| variation(image.plane(c), size, &|_, _| F::ONE, scale, d.plane_mut(c))).sum::<f64>()

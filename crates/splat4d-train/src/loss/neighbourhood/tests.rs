@@ -108,7 +108,7 @@ fn what_has_no_held_part_has_the_gradient_of_its_value() {
 }
 
 #[test]
-fn a_step_looks_at_few_rows_others_each_time_and_only_at_the_living() {
+fn a_step_samples_few_other_and_only_active_rows() {
     let scene = scene(LifeKind::GaussHalf);
     let loss = made(all(), CLIP);
     let rows = |iteration: usize| {

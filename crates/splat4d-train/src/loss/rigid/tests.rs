@@ -89,7 +89,7 @@ fn gradients_equal_finite_differences_at_quaternions_of_any_length() {
 }
 
 #[test]
-fn turns_alone_and_stretch_alone_are_told_apart() {
+fn rotation_and_stretch_are_distinguished() {
     let mut case = rigid([1.0, 0.0, 0.0, 0.0], [0.0; 3]);
     for (q, by) in case.now.1.iter_mut().zip(normals::<4>("own turns")) {
         add_to(q, by, 0.5);

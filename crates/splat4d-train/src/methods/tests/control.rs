@@ -24,7 +24,7 @@ fn spline() -> TrajectorySpec {
 }
 
 #[test]
-fn pictures_teach_nodes_and_everything_that_drives_them() {
+fn images_teach_nodes_and_everything_that_drives_them() {
     let mut scene = skinned::<f64>(12, 7, spline());
     let p = &mut scene.layers[0].params;
     let keys = p.find("node_keys").unwrap();

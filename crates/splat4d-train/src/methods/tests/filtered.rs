@@ -168,8 +168,8 @@ fn it_is_switched_on_in_the_middle_of_a_stage_and_trains() {
     assert_falls(&losses, 0.8, "filtered");
 }
 
-pub(super) fn made_plan(recipe: Recipe) -> Plan {
-    Plan { recipe, extent: 1.0, clip: [0.0, 0.3], fps: 20.0, times: 7, fixed_cameras: 3, ..Plan::default() }
+pub(super) fn made_plan(recipe: &Recipe) -> Plan {
+    Plan { extent: 1.0, clip: [0.0, 0.3], fps: 20.0, times: 7, fixed_cameras: 3, ..recipe.plan() }
 }
 
 #[test]
@@ -180,14 +180,14 @@ fn a_recipe_wraps_any_program_and_leaves_no_trace() {
             r.run.motion = MotionName::of("spacetime");
         });
         text.split_whitespace().for_each(|s| r.set(s).unwrap());
-        r.resolve()
+        r
     };
-    let plan = made_plan;
-    let off = plan(recipe(""));
-    assert_eq!(program_of(&off.recipe).unwrap().spec(&off), program("spacetime").unwrap().spec(&off));
+    let off = recipe("");
+    let plan = made_plan(&off);
+    assert_eq!(off.program().unwrap().spec(&plan), off.program_of("spacetime").unwrap().spec(&plan));
     for keep in [false, true] {
-        let plan = plan(recipe(&format!("filter=geodesic transport=wasserstein filter_keep={keep} filter_start=0.5")));
-        let program = program_of(&plan.recipe).unwrap();
+        let recipe = recipe(&format!("filter=geodesic transport=wasserstein filter_keep={keep} filter_start=0.5"));
+        let (plan, program) = (made_plan(&recipe), recipe.program().unwrap());
         let Spec::Filtered(spec) = program.spec(&plan) else { panic!("it is wrapped") };
         assert_eq!((spec.fusion, spec.frame, spec.inner.name()), (Fusion::Off, 0.05, "spacetime"));
         let mut stages = program.stages(&plan);
@@ -219,17 +219,17 @@ fn a_recipe_wraps_any_program_and_leaves_no_trace() {
         let moved = layer.params.find("velocities").unwrap();
         assert!(layer.params[moved].data().iter().any(|x| *x != 0.0), "what was learnt stays");
     }
-    let plan = plan(recipe("filter=geodesic filter_start=0.25 filter.until=0.75"));
-    let mut early = program_of(&plan.recipe).unwrap().stages(&plan);
+    let early = recipe("filter=geodesic filter_start=0.25 filter.until=0.75");
+    let mut early = early.program().unwrap().stages(&made_plan(&early));
     early[0].upkeep.retain(|u| u.once());
     let due = |step: &usize| early[0].upkeep.iter().any(|u| u.due(&At { step: *step, steps: 40 }));
     assert_eq!((0..40).filter(due).collect::<Vec<_>>(), [10, 30]);
     for bad in ["filter.until=0.1", "filter.until=0.5 filter_keep=true"] {
-        let plan = made_plan(recipe(&format!("filter=geodesic {bad}")));
-        let refused = program_of(&plan.recipe).unwrap().check(&plan).expect_err(bad).to_string();
+        let recipe = recipe(&format!("filter=geodesic {bad}"));
+        let refused = recipe.program().unwrap().check(&made_plan(&recipe)).expect_err(bad).to_string();
         assert!(refused.contains("filter.until"), "{refused}");
     }
-    let none = program("filtered").err().expect("it wraps, and moves nothing itself").to_string();
+    let none = Recipe::default().program_of("filtered").err().expect("it wraps, and moves nothing itself").to_string();
     assert!(none.contains("filter=geodesic"), "{none}");
     for bad in ["filter=kalman", "filter_gain=1", "filter_baseline=0", "filter_history=1000", "transport_every=2"] {
         assert!(Recipe::default().set(bad).is_err(), "{bad}");
@@ -250,7 +250,7 @@ fn hooks_of_the_program_inside_see_its_own_model() {
                     Ok(())
                 }))
             };
-            let one = || Stage { start: hook(), end: hook(), ..stage(plan.recipe.run.iterations) };
+            let one = || Stage { start: hook(), end: hook(), ..stage(plan.iterations) };
             vec![one(), one()]
         }
     }
@@ -259,8 +259,8 @@ fn hooks_of_the_program_inside_see_its_own_model() {
         r.filter.fusion = Fusion::Geodesic;
         r.filter.start = 0.5;
     });
-    let plan = made_plan(r.resolve());
-    let program = super::super::filtered::wrap(Box::new(Hooked), &plan.recipe);
+    let plan = made_plan(&r);
+    let program = super::super::filtered::wrap(Box::new(Hooked), &r.filter, &r.transport);
     let mut p = cloud::<f32>(20, LifeKind::Infinite, 4);
     let motion = build_as(&program.spec(&plan), &mut p).unwrap();
     let mut t = trainer(one_layer(p, motion, LifeKind::Infinite), program.stages(&plan), 200);

@@ -116,7 +116,6 @@ fn errors(motion: &str, life: &str) -> [f64; 2] {
     let recipe = recipe(motion, life);
     let clip = [0.0, (MOMENTS - 1) as f64 / FPS];
     let plan = Plan {
-        recipe,
         extent: 4.4,
         center: [0.0; 3],
         clip,
@@ -125,8 +124,9 @@ fn errors(motion: &str, life: &str) -> [f64; 2] {
         fixed_cameras: CAMERAS,
         moments: Vec::new(),
         masks: false,
+        ..recipe.plan()
     };
-    let program = program(motion).unwrap();
+    let program = recipe.program().unwrap();
     // Points on all guests: nobody knows yet who comes and goes.
     let mut seeds = Seeds::default();
     let rng = Rng::new(8, "guests", 0);
@@ -136,7 +136,7 @@ fn errors(motion: &str, life: &str) -> [f64; 2] {
         let unit = normalize(p);
         seeds.push(std::array::from_fn(|k| center[k] + 0.9 * RADIUS * unit[k]), [0.5; 3], None);
     }
-    let scene = init::scene(&plan, program.as_ref(), &seeds, SKY, [0.0, 1.0, 0.0]).unwrap();
+    let scene = init::scene(&plan, &recipe.init, program.as_ref(), &seeds, SKY, [0.0, 1.0, 0.0]).unwrap();
     let settings = Settings {
         seed: 5,
         limits: Limits { cap: 1000, extent: plan.extent, min_opacity: 0.005 },

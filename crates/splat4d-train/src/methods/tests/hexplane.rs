@@ -8,29 +8,28 @@ use crate::upkeep::Strategy;
 use splat4d::nn::hexplane::PlaneShape;
 use std::ops::Range;
 
-fn plan() -> Plan {
-    let recipe = Recipe::default()
-        .with(|r| {
-            r.run.motion = MotionName::of("hexplane");
-            r.run.iterations = 150;
-            r.hexplane.coarse_iterations = 40;
-            r.hexplane.unlock_interval = 50;
-            r.hexplane.plane_channels = 16;
-            r.hexplane.plane_resolution = 6;
-            r.hexplane.time_resolution = 3;
-            r.hexplane.net_width = 16;
-            r.densify.strategy = Strategy::None;
-            r.run.half_size_until = 0.0;
-            r.rates.position_init = 5e-3;
-        })
-        .resolve();
-    Plan { recipe, extent: 4.0, clip: [0.0, 0.2], fps: 10.0, times: 3, fixed_cameras: 4, ..Plan::default() }
+fn plan() -> (HexplaneProgram, Plan) {
+    let recipe = Recipe::default().with(|r| {
+        r.run.motion = MotionName::of("hexplane");
+        r.run.iterations = 150;
+        r.hexplane.coarse_iterations = 40;
+        r.hexplane.unlock_interval = 50;
+        r.hexplane.plane_channels = 16;
+        r.hexplane.plane_resolution = 6;
+        r.hexplane.time_resolution = 3;
+        r.hexplane.net_width = 16;
+        r.densify.strategy = Strategy::None;
+        r.run.half_size_until = 0.0;
+        r.rates.position_init = 5e-3;
+    });
+    let plan = Plan { extent: 4.0, clip: [0.0, 0.2], fps: 10.0, times: 3, fixed_cameras: 4, ..recipe.plan() };
+    (HexplaneProgram { hexplane: recipe.hexplane }, plan)
 }
 
-fn start(plan: &Plan) -> Trainer<'static> {
+fn start((program, plan): &(HexplaneProgram, Plan)) -> Trainer<'static> {
     let mut p = cloud::<f32>(60, LifeKind::Infinite, 3);
-    let motion = build_as(&HexplaneProgram.spec(plan), &mut p).unwrap();
-    trainer(one_layer(p, motion, LifeKind::Infinite), HexplaneProgram.stages(plan), 60)
+    let motion = build_as(&program.spec(plan), &mut p).unwrap();
+    trainer(one_layer(p, motion, LifeKind::Infinite), program.stages(plan), 60)
 }
 
 /// Numbers of the planes of some levels, or of the networks.
@@ -85,10 +84,10 @@ fn each_stage_learns_its_part_and_together_they_follow_the_ball() {
 
 #[test]
 fn rates_and_densification_go_on_over_the_stages() {
-    let mut plan = plan();
-    plan.recipe.densify.strategy = Strategy::Adc;
-    (plan.recipe.densify.from, plan.recipe.densify.until) = (20, 100);
-    let stages = HexplaneProgram.stages(&plan);
+    let (mut program, mut plan) = plan();
+    plan.common.densify.strategy = Strategy::Adc;
+    (plan.common.densify.from, plan.common.densify.until) = (20, 100);
+    let stages = program.stages(&plan);
     assert_eq!(stages.iter().map(|s| s.iterations).collect::<Vec<_>>(), [40, 50, 60]);
     let rate = |stage: usize, column: &str| stages[stage].groups.iter().find(|g| g.column == column).map(|g| g.rate);
     for (a, b) in [(0, 1), (1, 2)] {
@@ -97,11 +96,11 @@ fn rates_and_densification_go_on_over_the_stages() {
     }
     assert!(rate(0, "hexplane.0.xy").is_none() && rate(0, "hexplane.trunk.0.weight").is_none());
     let ends = |column: &str, rate_: f64| (rate(2, column).unwrap().end / rate_ - 1.0).abs() < 1e-9;
-    assert!(ends("hexplane.1.zt", plan.recipe.hexplane.grid_lr_final));
-    assert!(ends("hexplane.position.1.bias", plan.recipe.hexplane.deformation_lr_final));
+    assert!(ends("hexplane.1.zt", program.hexplane.grid_lr_final));
+    assert!(ends("hexplane.position.1.bias", program.hexplane.deformation_lr_final));
     let mut stages = stages;
     let steps = stages.iter_mut().map(|s| s.upkeep.iter_mut().find_map(|u| u.densification().copied()).unwrap());
     assert_eq!(steps.map(|e| (e.first, e.last)).collect::<Vec<_>>(), [(20, 40), (1, 50), (1, 10)]);
-    plan.recipe.hexplane.unlock_interval = 0;
-    assert_eq!(HexplaneProgram.stages(&plan).iter().map(|s| s.iterations).collect::<Vec<_>>(), [40, 110]);
+    program.hexplane.unlock_interval = 0;
+    assert_eq!(program.stages(&plan).iter().map(|s| s.iterations).collect::<Vec<_>>(), [40, 110]);
 }

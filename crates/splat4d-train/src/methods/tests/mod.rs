@@ -22,6 +22,8 @@ mod wrapper;
 use super::*;
 use crate::capture::frames::{Frames, Picture};
 use crate::loss::image::{ImageTerm, PictureGrads, Shown};
+use crate::recipe::Recipe;
+use crate::recipe::parts::PROGRAMS;
 use crate::step::chain::{Chain, Losses, Step, StepInfo, StepReport, View};
 use crate::step::loss::TrainLoss;
 use crate::step::tests::Made;
@@ -30,7 +32,7 @@ use crate::upkeep::Limits;
 use splat4d::layers::Layer;
 use splat4d::math::sh::MAX_DEGREE;
 use splat4d::math::{Real, Rng};
-use splat4d::motion::{Motion, SpacetimeSpec, build_as};
+use splat4d::motion::{MODELS, Motion, SpacetimeSpec, build_as};
 use splat4d::render::{
     self, Backend, Image, ImageGrads, PartGrads, RenderConfig, RenderGrads, Renderer, Wanted, oracle,
 };
@@ -45,11 +47,11 @@ fn every_built_in_model_has_a_program() {
     let mut models = MODELS.to_vec();
     models.sort_unstable();
     assert_eq!(all, models, "a model has mathematics and a program");
-    let plan = filtered::made_plan(Recipe::default().resolve());
+    let plan = filtered::made_plan(&Recipe::default());
     for (name, make) in PROGRAMS {
-        assert_eq!(make().spec(&plan).name(), name, "a program is listed under its model's name");
+        assert_eq!(make(&Recipe::default()).spec(&plan).name(), name, "a program is listed under its model's name");
     }
-    assert!(program("warp").is_err_and(|e| e.to_string().contains("spacetime")));
+    assert!(Recipe::default().program_of("warp").is_err_and(|e| e.to_string().contains("spacetime")));
 }
 
 #[test]
@@ -59,8 +61,8 @@ fn lasting_clouds_come_and_go_before_fixed_cameras() {
             r.run.motion = crate::recipe::MotionName::of(motion);
             change(r);
         });
-        let plan = Plan { fixed_cameras, ..filtered::made_plan(recipe.resolve()) };
-        program(motion).unwrap().life(&plan)
+        let plan = Plan { fixed_cameras, ..filtered::made_plan(&recipe) };
+        recipe.program().unwrap().life(&plan)
     };
     for motion in ["control", "ssm", "deform-mlp", "hexplane"] {
         assert_eq!(life(motion, 1, &|_| ()), LifeKind::Interval, "{motion}");

@@ -12,9 +12,8 @@ fn the_last_stage_splits_where_it_is_asked_to() {
             r.run.motion = MotionName::of(motion);
         });
         recipe.set(&format!("static_split={static_split}")).unwrap();
-        let plan =
-            Plan { recipe: recipe.resolve(), extent: 1.0, clip: [0.0, 1.0], fps: 30.0, times: 30, ..Plan::default() };
-        let stages = stages(program(motion).unwrap().as_ref(), &plan);
+        let plan = Plan { extent: 1.0, clip: [0.0, 1.0], fps: 30.0, times: 30, ..recipe.plan() };
+        let stages = stages(recipe.program().unwrap().as_ref(), &plan);
         let last = stages.last().unwrap();
         let shared = last.groups.iter().filter(|g| g.layer == EVERY).count();
         let splits = |step: &usize| last.upkeep.iter().any(|u| u.once() && u.due(&At { step: *step, steps: 1000 }));

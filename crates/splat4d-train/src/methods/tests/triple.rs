@@ -99,7 +99,7 @@ fn direct(scene: &Scene<f64>, rows: Option<&[u32]>) -> f64 {
 }
 
 #[test]
-fn a_triple_trains_with_pictures() {
+fn a_triple_trains_with_images() {
     let mut p = cloud::<f32>(70, LifeKind::GaussHalf, 4);
     let spec = Spec::Spacetime(SpacetimeSpec { order: 2, ..SpacetimeSpec::default() });
     let motion = build_as(&spec, &mut p).unwrap();

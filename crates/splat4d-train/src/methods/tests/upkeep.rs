@@ -61,7 +61,7 @@ fn on_nodes() -> Scene<f32> {
 }
 
 #[test]
-fn every_edit_of_rows_is_told_to_every_loss() {
+fn every_row_edit_reaches_every_loss() {
     type Change = fn(&mut Stage);
     const STEPS: Every = Every { first: 5, last: 30, interval: 5 };
     let edits: [(&str, Change); 8] = [

@@ -2,7 +2,7 @@ use super::*;
 use crate::capture::frames::{Frames, Picture};
 use crate::event::Progress;
 use crate::learner::Exposure;
-use crate::recipe::MotionName;
+use crate::recipe::{MotionName, Recipe};
 use crate::step::loss::TrainLoss;
 use crate::step::trainer::{Settings, Trainer};
 use crate::upkeep::Limits;
@@ -132,7 +132,7 @@ fn draw(s: &Scene<f32>, cameras: Vec<Camera>, frames: usize, masks: Option<usize
     Drawn { cameras, pictures }
 }
 
-fn plan(frames: usize, cameras: usize, masks: bool, knobs: &[&str]) -> Plan {
+fn plan(frames: usize, cameras: usize, masks: bool, knobs: &[&str]) -> (TrackedProgram, Plan) {
     let mut recipe = Recipe::default().with(|r| {
         r.run.motion = MotionName::of("tracked");
         r.appearance.sh_degree = 0;
@@ -140,8 +140,7 @@ fn plan(frames: usize, cameras: usize, masks: bool, knobs: &[&str]) -> Plan {
     });
     recipe.densify.strategy = Strategy::None;
     knobs.iter().for_each(|k| recipe.set(k).unwrap());
-    Plan {
-        recipe: recipe.resolve(),
+    let plan = Plan {
         extent: 3.0,
         center: [0.0; 3],
         clip: [0.0, (frames - 1) as f64 / FPS],
@@ -150,20 +149,27 @@ fn plan(frames: usize, cameras: usize, masks: bool, knobs: &[&str]) -> Plan {
         fixed_cameras: cameras,
         moments: (0..frames).map(|k| (k as f64 / FPS, cameras)).collect(),
         masks,
-    }
+        ..recipe.plan()
+    };
+    (TrackedProgram { tracked: recipe.tracked }, plan)
 }
 
-fn trainer(s: Scene<f32>, plan: &Plan, frames: Arc<dyn Frames>, exposure: Option<Exposure>) -> Trainer<'static> {
+fn trainer(
+    s: Scene<f32>,
+    (program, plan): &(TrackedProgram, Plan),
+    frames: Arc<dyn Frames>,
+    exposure: Option<Exposure>,
+) -> Trainer<'static> {
     let settings = Settings {
         seed: 5,
         limits: Limits { cap: 2000, extent: plan.extent, min_opacity: 0.005 },
         background: [0.0; 3],
         sh_degree: 0,
-        exposure_lr: plan.recipe.appearance.exposure_lr,
+        exposure_lr: plan.common.appearance.exposure_lr,
     };
     let draw = Box::new(Renderer::new(RenderConfig::default()));
     let loss = TrainLoss::photometric(0.2);
-    let mut trainer = Trainer::new(s, TrackedProgram.stages(plan), frames, draw, loss, settings);
+    let mut trainer = Trainer::new(s, program.stages(plan), frames, draw, loss, settings);
     trainer.learner.exposure = exposure;
     trainer
 }
@@ -208,11 +214,11 @@ fn a_turning_ball_is_followed_and_without_ties_it_is_not() {
 }
 
 #[test]
-fn what_goes_on_evenly_needs_no_steps() {
+fn even_motion_needs_no_steps() {
     let params = ball(50, 0);
     let world = truth(&params, 50, 6, 0.0);
-    let plan = plan(6, 4, false, &["iterations=1", "first_share=0"]);
-    let mut stages = TrackedProgram.stages(&plan);
+    let (program, plan) = plan(6, 4, false, &["iterations=1", "first_share=0"]);
+    let mut stages = program.stages(&plan);
     let mut s = scene(params, &first_frame(false));
     for (k, stage) in stages.iter_mut().enumerate().skip(1) {
         stage.start.take().unwrap()(&mut s, &mut Progress(&mut |_| {})).unwrap();
@@ -227,7 +233,7 @@ fn what_goes_on_evenly_needs_no_steps() {
 }
 
 #[test]
-fn masks_tell_what_stands_and_it_stays() {
+fn masks_identify_static_parts_which_stay() {
     let params = ball(200, 60);
     let world = truth(&params, 200, 3, 0.05);
     let frames: Arc<dyn Frames> = Arc::new(draw(&world, cameras(8, 32), 3, Some(200)));
@@ -321,8 +327,8 @@ fn exposures_are_learnt_on_frame_0_and_kept() {
 
 #[test]
 fn tuning_looks_at_every_frame_and_moves_every_page() {
-    let plan = plan(5, 4, false, &["static_split=0.01", "crowding=merge"]);
-    let stage = super::super::tuning(&plan).unwrap();
+    let (program, plan) = plan(5, 4, false, &["static_split=0.01", "crowding=merge"]);
+    let stage = super::super::tuning(&program, &plan);
     assert_eq!(stage.sampler, Sampler::Uniform);
     let learns = |column: &str| stage.groups.iter().any(|g| g.column == column && g.rate.start > 0.0);
     for k in 1..5 {
@@ -334,17 +340,20 @@ fn tuning_looks_at_every_frame_and_moves_every_page() {
 
 #[test]
 fn captures_that_cannot_be_tracked_are_refused_with_those_that_can() {
-    let good = plan(5, 4, false, &[]);
-    assert!(TrackedProgram.check(&good).is_ok());
+    let (program, good) = plan(5, 4, false, &[]);
+    assert!(program.check(&good).is_ok());
     let mut moving = good.clone();
     moving.moments.iter_mut().for_each(|m| m.1 = 0);
     let mut staggered = good.clone();
     staggered.moments[3].1 = 2;
     for bad in [moving, staggered] {
-        let text = TrackedProgram.check(&bad).unwrap_err().to_string();
+        let text = program.check(&bad).unwrap_err().to_string();
         assert!(text.contains("3 fixed cameras") && text.contains("spacetime, deform-mlp"), "{text}");
     }
-    let with = |knob: &str| TrackedProgram.check(&plan(5, 4, false, &[knob]));
+    let with = |knob: &str| {
+        let (program, plan) = plan(5, 4, false, &[knob]);
+        program.check(&plan)
+    };
     assert!(with("floor_height=-0.3").is_ok());
     assert!(Recipe::default().set("floor_height=low").unwrap_err().to_string().contains("floor_height"));
     assert!(with("prune_interval=100").is_err());
@@ -353,8 +362,8 @@ fn captures_that_cannot_be_tracked_are_refused_with_those_that_can() {
 #[test]
 fn steps_are_shared_out_and_every_frame_has_its_stage() {
     for (frames, iterations) in [(1, 100), (2, 100), (30, 1000), (30, 7)] {
-        let plan = plan(frames, 4, false, &[&format!("iterations={iterations}")]);
-        let stages = TrackedProgram.stages(&plan);
+        let (program, plan) = plan(frames, 4, false, &[&format!("iterations={iterations}")]);
+        let stages = program.stages(&plan);
         assert_eq!(stages.len(), frames);
         assert_eq!(stages.iter().map(|s| s.iterations).sum::<usize>(), iterations);
         let later: Vec<usize> = stages[1..].iter().map(|s| s.iterations).collect();

@@ -9,7 +9,7 @@ use crate::event::Event;
 use crate::recipe::Recipe;
 use crate::run::checkpoint::write_atomically_with;
 use crate::run::identity::recipe_print;
-use crate::run::start::{read_info, read_text};
+use crate::run::info::{read_info, read_text};
 use crate::vision::view::spread;
 use splat4d::device;
 use splat4d::layers::{Evaluation, Layer, Scene};

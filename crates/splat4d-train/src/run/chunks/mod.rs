@@ -21,15 +21,14 @@ pub use plan::ChunkPlan;
 
 use super::checkpoint::write_atomically;
 use super::identity;
+use super::info::{read_info, read_text};
 use super::open::{OpenCapture, learnable, open_frames};
 use super::session::{Outcome, TrainOptions};
-use super::start::{read_info, read_text};
 use crate::capture::{Capture, Lenses};
 use crate::event::Event;
 use crate::output::Owner;
 use crate::path_text::{of_text, to_text};
 use crate::recipe::Recipe;
-use crate::settings::settings;
 use crate::{Error, ErrorKind, Result};
 use serde_json::json;
 use std::ops::Range;
@@ -56,20 +55,6 @@ const PLAN: &str = "plan.json";
 const SCENE: &str = "scene.safetensors";
 /// What made runs of chunks.
 pub(super) const MADE_BY: &str = "train --chunk";
-
-settings! {
-    /// Long captures in chunks.
-    #[derive(Copy)]
-    pub struct ChunkSettings {
-        /// Frames per chunk; longer captures train chunk by chunk. 0: 60 if fixed cameras have more than 300 frames and
-        /// the recipe supports chunks, otherwise no chunks. Iterations are those of a chunk.
-        frames: usize = 0 => any().unit("frames");
-        /// Frames that neighbouring chunks share and in which they cross-fade; an even number.
-        overlap: usize = 16 => any().unit("frames");
-        /// Weight of the difference (L1) between an odd chunk's renders and its neighbours' in the overlap.
-        consistency: f64 = 2.0;
-    }
-}
 
 /// A part of the work on a take.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -216,7 +201,7 @@ impl Chunked {
     }
 
     /// The parts that must be there before this one begins, of those that are not.
-    fn waits_for(&self, part: Part) -> Vec<Part> {
+    pub fn waits_for(&self, part: Part) -> Vec<Part> {
         let needs = match part {
             Part::Shared => Vec::new(),
             Part::Chunk(c) => std::iter::once(Part::Shared).chain(self.neighbours(c).map(Part::Chunk)).collect(),

@@ -3,7 +3,6 @@
 use super::{FRAMES, WHOLE};
 use crate::capture::{Capture, ImageStore};
 use crate::event::Event;
-use crate::methods::program_of;
 use crate::recipe::Recipe;
 use crate::run::open::plan;
 use crate::{Error, Result};
@@ -47,7 +46,7 @@ impl ChunkPlan {
         let (take, count) = ([first, end], end.saturating_sub(first));
         let fixed = capture.cameras.iter().filter(|c| c.fixed).count() > 1;
         // `auto` has yet to say.
-        let moves = || program_of(recipe).map_or(true, |p| p.capabilities(&plan(capture, recipe)).moves);
+        let moves = || recipe.program().map_or(true, |p| p.capabilities(&plan(capture, recipe)).moves);
         let length = match settings.frames {
             0 if count > WHOLE && fixed && moves() && super::check(recipe).is_ok() => FRAMES,
             0 => return Ok(None),
@@ -80,7 +79,7 @@ impl ChunkPlan {
         let (half, chunks) = (self.overlap / 2, self.cuts.len() + 1);
         let reach = (MOVED * ((self.take[1] - self.take[0]) / chunks) as f64) as usize;
         for k in 0..self.cuts.len() {
-            listen(&Event::Phase { name: "looking for quiet moments".into(), done: k, total: self.cuts.len() });
+            listen(&Event::Phase { name: "searching for chunk boundaries".into(), done: k, total: self.cuts.len() });
             let cut = self.cuts[k];
             let first = cut - reach - half;
             let mut change = vec![0.0; 2 * (reach + half)];

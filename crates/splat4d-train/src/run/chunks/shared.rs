@@ -23,7 +23,7 @@ use rayon::prelude::*;
 use serde_json::json;
 use splat4d::format::{safetensors::SafeTensors, scene};
 use splat4d::layers::{Layer, Scene};
-use splat4d::math::Rng;
+use splat4d::math::{Rng, median_by};
 use splat4d::scene::{Camera, RowEdit, Space};
 use splat4d::{Error, ErrorKind};
 use std::path::Path;
@@ -148,7 +148,7 @@ fn nothing_still(capture: &Capture) -> Option<&'static str> {
     if fixed.len() < 2 || !all {
         Some("cameras move")
     } else if capture.background.is_some() {
-        Some("pictures are cut out of their background")
+        Some("images are cut out of their background")
     } else {
         None
     }
@@ -259,15 +259,14 @@ fn median(pictures: &[Vec<u8>], i: usize) -> u8 {
     let mut values = [0u8; MEDIAN_OF];
     let values = &mut values[..pictures.len()];
     values.iter_mut().zip(pictures).for_each(|(v, picture)| *v = picture[i]);
-    let middle = values.len() / 2;
-    *values.select_nth_unstable(middle).1
+    median_by(values, u8::cmp).expect("there are images")
 }
 
 fn write_png(path: &Path, data: &[u8], view: &Camera, color: ExtendedColorType) -> Result<()> {
     let mut out = Vec::new();
     PngEncoder::new(&mut out)
         .write_image(data, view.width as u32, view.height as u32, color)
-        .map_err(|e| Error::new(ErrorKind::Io, format!("a picture cannot be encoded: {e}")).at(path.display()))?;
+        .map_err(|e| Error::new(ErrorKind::Io, format!("an image cannot be encoded: {e}")).at(path.display()))?;
     write_atomically(path, &out)
 }
 

@@ -7,7 +7,7 @@ use crate::Result;
 use crate::capture::Capture;
 use crate::event::Event;
 use crate::init::Seeds;
-use crate::methods::{Plan, program_of, stages};
+use crate::methods::{Plan, stages};
 use crate::recipe::Recipe;
 use crate::run::checkpoint;
 use crate::run::flows;
@@ -46,7 +46,7 @@ pub(super) fn train(
     let capture = Arc::new(open_frames(&chunked.source, &recipe, vec![chunked.plan.frames(chunk)], &chunked.lenses)?);
     let opened = OpenCapture::new(capture, &recipe)?.on(options.device);
     check_flow(&opened.capture, &recipe)?;
-    let program = program_of(&recipe)?;
+    let program = recipe.program()?;
     program.check(&opened.plan(&recipe))?;
     let opened = points::complete(opened, &recipe, &folder, &mut listen)?;
     let opened = flows::complete(opened, &recipe, &folder, &mut listen)?;
@@ -55,10 +55,10 @@ pub(super) fn train(
     let neighbours = neighbours(chunked, chunk, &opened.capture)?;
     let scene = if checkpoint::list(&folder).is_empty() {
         listen(&Event::Phase { name: "initial points".into(), done: 0, total: 0 });
-        first_scene(&opened, &plan, &shared, &neighbours)?
+        first_scene(&opened, &recipe, &plan, &shared, &neighbours)?
     } else {
         // The checkpoint has it.
-        opened.scene(&plan, program.as_ref(), &Seeds::default(), shared.background)?
+        opened.scene(&recipe, &plan, program.as_ref(), &Seeds::default(), shared.background)?
     };
     let prints: Vec<&str> =
         std::iter::once(&shared.print).chain(neighbours.iter().map(|n| &n.print)).map(String::as_str).collect();
@@ -108,9 +108,15 @@ fn neighbours(chunked: &Chunked, chunk: usize, capture: &Capture) -> Result<Vec<
 
 /// The scene that a chunk begins with: its own first Gaussians where the shared layer shows nothing, those of its neighbours in
 /// the middle of what they share, and the shared layer, which does not learn.
-fn first_scene(opened: &OpenCapture, plan: &Plan, shared: &Shared, neighbours: &[Neighbour]) -> Result<Scene<f32>> {
-    let program = program_of(&plan.recipe)?;
-    let mut seeds = opened.seeds(plan)?;
+fn first_scene(
+    opened: &OpenCapture,
+    recipe: &Recipe,
+    plan: &Plan,
+    shared: &Shared,
+    neighbours: &[Neighbour],
+) -> Result<Scene<f32>> {
+    let program = recipe.program()?;
+    let mut seeds = opened.seeds(recipe, plan)?;
     let still = shared.still.as_ref();
     if let Some(still) = still {
         let covered = Covered::new(still);
@@ -121,17 +127,17 @@ fn first_scene(opened: &OpenCapture, plan: &Plan, shared: &Shared, neighbours: &
             own.into_iter().for_each(|i| seeds.push(all.points[i], all.colors[i], all.times[i]));
         }
     }
-    let room = plan.recipe.densify.max_cap.saturating_sub(still.map_or(0, |l| l.params.len())).max(1);
+    let room = plan.common.densify.max_cap.saturating_sub(still.map_or(0, |l| l.params.len())).max(1);
     // A Gaussian that lives all the time starts where it is in the middle of the chunk, of which neighbours know nothing.
     let mut taken: Vec<Params<f32>> = Vec::new();
     if !program.one_moment(plan) {
         let share = (TAKEN_OVER * room as f64) as usize / neighbours.len().max(1);
         for n in neighbours {
-            taken.push(alive(&n.scene, 0.5 * (n.window[0] + n.window[1]), share, plan.recipe.run.seed));
+            taken.push(alive(&n.scene, 0.5 * (n.window[0] + n.window[1]), share, plan.seed));
         }
     }
     let count: usize = taken.iter().map(Params::len).sum();
-    seeds.truncate_evenly(room.saturating_sub(count).max(1), Rng::new(plan.recipe.run.seed, "chunk", 0));
+    seeds.truncate_evenly(room.saturating_sub(count).max(1), Rng::new(plan.seed, "chunk", 0));
     let first = seeds.len();
     for (params, n) in taken.iter().zip(neighbours) {
         let time = 0.5 * (n.window[0] + n.window[1]);
@@ -140,7 +146,7 @@ fn first_scene(opened: &OpenCapture, plan: &Plan, shared: &Shared, neighbours: &
             seeds.push(params[GEOMETRY].read::<3>(row, 0).map(f64::from), color, Some(time));
         }
     }
-    let mut scene = opened.scene(plan, program.as_ref(), &seeds, shared.background)?;
+    let mut scene = opened.scene(recipe, plan, program.as_ref(), &seeds, shared.background)?;
     let own = &mut scene.layers[0].params;
     let mut row = first;
     for params in &taken {

@@ -5,7 +5,7 @@ use super::*;
 use crate::ErrorKind;
 use crate::compress::quantise::{self, Quantised};
 use crate::loss::terms::{Codec, ParamLoss, StepInfo};
-use crate::methods::{Plan, Rate, program};
+use crate::methods::{Plan, Rate};
 use crate::run::tests::{Place, copy_folder, recipe};
 use crate::run::{plan, training_frames};
 use splat4d::bake::{self, bake};
@@ -71,10 +71,10 @@ impl Bed {
         let begun = Arc::new(AtomicUsize::new(0));
         let codec = Quantised::new(
             Depths { position: 10, color: 5, opacity: 5, ..Depths::default() },
-            quantise::palette_rate(&self.recipe, 0.5),
+            quantise::palette_rate(&self.recipe.rates, 0.5),
         )
         .unwrap();
-        let base = program(self.recipe.run.motion.as_str()).unwrap().stages(&self.plan).remove(0);
+        let base = self.recipe.program().unwrap().stages(&self.plan).remove(0);
         let count = begun.clone();
         let floats = Stage {
             name: "pruned".into(),
@@ -96,7 +96,7 @@ impl Bed {
         };
         let nothing = Stage::new("nothing", 0);
         let (count, writer) = (begun.clone(), codec.clone());
-        let mut coded = quantise::stage(&self.plan, CODED, 0.5, codec.clone());
+        let mut coded = quantise::stage(&self.recipe, &self.plan, CODED, 0.5, codec.clone());
         coded.start = Some(Box::new(move |scene, _| {
             count.fetch_add(1, Ordering::Relaxed);
             let options = bake::Options { tolerance: f64::INFINITY, ..bake::Options::default() };
@@ -262,6 +262,6 @@ fn stages_without_steps_and_codecs_without_tuning() {
     assert_eq!(job.begun.load(Ordering::Relaxed), 0);
     assert!(again.scene.layers.iter().zip(&done.scene.layers).all(|(a, b)| a.params == b.params));
     // A rate is a rate, and one that falls.
-    let rate: Rate = quantise::palette_rate(&bed.recipe, 1.0);
+    let rate: Rate = quantise::palette_rate(&bed.recipe.rates, 1.0);
     assert!(rate.at(0.0) > rate.at(0.9) && rate.at(0.9) > 0.0);
 }

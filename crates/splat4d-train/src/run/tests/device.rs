@@ -4,7 +4,7 @@ use super::*;
 use splat4d::device::Device;
 
 #[test]
-fn a_run_says_on_what_it_trains_and_where_it_goes_on() {
+fn a_run_reports_its_device_and_where_it_resumes() {
     let place = Place::new();
     let recipe = recipe(&["iterations=20"]);
     let stop = AtomicBool::new(false);

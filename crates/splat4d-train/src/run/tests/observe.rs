@@ -8,7 +8,7 @@ use crate::run::open_capture;
 const SHARE: f64 = 0.6;
 
 #[test]
-fn other_pictures_of_the_future_make_the_same_tensors() {
+fn other_images_of_the_future_make_the_same_tensors() {
     // Masks of motion, exposures, clocks, growth and pruning: whatever looks at pictures is switched on.
     let settings = [
         "motion=spacetime init=auto densify.interval=5",
@@ -46,7 +46,7 @@ fn other_pictures_of_the_future_make_the_same_tensors() {
 }
 
 #[test]
-fn a_take_is_cut_where_it_was_told() {
+fn a_capture_is_split_at_given_times() {
     let place = Place::new();
     let open = |share: &str| open_capture(place.capture.path(), &recipe(&[&format!("capture.observe={share}")]));
     let whole = open("1").unwrap();
@@ -62,5 +62,5 @@ fn a_take_is_cut_where_it_was_told() {
     assert_eq!(last(&open("0.0001").unwrap(), &open("0.0001").unwrap().train), 0.0);
     let photos = recipe(&["capture.observe=0.5", "max_frames=1"]);
     let message = open_capture(place.capture.path(), &photos).unwrap_err().to_string();
-    assert!(message.contains("one moment"), "{message}");
+    assert!(message.contains("the same time"), "{message}");
 }

@@ -1,7 +1,6 @@
 //! Short training in memory, on the tiny capture of the tests of runs.
 
 use crate::init::{self, Seeds};
-use crate::methods::program_of;
 use crate::recipe::Recipe;
 use crate::run::checkpoint::{self, Identity, RunState};
 use crate::run::dataset::Dataset;
@@ -91,9 +90,9 @@ impl Bed {
     pub(super) fn start_on(&self, device: Device, recipe: &Recipe) -> Trainer<'static> {
         let opened = OpenCapture::with(self.frames.clone()).on(device);
         let plan = opened.plan(recipe);
-        program_of(recipe).unwrap().check(&plan).unwrap();
-        let scene = Scene { background: BLACK, ..opened.initial_scene(&plan).unwrap() };
-        opened.trainer(&plan, scene).unwrap()
+        recipe.program().unwrap().check(&plan).unwrap();
+        let scene = Scene { background: BLACK, ..opened.initial_scene(recipe, &plan).unwrap() };
+        opened.trainer(recipe, &plan, scene).unwrap()
     }
 
     /// As a resume does: an empty scene, and everything from the checkpoint.
@@ -105,9 +104,10 @@ impl Bed {
     pub(super) fn resumed_on(&self, device: Device, recipe: &Recipe, checkpoint: &[u8]) -> Trainer<'static> {
         let opened = OpenCapture::with(self.frames.clone()).on(device);
         let plan = opened.plan(recipe);
-        let program = program_of(recipe).unwrap();
-        let empty = init::scene(&plan, program.as_ref(), &Seeds::default(), BLACK, [0.0, 1.0, 0.0]).unwrap();
-        let mut trainer = opened.trainer(&plan, empty).unwrap();
+        let program = recipe.program().unwrap();
+        let empty =
+            init::scene(&plan, &recipe.init, program.as_ref(), &Seeds::default(), BLACK, [0.0, 1.0, 0.0]).unwrap();
+        let mut trainer = opened.trainer(recipe, &plan, empty).unwrap();
         checkpoint::read(checkpoint, &mut trainer, &Identity::default()).unwrap();
         trainer
     }

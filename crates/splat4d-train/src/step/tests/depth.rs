@@ -43,7 +43,7 @@ fn write(place: &Place, made: &Made, scale: f64) {
 }
 
 #[test]
-fn a_map_that_the_pictures_contradict_is_reported() {
+fn a_map_that_the_images_contradict_is_reported() {
     let (place, made) = (Place::new(), Made::new(4, 3, 24));
     // Gaussians begin on the ball, so that so short a run has its depth.
     let mut cloud = PointCloud::default();

@@ -89,7 +89,7 @@ fn known_flow_teaches_motion() {
 }
 
 #[test]
-fn flow_of_our_own_is_followed_once_and_kept_beside_the_run() {
+fn computed_flow_is_cached_in_the_run() {
     let place = Place::new();
     let own = recipe(&["lambda_flow=1", "capture.flow=own"]);
     place.train("own", &own).unwrap();

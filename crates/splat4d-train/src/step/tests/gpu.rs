@@ -117,7 +117,7 @@ fn a_run_on_a_gpu_repeats_and_resumes_bit_for_bit() {
 }
 
 #[test]
-fn what_a_gpu_does_not_draw_is_said_once_and_drawn_by_the_cpu() {
+fn unsupported_channels_render_on_the_cpu_and_are_reported_once() {
     let bed = Bed::new();
     let recipe = knobs("motion=spacetime features=full iterations=6");
     let Some(mut trainer) = on_gpu(&bed, &recipe) else { return };
@@ -129,13 +129,13 @@ fn what_a_gpu_does_not_draw_is_said_once_and_drawn_by_the_cpu() {
 }
 
 #[test]
-fn a_loss_of_more_terms_is_said_once_and_computed_by_the_cpu() {
+fn further_loss_terms_run_on_the_cpu_and_are_reported_once() {
     let bed = Bed::new();
     let recipe = knobs("motion=spacetime strategy=none loss.tv=0.1 iterations=8");
     let Some(mut trainer) = on_gpu(&bed, &recipe) else { return };
     let mut cpu = bed.start(&recipe);
     let (mse, notices) = finish(&mut trainer, "total variation");
-    assert!(notices.len() == 1 && notices[0].contains("the CPU compares pictures"), "{notices:?}");
+    assert!(notices.len() == 1 && notices[0].contains("the CPU compares images"), "{notices:?}");
     let expected = finish(&mut cpu, "total variation").0;
     assert!((mse[0] / expected[0] - 1.0).abs() < FIRST.1, "{mse:?} {expected:?}");
 }

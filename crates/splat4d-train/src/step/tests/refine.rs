@@ -6,7 +6,7 @@ use crate::Result;
 use crate::capture::frames::{Frames, Picture};
 use crate::init;
 use crate::learner::{Corrections, Origin, Scale, moved, zoomed};
-use crate::methods::{Plan, program_of, stages};
+use crate::methods::{Plan, stages};
 use crate::step::loss::TrainLoss;
 use crate::step::trainer::{Settings, Trainer};
 use crate::upkeep::Limits;
@@ -108,7 +108,6 @@ fn run(frames: Disturbed, line: &str) -> Left {
     let times: Vec<f64> = (0..frames.len()).map(|i| frames.time(i).0).collect();
     let end = |f: fn(f64, f64) -> f64| times.iter().copied().reduce(f).unwrap();
     let plan = Plan {
-        recipe: recipe.clone(),
         extent: EXTENT,
         center: [0.0; 3],
         clip: [end(f64::min), end(f64::max)],
@@ -117,11 +116,12 @@ fn run(frames: Disturbed, line: &str) -> Left {
         fixed_cameras: CAMERAS,
         moments: Vec::new(),
         masks: true,
+        ..recipe.plan()
     };
-    let program = program_of(&recipe).unwrap();
+    let program = recipe.program().unwrap();
     let background = [0.2, 0.3, 0.6];
-    let seeds = init::seeds(&plan, frames.as_ref(), None, true).unwrap();
-    let scene = init::scene(&plan, program.as_ref(), &seeds, background, [0.0, 1.0, 0.0]).unwrap();
+    let seeds = init::seeds(&plan, &recipe.init, frames.as_ref(), None, true).unwrap();
+    let scene = init::scene(&plan, &recipe.init, program.as_ref(), &seeds, background, [0.0, 1.0, 0.0]).unwrap();
     let settings = Settings {
         seed: 5,
         limits: Limits { cap: recipe.densify.max_cap, extent: EXTENT, min_opacity: recipe.densify.min_opacity },

@@ -76,7 +76,7 @@ fn filters_and_frames() {
 
 /// Three steps of the schedule at a time, then many at each of its steps: hooks, switches and splits come once.
 #[test]
-fn plans_made_anew() {
+fn replanned_runs() {
     check(&[
         "motion=spacetime run.replans=[[8,18],[14,60]] static_split=0.02 static_split_from=0.7 strategy=mcmc",
         "motion=tracked run.replans=[[8,18],[14,60]] rigid_neighbours=5 filter=geodesic filter_start=0.1",

@@ -62,7 +62,7 @@ fn every_trajectory_of_nodes_learns() {
 }
 
 #[test]
-fn nodes_that_nobody_follows_go_while_training() {
+fn nodes_without_gaussians_are_removed() {
     let bed = Bed::new();
     // More nodes than Gaussians need; none is added.
     let ran = bed.run("motion=control control_nodes=60 control_adapt_interval=6 control_grad_threshold=1e9 num_pts=40");

@@ -215,7 +215,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_camera_comes_back_and_nonsense_is_none() {
+    fn a_camera_round_trips_and_invalid_text_is_refused() {
         let pose = Se3::look_at([1.0, -2.0, 3.0], [0.2, 0.1, 0.0], [0.0, -1.0, 0.0]);
         let camera = Camera::with_fov_y(pose, 0.7, 320, 200);
         let named = NamedCamera::new("left", &camera);

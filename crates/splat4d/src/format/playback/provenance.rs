@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn damage_is_told() {
+    fn damage_is_reported() {
         let with = with_provenance(&file(), Some(&words())).unwrap();
         let mut broken = with.clone();
         *broken.last_mut().unwrap() ^= 1;

@@ -279,7 +279,7 @@ fn floats(draft: &Draft) -> Scene<f32> {
 }
 
 #[test]
-fn pictures_of_the_file_are_those_of_the_floats() {
+fn images_of_the_file_are_those_of_the_floats() {
     // Made-up coefficients are noise, the worst case for a palette: here they have an entry each, like degree 0 to 2.
     for (degree, least) in [(0, 45.0), (2, 40.0)] {
         let draft = made_up(2400, degree, 4);

@@ -6,6 +6,7 @@
 //! holds f_rest in bytes over [-4, 4]. Source: layout of PlayCanvas' splat-transform (MIT).
 
 use super::header::{Element, Header, broken};
+use super::pack::{BOUNDS, CHUNK, COLOR_BOUNDS, SH_RANGE, WORDS};
 use super::{PlyInfo, degree, f_rest_columns, is_compressed, non_finite, open, rows, write_compressed};
 use crate::format::bytes::{SH_C0, logit_of_byte};
 use crate::format::dialect::{Dialect, Writer, Y_DOWN};
@@ -25,30 +26,6 @@ pub const COMPRESSED: Dialect = Dialect {
     writer: Writer::Moment(|params, _, mut out| write_compressed(params, &mut out)),
     world: false,
 };
-
-/// Gaussians that share their bounds.
-pub(super) const CHUNK: usize = 256;
-/// The four words of a Gaussian.
-pub(super) const WORDS: [&str; 4] = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
-/// Bounds that every chunk has, in the order in which `Bounds` uses them.
-pub(super) const BOUNDS: [&str; 12] = [
-    "min_x",
-    "min_y",
-    "min_z",
-    "max_x",
-    "max_y",
-    "max_z",
-    "min_scale_x",
-    "min_scale_y",
-    "min_scale_z",
-    "max_scale_x",
-    "max_scale_y",
-    "max_scale_z",
-];
-/// Bounds of the colours; files of the first version lack them and mean 0 and 1.
-pub(super) const COLOR_BOUNDS: [&str; 6] = ["min_r", "min_g", "min_b", "max_r", "max_g", "max_b"];
-/// SH bytes span [-SH_RANGE/2, SH_RANGE/2].
-pub(super) const SH_RANGE: f32 = 8.0;
 
 /// Whether the element holds packed Gaussians.
 pub(super) fn is_packed(vertex: &Element) -> bool {

@@ -13,6 +13,7 @@ mod rows;
 mod stg;
 
 use crate::format::bytes::SH_C0;
+pub use crate::format::dialect::PlyInfo;
 use crate::format::dialect::{Dialect, Opened, Writer, Y_DOWN};
 use crate::format::mend::{self, Mended};
 use crate::format::warnings::Warnings;
@@ -64,29 +65,6 @@ const BLOCKS_PER_TASK: usize = 64;
 /// Rows that the writer formats at a time.
 const ROWS_PER_WRITE: usize = 4096;
 const _: () = assert!(GEOMETRY_COLUMNS.len() == 4, "GEOMETRY_NAMES names these columns");
-
-/// Metadata of a file, besides its numbers.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct PlyInfo {
-    /// Rows.
-    pub gaussians: usize,
-    /// Degree of the spherical harmonics, 0-3.
-    pub sh_degree: usize,
-    /// Rows that hold a NaN or an infinity without a meaning; they are kept as they are.
-    pub non_finite_rows: usize,
-    /// Infinities that mean something, now finite.
-    pub mended: Mended,
-    /// Whether base colours are RGB (`red green blue`), not coefficients.
-    pub rgb: bool,
-    /// What was subtracted from positions in double precision that are far from the origin, or what the file says was.
-    pub offset: [f64; 3],
-    /// Whether the numbers were quantised (PlayCanvas' compressed layout).
-    pub compressed: bool,
-    /// The header's comments.
-    pub comments: Vec<String>,
-    /// Properties of a Gaussian that were ignored; normals are not listed.
-    pub extra_properties: Vec<String>,
-}
 
 /// Coloured points without Gaussians.
 #[derive(Clone, Debug, Default, PartialEq)]

@@ -1,6 +1,5 @@
 //! Writes PlayCanvas' compressed `.ply`; the layout is told where it is read, in `compressed.rs`.
 
-use super::compressed::{BOUNDS, CHUNK, COLOR_BOUNDS, SH_RANGE, WORDS};
 use crate::format::bytes::{SH_C0, sound_rows};
 use crate::format::warnings::Warnings;
 use crate::math::quat;
@@ -8,6 +7,30 @@ use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::{GEOMETRY, Params, SH};
 use crate::{Error, Result};
 use std::io::Write;
+
+/// Gaussians that share their bounds.
+pub(super) const CHUNK: usize = 256;
+/// The four words of a Gaussian.
+pub(super) const WORDS: [&str; 4] = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
+/// Bounds that every chunk has, in the order in which `Bounds` uses them.
+pub(super) const BOUNDS: [&str; 12] = [
+    "min_x",
+    "min_y",
+    "min_z",
+    "max_x",
+    "max_y",
+    "max_z",
+    "min_scale_x",
+    "min_scale_y",
+    "min_scale_z",
+    "max_scale_x",
+    "max_scale_y",
+    "max_scale_z",
+];
+/// Bounds of the colours; files of the first version lack them and mean 0 and 1.
+pub(super) const COLOR_BOUNDS: [&str; 6] = ["min_r", "min_g", "min_b", "max_r", "max_g", "max_b"];
+/// SH bytes span [-SH_RANGE/2, SH_RANGE/2].
+pub(super) const SH_RANGE: f32 = 8.0;
 
 /// Log scales are kept within ± this: some trainings leave infinitely thin ones. Source: splat-transform's writer.
 const MOST_LOG_SCALE: f32 = 20.0;

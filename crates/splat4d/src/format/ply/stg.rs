@@ -97,7 +97,7 @@ pub fn read_stg(bytes: &[u8]) -> Result<(Scene<f32>, Warnings)> {
             sound.push(unpack(&x));
         }
     }
-    warnings.counted(rows.len() - sound.len(), rows.len(), "hold NaN or infinity and were left out");
+    warnings.counted(rows.len() - sound.len(), rows.len(), "contain NaN or infinity and were left out");
     Ok((scene(&sound, clock)?, warnings))
 }
 

@@ -40,7 +40,7 @@ const ONE_GAUSSIAN: &str = "property float x\nproperty float y\nproperty float z
     property float rot_2\nproperty float rot_3";
 
 #[test]
-fn every_degree_comes_back_bit_for_bit() {
+fn every_degree_round_trips_bit_for_bit() {
     for (degree, coefficients) in [1, 4, 9, 16].into_iter().enumerate() {
         for rows in [0, 1, 16, 1000, 4097] {
             let p = random(rows, coefficients);

@@ -45,7 +45,7 @@ fn sample() -> Vec<u8> {
 }
 
 #[test]
-fn every_type_comes_back_bit_for_bit() {
+fn every_type_round_trips_bit_for_bit() {
     assert_eq!(sample(), sample(), "the same content must give the same bytes");
 }
 

@@ -234,7 +234,7 @@ fn parse(meta: &[u8]) -> Result<Value> {
 fn picture(files: &Files<'_>, meta: &Value, group: &str, i: usize, needs: Needs) -> Result<Picture> {
     let name = meta[group]["files"][i].as_str();
     let name = name.ok_or_else(|| damaged(format!("its meta.json names no file {i} of `{group}`")))?;
-    let bytes = files.get(name).ok_or_else(|| damaged(format!("the picture {name} is missing")))?;
+    let bytes = files.get(name).ok_or_else(|| damaged(format!("the image {name} is missing")))?;
     Picture::open(bytes, needs).map_err(|e| e.at(name))
 }
 

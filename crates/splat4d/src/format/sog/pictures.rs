@@ -39,7 +39,7 @@ pub(super) struct Picture {
 impl Picture {
     /// Decodes a picture. Errors: not WebP, lossy, damaged, fewer pixels than needed, or absurdly many.
     pub(super) fn open(bytes: &[u8], needs: Needs) -> Result<Self> {
-        let broken = |e| damaged(format!("the picture cannot be decoded ({e})"));
+        let broken = |e| damaged(format!("the image cannot be decoded ({e})"));
         let mut decoder = WebPDecoder::new(Cursor::new(bytes)).map_err(broken)?;
         let (width, height) = decoder.dimensions();
         let (width, height) = (width as usize, height as usize);
@@ -48,12 +48,10 @@ impl Picture {
             Needs::Palette => (1, ALWAYS),
         };
         if !(least..=most).contains(&(width * height)) {
-            return Err(damaged(format!(
-                "the picture has {width}x{height} pixels, but {least} to {most} are expected"
-            )));
+            return Err(damaged(format!("the image has {width}x{height} pixels, but {least} to {most} are expected")));
         }
         if decoder.is_animated() || decoder.is_lossy() {
-            return Err(damaged("the picture is lossy or animated, so that its numbers are not those that were meant"));
+            return Err(damaged("the image is lossy or animated, so its values are not exact"));
         }
         let channels = if decoder.has_alpha() { 4 } else { 3 };
         decoder.set_memory_limit(16 * most + bytes.len());

@@ -45,7 +45,7 @@ fn files() -> Files<'static> {
 }
 
 #[test]
-fn pictures_made_by_hand_are_read() {
+fn images_made_by_hand_are_read() {
     let (p, warnings) = read(&files()).unwrap();
     let (g, sh) = (&p[GEOMETRY], &p[SH]);
     let [x, y, z] = g.read::<3>(0, 0);

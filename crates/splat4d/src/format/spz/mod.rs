@@ -16,6 +16,7 @@ mod streams;
 mod tests;
 
 use super::bytes::sound_rows;
+pub use super::dialect::SPZ_VERSION as DEFAULT_VERSION;
 use super::dialect::{Dialect, Opened, Writer, Y_DOWN};
 use super::warnings::Warnings;
 use crate::math::sh::degree_of;
@@ -39,8 +40,6 @@ pub(crate) const DIALECT: Dialect = Dialect {
 
 /// The versions this library reads and writes.
 pub(crate) const VERSIONS: std::ops::RangeInclusive<u32> = 2..=4;
-/// Version written by default: the one that most programs open.
-pub const DEFAULT_VERSION: u32 = 3;
 /// First version that names its axes when it is written: readers of version 2 (spz-js 1.2) refuse bytes behind the streams.
 const NAMES_AXES: u32 = 3;
 /// First bytes of a version 4 file, and of the header inside older ones.

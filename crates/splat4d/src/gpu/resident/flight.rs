@@ -147,7 +147,7 @@ impl GpuRenderer {
         for view in step.views {
             let target = &view.target;
             let size = [target.truth.width, target.truth.height];
-            assert_eq!(size, [view.camera.width, view.camera.height], "a picture and its truth have one shape");
+            assert_eq!(size, [view.camera.width, view.camera.height], "an image and its truth have one shape");
             able &= self.can_compare(n, size);
             if !able {
                 break;

@@ -282,7 +282,7 @@ fn steps_under_way_room_bands_and_pages_change_no_bit() {
 }
 
 #[test]
-fn a_number_that_is_none_stops_all_that_follows_and_is_told_of_its_step() {
+fn a_non_finite_value_stops_later_steps_and_its_step_is_reported() {
     let Some(mut r) = own_renderer() else { return };
     let [first, then, _] = far_and_near();
     let steps: [(&[Camera], f64); 5] =
@@ -352,7 +352,7 @@ fn ties_of_more_rows_than_a_page_are_refused_and_nothing_else_is() {
 }
 
 #[test]
-fn memory_that_is_refused_costs_pictures_first_and_is_an_error_then() {
+fn failed_allocations_drop_cached_images_first_then_are_errors() {
     let Some(mut r) = own_renderer() else { return };
     let [first, then, _] = far_and_near();
     let steps: [(&[Camera], f64); 3] = [(&first, 0.01), (&first, 0.01), (&then, 0.01)];
@@ -369,7 +369,7 @@ fn memory_that_is_refused_costs_pictures_first_and_is_an_error_then() {
 }
 
 #[test]
-fn a_film_shows_what_a_picture_does() {
+fn a_film_shows_what_an_image_does() {
     let Some(mut r) = own_renderer() else { return };
     let (p, _, motion) = params::<f32>(&Native4dSpec::default());
     let layer = Layer::new("all", p, motion, LifeKind::Infinite);

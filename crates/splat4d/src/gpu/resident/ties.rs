@@ -4,7 +4,7 @@ use super::uniforms::TieRule;
 use crate::Result;
 use crate::gpu::buffers::Grown;
 use crate::gpu::device::Gpu;
-use crate::gpu::frame::THREADS;
+use crate::gpu::limits::THREADS;
 use crate::render::KeptTies;
 
 /// The ties of a layer.

@@ -330,7 +330,7 @@ fn each_equals_its_twin(r: &mut GpuRenderer) {
 }
 
 #[test]
-fn the_way_back_repeats_bit_for_bit_in_bands_too() {
+fn the_backward_pass_repeats_bit_for_bit_in_bands() {
     let Some(mut r) = own_renderer() else { return };
     r.for_training().expect("the kernels compile");
     let (scene, camera) = (Scenery::new(50, 4000, 1.2, 0.08), camera([0.0, 0.5, -4.0], 150, 110));
@@ -359,7 +359,7 @@ fn the_way_back_repeats_bit_for_bit_in_bands_too() {
 }
 
 #[test]
-fn small_bindings_cut_tables_and_pictures_and_change_no_bit() {
+fn small_bindings_cut_tables_and_images_and_change_no_bit() {
     /// Bytes of the largest binding: 2,720 rows of colours of degree 3.
     const SMALL: u64 = 1 << 19;
     let Some(mut r) = own_renderer() else { return };

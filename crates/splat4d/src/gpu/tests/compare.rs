@@ -170,7 +170,7 @@ fn value_and_gradient_equal_the_definition_and_the_way_through_the_cpu() {
 }
 
 #[test]
-fn comparing_repeats_bit_for_bit_whatever_room_there_is_and_pictures_are_sent_once() {
+fn comparison_repeats_bit_for_bit_at_any_budget_and_images_are_uploaded_once() {
     let Some(mut r) = own_renderer() else { return };
     let (scene, camera) = (Scenery::new(82, 3000, 1.2, 0.08), camera([0.0, 0.5, -4.0], 100, 70));
     let (splats, (color, weight)) = (scene.splats(), truth(83, &camera, true));

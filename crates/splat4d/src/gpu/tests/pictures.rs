@@ -37,7 +37,7 @@ fn compare(r: &mut GpuRenderer, shot: &Shot<'_>, what: &str) -> (f64, RenderStat
 }
 
 #[test]
-fn pictures_equal_the_cpus() {
+fn images_equal_the_cpus() {
     let Some(mut r) = renderer() else { return };
     println!("{}", r.gpu().describe());
     let scenes = [Scenery::new(10, 2000, 1.2, 0.03), Scenery::new(11, 200, 1.0, 0.3), Scenery::new(12, 1, 0.1, 0.2)];
@@ -142,7 +142,7 @@ fn spoilt(values: &[f32]) -> Scenery {
 }
 
 #[test]
-fn absurd_numbers_are_not_drawn() {
+fn absurd_values_are_not_rendered() {
     let Some(mut r) = renderer() else { return };
     let camera = camera([0.0, 0.5, -4.0], 90, 70);
     let scene = spoilt(&[f32::NAN, f32::INFINITY, f32::NEG_INFINITY]);
@@ -161,7 +161,7 @@ fn absurd_numbers_are_not_drawn() {
 }
 
 #[test]
-fn bands_make_the_same_picture() {
+fn bands_make_the_same_image() {
     let Some(mut r) = own_renderer() else { return };
     let (scene, camera) = (Scenery::new(20, 20_000, 1.2, 0.05), camera([0.0, 0.5, -4.0], 300, 210));
     let (mut whole, mut bands) = (Image::default(), Image::default());
@@ -203,7 +203,7 @@ fn a_second_frame_is_the_same_and_allocates_nothing() {
 }
 
 #[test]
-fn bytes_are_the_picture_clamped_and_rounded() {
+fn bytes_are_the_image_clamped_and_rounded() {
     let Some(mut r) = own_renderer() else { return };
     let (scene, camera) = (Scenery::new(23, 3000, 1.2, 0.1), camera([0.0, 0.5, -4.0], 131, 77));
     let splats = scene.splats();

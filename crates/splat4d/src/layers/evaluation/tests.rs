@@ -162,7 +162,7 @@ fn bits(d: &Grads<f64>, params: &Params<f64>) -> Vec<(Key, Vec<u64>)> {
 }
 
 #[test]
-fn the_way_back_is_the_motion_models_own_bit_for_bit() {
+fn the_backward_pass_equals_the_motion_model_bit_for_bit() {
     let layers = layers();
     let (got, got_times) = gradients(&layers);
     let d_outs = d_outs(&evaluation(&layers));
@@ -227,7 +227,7 @@ fn what_was_asked_before_leaves_no_trace() {
 }
 
 #[test]
-fn a_sweep_shows_what_single_questions_answer() {
+fn a_sweep_equals_single_queries() {
     for layer in &layers() {
         let asked = [(Rows::Some(&[2, 3][..]), Time(0.1)), (Rows::All, Time(0.6)), (Rows::Some(&[0][..]), Time(0.1))];
         let mut shown = 0;

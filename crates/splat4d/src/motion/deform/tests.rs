@@ -91,7 +91,7 @@ fn the_network_is_detached_from_the_mean() {
 }
 
 #[test]
-fn while_the_network_rests_nobody_asks_it() {
+fn a_frozen_network_is_not_evaluated() {
     let mut p = cloud::<f32>(20, [0.0; 3]);
     let model = Deform::new(spec(ENCODED, 3, false), &mut p).unwrap();
     let touched = |p: &Params<f32>| {

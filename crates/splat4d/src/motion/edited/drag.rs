@@ -123,7 +123,7 @@ impl<'a, F: Real> Pulls<'a, F> {
             let q = quat::normalize([F::ONE + x[6], x[7], x[8], x[9]]).0;
             let r = quat::to_rotation(q);
             let place = [x[0], x[1], x[2]];
-            (r, std::array::from_fn(|i| place[i] + x[3 + i] - super::dot3(r[i], place)), q)
+            (r, std::array::from_fn(|i| place[i] + x[3 + i] - crate::math::vec3::dot(r[i], place)), q)
         };
         Self { nodes: (0..spec.nodes).map(node).collect(), table: &p[keys.pulls] }
     }

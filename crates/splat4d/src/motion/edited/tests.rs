@@ -45,7 +45,7 @@ fn nodes_that_move_as_one_body_carry_what_they_pull_and_nothing_else() {
     let turn = quat::normalize([0.8, 0.1, -0.3, 0.4]).0;
     let (r, shift) = (quat::to_rotation(turn), [0.2, -0.1, 0.4]);
     let places = [[0.0, 0.1, 0.0], [0.6, 0.0, 0.2], [1.1, 0.0, 0.0]];
-    let body = |p: [f64; 3]| -> [f64; 3] { std::array::from_fn(|i| dot3(r[i], p) + shift[i]) };
+    let body = |p: [f64; 3]| -> [f64; 3] { std::array::from_fn(|i| dot(r[i], p) + shift[i]) };
     let moved = |p: [f64; 3]| (p, std::array::from_fn(|k| body(p)[k] - p[k]), turn);
     let rest = places.map(|p| (p, [0.0; 3], [1.0, 0.0, 0.0, 0.0]));
     let nodes = rest.into_iter().chain(places.map(moved)).collect();

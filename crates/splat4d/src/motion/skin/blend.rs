@@ -4,6 +4,7 @@
 //! (4). A Gaussian blends the numbers of its nodes and goes to M x + c with the blend; it is node by node only that sums are
 //! made, and all else is done for sixteen Gaussians at a time.
 
+use super::tasks::{sum_parts, task_rows};
 use super::{POSE, Skin, Weights};
 use crate::math::{Real, quat};
 use crate::motion::lanes::{Batch, Batches, Lane, Work};
@@ -21,10 +22,6 @@ const FRAME: usize = 16;
 const SHIFT: usize = 9;
 /// Where the quaternion begins.
 const TURN: usize = 12;
-/// Rows a task takes at least.
-const TASK_ROWS: usize = 1024;
-/// A task's rows a node at least: then adding up all tasks' gradients to nodes is a small part of the work.
-const TASK_ROWS_A_NODE: usize = 4;
 
 /// A rigid motion.
 type Frame<F> = [F; FRAME];
@@ -314,19 +311,4 @@ impl<F: Real> Kernel for Back<'_, F> {
             }
         }
     }
-}
-
-/// Rows of one task: a function of sizes alone.
-pub(super) fn task_rows(nodes: usize) -> usize {
-    (nodes * TASK_ROWS_A_NODE).max(TASK_ROWS).next_multiple_of(BLOCK)
-}
-
-/// Adds up the tasks' results in order.
-pub(super) fn sum_parts<F: Real>(parts: Vec<Vec<[F; 16]>>, len: usize) -> Vec<[F; 16]> {
-    let mut parts = parts.into_iter();
-    let mut sum = parts.next().unwrap_or_else(|| vec![[F::ZERO; 16]; len]);
-    for part in parts {
-        sum.as_flattened_mut().iter_mut().zip(part.as_flattened()).for_each(|(s, x)| *s += *x);
-    }
-    sum
 }

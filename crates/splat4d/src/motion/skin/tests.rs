@@ -160,7 +160,7 @@ fn one_motion_of_all_nodes_moves_every_gaussian_rigidly() {
 }
 
 #[test]
-fn an_edit_of_nodes_keeps_the_picture() {
+fn an_edit_of_nodes_keeps_the_image() {
     let spec = ControlSpec {
         skin: spec(14, 2, true),
         trajectory: TrajectorySpec::Keys { curve: Curve::Cubic, keys: 5 },

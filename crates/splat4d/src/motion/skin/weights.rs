@@ -9,7 +9,7 @@
 //! (nearly) zero: no cracks open where neighbours switch (the reference cuts off sharply). Σ a = 1 exactly as the sum of
 //! quotients, and ε keeps the sum above zero where K + 1 nodes pull alike.
 
-use super::blend::{sum_parts, task_rows};
+use super::tasks::{sum_parts, task_rows};
 use super::{MAX_HYPER, MAX_NEIGHBOURS, NODE_HYPER, NODE_LOG_RADIUS, SPARE_CANDIDATES, Skin};
 use crate::math::Real;
 use crate::scene::table::TableMut;

@@ -39,7 +39,7 @@ impl Headed {
 }
 
 #[test]
-fn pictures_with_a_head_equal_the_oracle() {
+fn images_with_a_head_equal_the_oracle() {
     // Odd sizes end in the middle of sixteen pixels and of eight rows.
     for (w, h) in [(1, 1), (17, 3), (33, 21), (64, 40)] {
         let (s, view) = (Headed::new(20, 0.3), camera(w, h));
@@ -89,7 +89,7 @@ fn the_network_is_a_matrix_product_a_pixel() {
 }
 
 #[test]
-fn a_head_at_its_start_gives_the_picture_without_one() {
+fn a_head_at_its_start_gives_the_image_without_one() {
     let mut s = Headed::new(20, 0.3);
     let mut p = Params::<f64>::new(0, 1, &[]);
     let keys = crate::scene::HeadKeys::new(7, &mut p).unwrap();

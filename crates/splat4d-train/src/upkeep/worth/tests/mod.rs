@@ -98,7 +98,7 @@ impl Frames for Again {
 }
 
 #[test]
-fn spatial_scores_sum_to_what_the_pictures_cover_and_double_with_them() {
+fn spatial_scores_sum_to_what_the_images_cover_and_double_with_them() {
     let (s, made) = (scene(400), made());
     let scores = scored(&s, &made, &ScoreConfig::default());
     let sum: f64 = scores.spatial.iter().flatten().sum();
@@ -115,7 +115,7 @@ fn spatial_scores_sum_to_what_the_pictures_cover_and_double_with_them() {
 }
 
 #[test]
-fn scores_know_no_threads_and_tell_of_their_progress() {
+fn scores_do_not_depend_on_threads_and_report_progress() {
     let (s, made) = (scene(300), made());
     let pool = |threads: usize| rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
     for temporal in Temporal::ALL {

@@ -15,7 +15,7 @@ fn the_recipe_knows_every_score() {
 }
 
 #[test]
-fn every_score_is_finite_ranks_what_is_seen_above_what_is_not_and_knows_no_threads() {
+fn every_score_is_finite_ranks_visible_first_and_ignores_threads() {
     let (mut s, made) = (scene(120), made());
     // One behind every camera's back and one that is transparent.
     s.layers[1].params[GEOMETRY].write(0, 0, [1e4, 0.0, 0.0]);
@@ -92,7 +92,7 @@ fn pup_is_the_determinant_of_the_blocks_of_all_views_and_speedy_their_sum() {
 }
 
 #[test]
-fn a_block_without_full_rank_is_worth_nothing() {
+fn a_block_without_full_rank_has_zero_importance() {
     let mut identity = [0.0; 21];
     [0, 6, 11, 15, 18, 20].iter().for_each(|&k| identity[k] = 4.0);
     assert!((root_of_determinant(&identity) - 4.0).abs() < 1e-12);

@@ -27,7 +27,7 @@ fn shown(bytes: &[u8], t: f64) -> Vec<[f64; 3]> {
 }
 
 #[test]
-fn a_file_plays_as_far_as_it_goes_and_who_has_an_older_start_is_not_disturbed() {
+fn a_growing_file_plays_and_readers_of_an_older_header_are_not_disturbed() {
     let mut growing = Growing::begin(Cursor::new(Vec::new()), meta(0.0, &[])).unwrap();
     let bytes = |g: &mut Growing<Cursor<Vec<u8>>>| g.file().get_ref().clone();
     assert_eq!(read(&bytes(&mut growing)).unwrap().len(), 0);
@@ -53,7 +53,7 @@ fn a_file_plays_as_far_as_it_goes_and_who_has_an_older_start_is_not_disturbed() 
 }
 
 #[test]
-fn the_finished_file_does_not_tell_who_came_first_and_is_like_any_other() {
+fn the_finished_file_does_not_depend_on_the_order_of_chunks() {
     let parts = [part(1, 0.0), part(2, 0.5), part(3, 0.0)];
     let file = |order: [usize; 3]| {
         let mut growing = Growing::begin(Cursor::new(Vec::new()), meta(1.0, &[])).unwrap();

@@ -26,7 +26,7 @@ impl Replans {
 
     /// Adds one. Panics: it is not behind the last, or leaves no step to take.
     pub(crate) fn push(&mut self, row: Replan) {
-        assert!(self.may_follow(row), "a run is planned anew at ascending steps, and has a step left then");
+        assert!(self.may_follow(row), "a run is planned again at increasing steps, and has a step left then");
         self.0.push(row);
     }
 

@@ -1,0 +1,98 @@
+//! Files of output folders: one of a sound run's files holds the bytes, and the run is opened. Runs come from other machines.
+
+use crate::Reader;
+use serde_json::json;
+use splat4d_cli::run_folder::{Asked, Run};
+use splat4d_train::output;
+use splat4d_train::recipe::Recipe;
+use splat4d_train::run::chunks::Chunked;
+use std::cell::OnceCell;
+use std::path::Path;
+use tempfile::TempDir;
+
+pub(crate) const READERS: &[Reader] = &[
+    Reader { name: "run_json", seeds: || vec![run_json().into()], read: |b| open("run.json", b) },
+    Reader { name: "metrics_csv", seeds: || vec![METRICS.into()], read: |b| open("metrics.csv", b) },
+    Reader { name: "results_json", seeds: || vec![RESULTS.into()], read: |b| open("results.json", b) },
+    Reader { name: "per_view_json", seeds: || vec![PER_VIEW.into()], read: |b| open("per_view.json", b) },
+    Reader { name: "cameras_json", seeds: || vec![CAMERAS.into()], read: |b| open("cameras.json", b) },
+    Reader { name: "chunk_plan", seeds: || vec![PLAN.into()], read: |b| open("chunks/plan.json", b) },
+    Reader { name: "output_files", seeds: || vec![FILES.into()], read: |b| open(".splat4d/files", b) },
+    Reader { name: "output_asked", seeds: || vec![asked().into()], read: |b| open(".splat4d/asked", b) },
+];
+
+const METRICS: &str =
+    "iteration,loss,psnr,gaussians,stage,seconds,render_ms\n10,0.5,20.5,100,\"deform-mlp, still\",1.5,0.25\n";
+const RESULTS: &str = r#"{"ours_10": {"PSNR": 20.5, "SSIM": 0.9}, "still": {"PSNR": 18.0}}"#;
+const PER_VIEW: &str =
+    r#"{"ours_10": {"PSNR": {"00000.png": 20.5}, "camera": {"00000.png": "a"}, "time": {"00000.png": 0.5}}}"#;
+const CAMERAS: &str = r#"[{"id": 0, "img_name": "a", "width": 8, "height": 6, "position": [0, 0, -4],
+    "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "fx": 8, "fy": 8, "cx": 4, "cy": 3, "near": 0.1, "time": 0.5, "split": "test"}]"#;
+const PLAN: &str = r#"{"version": "0.1.0", "recipe": "0011223344556677", "capture": "8899", "take": [0, 120], "overlap": 16, "cuts": [60]}"#;
+const FILES: &str = "run.json\ntest/ours_10/\ntest/ours_10/renders/00000.png\nü%0a.json\n";
+
+fn run_json() -> String {
+    json!({"version": "0.1.0", "capture": "/nowhere", "capture_name": "a", "iteration": 10, "iterations": 10, "seconds": 1.5,
+        "finished": true, "gaussians": 100, "warnings": ["a"], "notes": [{"what": "b", "remedy": "c"}]})
+    .to_string()
+}
+
+fn asked() -> String {
+    let asked = Asked::new(Path::new("/nowhere"), &Recipe::default(), Some(1.0), false);
+    serde_json::to_string(&asked).expect("it is plain data")
+}
+
+thread_local! {
+    static FOLDER: OnceCell<TempDir> = const { OnceCell::new() };
+}
+
+/// Opens the run in which one file has other bytes, and puts that back.
+fn open(file: &str, bytes: &[u8]) {
+    FOLDER.with(|folder| {
+        let run = folder.get_or_init(made).path();
+        let path = run.join(file);
+        std::fs::write(&path, bytes).expect("the disk takes a file");
+        if let Ok(run) = Run::open(run) {
+            drop((run.name(), run.iteration(), run.scene_file(), run.views()));
+        }
+        drop((Chunked::open(run).map(|c| c.parts()), Asked::unbegun(run), output::written(run)));
+        std::fs::remove_file(path).expect("it is there");
+    });
+}
+
+fn made() -> TempDir {
+    let folder = tempfile::tempdir().expect("there is a place for temporary files");
+    for inner in ["chunks", ".splat4d"] {
+        std::fs::create_dir(folder.path().join(inner)).expect("it is new");
+    }
+    std::fs::write(folder.path().join("recipe.toml"), Recipe::default().to_toml()).expect("the disk takes a file");
+    folder
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn seeds_are_sound() {
+        let folder = made();
+        let at = folder.path();
+        for (file, text) in [
+            ("run.json", run_json()),
+            ("metrics.csv", METRICS.into()),
+            ("results.json", RESULTS.into()),
+            ("per_view.json", PER_VIEW.into()),
+            ("cameras.json", CAMERAS.into()),
+            ("chunks/plan.json", PLAN.into()),
+            (".splat4d/files", FILES.into()),
+            (".splat4d/asked", asked()),
+        ] {
+            std::fs::write(at.join(file), text).unwrap();
+        }
+        let run = Run::open(at).unwrap();
+        assert_eq!((run.metrics.len(), run.views.len(), run.views().unwrap().len()), (1, 1, 1));
+        assert_eq!((run.name().as_str(), output::written(at).len()), ("a", 4));
+        assert!(Asked::unbegun(at).is_some());
+        assert!(Chunked::open(at).err().unwrap().to_string().contains("recipe"), "its fingerprint is another");
+    }
+}

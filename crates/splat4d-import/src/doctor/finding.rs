@@ -1,0 +1,60 @@
+//! What checks share: thresholds, grades, and the report that they write findings to.
+
+use super::{Finding, Grade, Report};
+use splat4d::scene::Camera;
+
+/// Sharpness relative to other cameras.
+pub(super) const SHARPNESS: [f64; 2] = [0.6, 0.35];
+/// sRGB values are this power of light, about.
+pub(super) const GAMMA: f64 = 2.2;
+/// Matches that tell something of a pair.
+pub(super) const MATCHES: usize = 12;
+/// So many of a camera's pairs must agree on its error at least, of so many that tell it; chance only makes errors larger.
+pub(super) const AGREE: usize = 2;
+
+pub(super) fn grade(value: f64, [warning, bad]: [f64; 2]) -> Option<Grade> {
+    match value {
+        v if v >= bad => Some(Grade::Bad),
+        v if v >= warning => Some(Grade::Warning),
+        _ => None,
+    }
+}
+
+pub(super) fn worse([a, b]: [f64; 2], [c, d]: [f64; 2]) -> [f64; 2] {
+    [a.max(c), b.max(d)]
+}
+
+/// Pixels of a picture 1920 wide for each of its own.
+pub(super) fn unit(view: &Camera) -> f64 {
+    /// The longer side of what thresholds are about.
+    const WIDE: f64 = 1920.0;
+    WIDE / view.width.max(view.height) as f64
+}
+
+/// Where findings go.
+pub(super) struct Told<'a> {
+    pub(super) report: &'a mut Report,
+}
+
+impl Told<'_> {
+    pub(super) fn add(
+        &mut self,
+        (grade, check): (Grade, &'static str),
+        camera: Option<&str>,
+        (amount, unit): (f64, &'static str),
+        what: String,
+        (looks, remedy): (&'static str, &str),
+    ) {
+        self.report.findings.push(Finding {
+            grade,
+            check,
+            camera: camera.map(str::to_owned),
+            amount: Some(amount),
+            unit,
+            what,
+            looks,
+            remedy: remedy.to_owned(),
+            alike: Vec::new(),
+        });
+    }
+}

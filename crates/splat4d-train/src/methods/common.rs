@@ -1,0 +1,155 @@
+//! Settings that every motion model is trained with.
+
+use super::Rate;
+use crate::loss::LossSettings;
+use crate::settings::{Choice, settings};
+use crate::upkeep::{
+    Adc, AdcSettings, DensifySettings, FloaterSettings, Floaters, LEAST, Mcmc, McmcSettings, Merge, MergeSettings,
+    MortonOrder, OpacityReset, OpacityResetSettings, Prune, PruneSettings, Relocate, RelocateSettings, SplitSettings,
+    Upkeep,
+};
+use splat4d::scene::LifeKind;
+
+settings! {
+    /// Colour of Gaussians and of cameras' images.
+    pub struct AppearanceSettings {
+        /// Highest degree of the spherical harmonics, 0 to 3.
+        sh_degree: usize = 1 => within(0, 3);
+        /// Iterations before each further SH degree is unlocked; 0: iterations/10.
+        sh_degree_interval: usize = 0 => any().unit("iterations").when(On("appearance.sh_degree"));
+        /// Learn a colour matrix and an offset per camera, if there are several cameras and each is named or has
+        /// several images; their mean stays the identity.
+        exposure: bool = true;
+        /// The same for photos with automatic exposure: colours between them become more accurate, except those of
+        /// held-out photos (studies/records/2026-11-26-recipe-trials.md).
+        exposure_single: bool = false => any().when(On("appearance.exposure"));
+        /// Rate of the exposure (Luiten et al., 10,000 steps: 1e-4).
+        exposure_lr: f64 = 1e-3 => any().when(On("appearance.exposure"));
+        /// Antialiased mode (opacity compensation).
+        antialias: bool = false;
+    }
+}
+
+settings! {
+    /// Learning rates of parameters that all Gaussians have.
+    pub struct RateSettings {
+        /// Rate of positions at the start, of the extent; 0: 0.002, and less in proportion if `densify.max_cap` is above
+        /// 30,000.
+        position_init: f64 = 0.0 => any().unit("extents");
+        /// Rate of positions at the end, of the extent; 0: 0.00005, and less in the same way.
+        position_final: f64 = 0.0 => any().unit("extents");
+        /// Share to which rates without a final value (colour, opacity, scale, rotation, lifespan) decay.
+        decay: f64 = 1.0 => positive();
+        /// Rate of base colour; higher SH degrees learn 20 times more slowly.
+        feature: f64 = 6e-3 => positive();
+        /// Rate of opacity logits.
+        opacity: f64 = 0.05 => positive();
+        /// Rate of log scales.
+        scaling: f64 = 0.015 => positive();
+        /// Rate of quaternions.
+        rotation: f64 = 1e-3 => positive();
+    }
+}
+
+/// Rates of positions at the start and at the end for up to [`LEAST`] Gaussians, of the extent. Kerbl et al. 2023 use 1.6e-4
+/// and 1.6e-6 for runs of 30,000 steps; ours are several times shorter. Stated before and not measured against them.
+const POSITIONS: [f64; 2] = [2e-3, 5e-5];
+/// Lowest share of them, with many Gaussians: the rate of Kerbl et al. 2023, who have some millions.
+const FINEST: f64 = 0.08;
+
+impl RateSettings {
+    /// A rate that falls to `decay` of itself over the stage.
+    pub(crate) fn falling(&self, rate: f64) -> Rate {
+        Rate { start: rate, end: rate * self.decay }
+    }
+
+    /// Rates of positions at the start and at the end, of the extent. More Gaussians are smaller and lie closer, and the
+    /// steps of the few throw them about: a real room with 70,000 gains 0.4 dB with a third of the rates, an object with 90,000
+    /// neither gains nor loses (studies/records/2026-11-26-real-size.md).
+    pub(super) fn positions(&self, cap: usize) -> [f64; 2] {
+        let share = (LEAST as f64 / cap.max(1) as f64).clamp(FINEST, 1.0);
+        let [start, end] = POSITIONS.map(|rate| rate * if cap == 0 { 1.0 } else { share });
+        let stated = |rate: f64, by_count: f64| if rate > 0.0 { rate } else { by_count };
+        [stated(self.position_init, start), stated(self.position_final, end)]
+    }
+}
+
+settings! {
+    /// The lifespan of a Gaussian (temporal opacity).
+    pub struct LifeSettings
+    when (Any(&[IsNot("run.motion", &["still", "tracked"]), Is("life.kind", &["gauss-half", "gauss-one", "interval"])])) {
+        /// Kind of lifespan: auto (spacetime: gauss-half; control, ssm, deform-mlp and hexplane with fixed cameras:
+        /// interval; else infinite), infinite, gauss-half, gauss-one, interval.
+        kind: Option<LifeKind> = None => any().switch().when(IsNot("run.motion", &["still"]));
+        /// Rate of lifespan centres, clips.
+        center_lr: f64 = 1e-3 => any().unit("clips");
+        /// Rate of log lifespan widths.
+        width_lr: f64 = 0.02;
+        /// Smallest lifespan width, frames.
+        min_frames: f64 = 0.5 => any().unit("frames");
+    }
+}
+
+/// `auto`, the first, is the motion model's own choice.
+impl Choice for Option<LifeKind> {
+    const NAMES: &'static [(&'static str, Self)] = &[
+        ("auto", None),
+        ("infinite", Some(LifeKind::Infinite)),
+        ("gauss-half", Some(LifeKind::GaussHalf)),
+        ("gauss-one", Some(LifeKind::GaussOne)),
+        ("interval", Some(LifeKind::Interval)),
+    ];
+}
+
+/// The tables of settings that every motion model is trained with, resolved; [`still::stage`](super::still::stage) makes a
+/// stage of them. What one model alone needs is its method's own.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct CommonSettings {
+    /// Colours of Gaussians and cameras.
+    pub appearance: AppearanceSettings,
+    /// Learning rates.
+    pub rates: RateSettings,
+    /// Lifespans.
+    pub life: LifeSettings,
+    /// Weights of losses.
+    pub loss: LossSettings,
+    /// Density control.
+    pub densify: DensifySettings,
+    /// Adaptive density control.
+    pub adc: AdcSettings,
+    /// Opacity reset.
+    pub opacity_reset: OpacityResetSettings,
+    /// Markov chain Monte Carlo.
+    pub mcmc: McmcSettings,
+    /// Relocation.
+    pub relocate: RelocateSettings,
+    /// Removal of floaters.
+    pub floaters: FloaterSettings,
+    /// Pruning.
+    pub prune: PruneSettings,
+    /// Merging.
+    pub merge: MergeSettings,
+    /// The split into a static and a dynamic layer.
+    pub split: SplitSettings,
+}
+
+impl CommonSettings {
+    /// The maintenance operations that these settings switch on.
+    pub(crate) fn upkeep(&self) -> Vec<Box<dyn Upkeep>> {
+        let all = [
+            boxed(Adc::of(self.adc, &self.densify)),
+            boxed(Mcmc::of(self.mcmc, self.relocate.gradient_share, &self.densify)),
+            boxed(MortonOrder::of(&self.densify)),
+            boxed(Relocate::of(self.relocate, &self.densify)),
+            boxed(Floaters::of(self.floaters, &self.densify)),
+            boxed(Prune::of(self.prune)),
+            boxed(Merge::of(self.merge)),
+            boxed(OpacityReset::of(self.opacity_reset, &self.densify)),
+        ];
+        all.into_iter().flatten().collect()
+    }
+}
+
+fn boxed(operation: Option<impl Upkeep + 'static>) -> Option<Box<dyn Upkeep>> {
+    operation.map(|o| Box::new(o) as Box<dyn Upkeep>)
+}

@@ -1,0 +1,133 @@
+//! The parts of a run, built from the recipe's tables: the method of a motion model, and the plan that methods read.
+
+use super::Recipe;
+use crate::init::{self, InitSettings};
+use crate::methods::{
+    CommonSettings, Plan, Program, control, deform, filtered, hexplane, native4d, own, spacetime, ssm, still, tracked,
+};
+use crate::upkeep::{AdcSettings, DENSE, FINEST};
+use crate::{Error, Result};
+use splat4d::motion::{BUILT_IN, MODELS};
+
+/// Makes a program with the settings of a recipe.
+type Make = fn(&Recipe) -> Box<dyn Program>;
+
+/// The programs by the names of their models: a method is its file and an entry here. `auto` asks them in this order.
+pub(crate) const PROGRAMS: [(&str, Make); 8] = [
+    ("still", |_| Box::new(still::StillProgram)),
+    ("tracked", |r| Box::new(tracked::TrackedProgram { tracked: r.tracked.clone() })),
+    ("spacetime", |r| Box::new(spacetime::SpacetimeProgram { spacetime: r.spacetime.clone(), guided: r.guided })),
+    ("control", |r| Box::new(control::ControlProgram { control: r.control.clone(), nodes: r.nodes })),
+    ("deform-mlp", |r| Box::new(deform::DeformProgram { deform: r.deform.clone() })),
+    ("hexplane", |r| Box::new(hexplane::HexplaneProgram { hexplane: r.hexplane.clone() })),
+    ("native4d", |r| Box::new(native4d::Native4dProgram { native4d: r.native4d.clone() })),
+    ("ssm", |r| Box::new(ssm::SsmProgram { ssm: r.ssm.clone(), control: r.control.clone(), nodes: r.nodes })),
+];
+
+impl Recipe {
+    /// The program of the recipe's motion model, with the losses over time and the filter that the recipe switches on.
+    ///
+    /// Errors: `auto` has not chosen yet; features for a model that has none.
+    pub fn program(&self) -> Result<Box<dyn Program>> {
+        let program = self.program_of(self.run.motion.as_str())?;
+        if self.spacetime.has_features() && !program.has_features() {
+            return Err(Error::input(format!("motion `{}` has no features", self.run.motion))
+                .remedy("Use --motion spacetime, or --set features=none"));
+        }
+        Ok(filtered::wrap(program, &self.filter, &self.transport))
+    }
+
+    /// The program of a built-in motion model with the recipe's settings, or of one from outside
+    /// ([`OwnMotion`](crate::methods::OwnMotion)), without a filter.
+    pub(crate) fn program_of(&self, motion: &str) -> Result<Box<dyn Program>> {
+        if let Some(own) = own::program(motion) {
+            return Ok(own);
+        }
+        if let Some((_, make)) = PROGRAMS.into_iter().find(|(name, _)| *name == motion) {
+            return Ok(make(self));
+        }
+        if BUILT_IN.contains(&motion) {
+            return Err(Error::input(format!("`{motion}` cannot be chosen: it wraps another motion model"))
+                .remedy("Name the motion to be filtered, and add --set filter=geodesic"));
+        }
+        Err(Error::input(format!("there is no motion model `{motion}`"))
+            .remedy(format!("Use one of: {}", MODELS.join(", "))))
+    }
+
+    /// All programs with the recipe's settings, in the order in which `auto` asks them.
+    pub(crate) fn programs(&self) -> impl Iterator<Item = (&'static str, Box<dyn Program>)> + '_ {
+        PROGRAMS.into_iter().map(|(name, make)| (name, make(self)))
+    }
+
+    /// Settings of the initial Gaussians, with their number.
+    pub(crate) fn initial(&self) -> InitSettings {
+        InitSettings { count: self.initial_count(), ..self.init.clone() }
+    }
+
+    /// The number of initial Gaussians; without its largest number of Gaussians, the least that it becomes.
+    pub(crate) fn initial_count(&self) -> usize {
+        if self.init.count == 0 { (self.crowd() * init::COUNT as f64) as usize } else { self.init.count }
+    }
+
+    /// The size above which a Gaussian is split, extents.
+    fn percent_dense(&self) -> f64 {
+        match self.adc.percent_dense {
+            0.0 => (DENSE / self.crowd()).max(FINEST),
+            stated => stated,
+        }
+    }
+
+    /// The recipe's part of a plan, resolved; the capture's part (extent, clip, times, cameras) is still empty.
+    pub fn plan(&self) -> Plan {
+        let r = self.resolve();
+        let percent_dense = r.percent_dense();
+        Plan {
+            seed: r.run.seed,
+            iterations: r.run.iterations,
+            batch_size: r.run.batch_size,
+            half_size_until: r.run.half_size_until,
+            predicted: r.capture.observe < 1.0,
+            common: CommonSettings {
+                appearance: r.appearance,
+                rates: r.rates,
+                life: r.life,
+                loss: r.loss,
+                densify: r.densify,
+                adc: AdcSettings { percent_dense, ..r.adc },
+                opacity_reset: r.opacity_reset,
+                mcmc: r.mcmc,
+                relocate: r.relocate,
+                floaters: r.floaters,
+                prune: r.prune,
+                merge: r.merge,
+                split: r.split,
+            },
+            ..Plan::default()
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn static_scenes_of_many_gaussians_begin_with_a_third_of_them() {
+        let of = |words: &[&str]| Recipe::of(words).unwrap().resolve().initial_count();
+        assert_eq!(of(&["motion=still", "max_cap=150000"]), 50_000);
+        assert_eq!(of(&["motion=still"]), init::COUNT, "small captures are tuned for as many");
+        assert_eq!(of(&["motion=spacetime", "max_cap=150000"]), init::COUNT);
+        assert_eq!(of(&["motion=still", "max_cap=150000", "init.count=700"]), 700);
+    }
+
+    #[test]
+    fn the_size_that_splits_falls_with_the_number_of_gaussians() {
+        let of = |words: &[&str]| Recipe::of(words).unwrap().plan().common.adc.percent_dense;
+        let near = |a: f64, b: f64| (a - b).abs() < 1e-12;
+        assert!(near(of(&["motion=still"]), 0.01) && near(of(&["motion=still", "max_cap=100"]), 0.01));
+        assert!(near(of(&["motion=still", "max_cap=150000"]), 0.002));
+        assert!(near(of(&["motion=still", "max_cap=5000000"]), 0.001), "not without end");
+        assert!(near(of(&["motion=spacetime", "max_cap=150000"]), 0.01));
+        assert!(near(of(&["motion=still", "max_cap=150000", "adc.percent_dense=0.03"]), 0.03));
+    }
+}

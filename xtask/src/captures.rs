@@ -1,0 +1,40 @@
+//! `capture`: which of the sample captures to render.
+
+use crate::capture::{self, CAMERAS};
+use crate::scene::FRAMES;
+use crate::{long, still, videos, world};
+use anyhow::{Context, Result, bail};
+use std::path::Path;
+
+/// `capture [FOLDER]`, `capture --truth FOLDER`, `capture --check [N]`, `capture --still CHARACTER.glb FOLDER ...`, `capture --videos FOLDER`,
+/// `capture --world NAME FOLDER` and `capture --long SECONDS FOLDER`.
+pub(crate) fn command(arguments: &[String]) -> Result<()> {
+    let home = capture::bundled_folder();
+    match arguments {
+        [flag, rest @ ..] if flag == "--check" => {
+            let count = match rest {
+                [] => 3,
+                [n] => n.parse().with_context(|| format!("{n} is not a number of images"))?,
+                _ => bail!("capture --check takes one number"),
+            };
+            let clock = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH)?.subsec_nanos();
+            let picks = (0..count).map(|i| (u64::from(clock) + 7919 * i) as usize % (CAMERAS * FRAMES));
+            capture::check(&home, &picks.map(|p| (p % CAMERAS, p / CAMERAS)).collect::<Vec<_>>())
+        }
+        [flag, rest @ ..] if flag == "--still" => still::command(rest),
+        [flag, name, folder] if flag == "--world" => world::command(name, Path::new(folder), false),
+        [flag, name, truth, folder] if flag == "--world" && truth == "--truth" => {
+            world::command(name, Path::new(folder), true)
+        }
+        [flag, folder] if flag == "--truth" && !folder.starts_with('-') => {
+            capture::write(&home, Path::new(folder), true)
+        }
+        [flag, seconds, folder] if flag == "--long" => long::command(seconds, Path::new(folder)),
+        [flag, folder] if flag == "--videos" => videos::command(Path::new(folder)),
+        [] => capture::write(&home, &home, false),
+        [folder] if !folder.starts_with('-') => capture::write(&home, Path::new(folder), false),
+        _ => bail!(
+            "capture takes a folder, --truth with a folder, --check with a number, --still with a character and a folder, --videos with a folder, --world with a name, --truth if it is wanted, and a folder, or --long with seconds and a folder"
+        ),
+    }
+}
