@@ -1,8 +1,8 @@
-// The chores of check-dialects.sh that want a program: Gaussians made up, files compared, pictures compared. Reads and
+// The chores of check-dialects.sh that want a program: Gaussians synthetic, files compared, images compared. Reads and
 // writes plain .ply files with a reader of its own, so that no error of ours can hide.
 import { readFileSync, writeFileSync } from 'node:fs';
 
-/// Gaussians that are made up.
+/// Gaussians that are synthetic.
 const COUNT = 5000;
 /// SH basis function of degree 0, 1/(2√π).
 const SH_C0 = 0.28209479177387814;

@@ -16,7 +16,7 @@ const FEW_INTERVALS: [usize; 2] = [5, 20];
 /// Rounds in which one share is pruned.
 const ROUNDS: [usize; 3] = [1, 2, 4];
 const FEW_ROUNDS: [usize; 1] = [1];
-/// Assumed cost of fine-tuning besides its steps (scoring, evaluation, playing), in steps; for the time
+/// Assumed cost of fine-tuning in addition to its steps (scoring, evaluation, playing), in steps; for the time
 /// that is left.
 const OVERHEAD: f64 = 300.0;
 

@@ -15,7 +15,7 @@ Examples:
 
 Tables are printed and written to DIR/e00.md, curves to DIR/e00-*.svg, all numbers to DIR/e00.json.";
 
-/// Learn made-up motion with a small network, and see where that fails
+/// Learn synthetic motion with a small network, and see where that fails
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
@@ -156,7 +156,7 @@ fn plots(s: &Settings, first: &Findings, sweep: &[(f64, Vec<Findings>)]) -> Vec<
     out
 }
 
-/// Both clouds in one picture: true paths as lines that end in circles, the network's as dots at every time.
+/// Both clouds in one image: true paths as lines that end in circles, the network's as dots at every time.
 fn clouds([truth, found]: &[Vec<Vec<[f64; 2]>>; 2]) -> String {
     const SIDE: f64 = 640.0;
     let far = truth.iter().chain(found).flatten().flatten().fold(0.0f64, |far, x| far.max(x.abs()));

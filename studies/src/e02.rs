@@ -33,7 +33,7 @@ const STEPS: usize = 1500;
 const QUICK_STEPS: usize = 300;
 /// Runs of every variant, from seed 1 on.
 const SEEDS: usize = 3;
-/// Factor by which pictures are reduced unless told.
+/// Factor by which images are reduced unless told.
 const DOWNSCALE: usize = 2;
 /// The form of the file; another is refused.
 const VERSION: u32 = 1;
@@ -68,10 +68,10 @@ pub(crate) struct Args {
     /// Runs of every variant, each with its own seed [default: 3; 1 with --quick]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100))]
     seeds: Option<u32>,
-    /// Reduce pictures by k
+    /// Reduce images by k
     #[arg(long, value_name = "K", default_value_t = DOWNSCALE)]
     downscale: usize,
-    /// Set a knob of the recipe; may be repeated
+    /// Set a setting of the recipe; may be repeated
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
     /// Fewer variants, steps and seeds

@@ -29,7 +29,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 const STEPS_SHARE: f64 = 1.0 / 6.0;
 /// The same with `--quick`.
 const QUICK_SHARE: f64 = 1.0 / 30.0;
-/// Width and height of the pictures that speed is measured on with `--quick`.
+/// Width and height of the images that speed is measured on with `--quick`.
 const QUICK_SIZE: [usize; 2] = [200, 200];
 
 const EXAMPLES: &str = "Examples:
@@ -110,7 +110,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     tell(&study, &trials, &args.output, console)
 }
 
-/// Tables and pictures of the runs that were asked for.
+/// Tables and images of the runs that were asked for.
 fn tell(study: &Study, trials: &[Trial], folder: &Path, console: &Console) -> anyhow::Result<()> {
     let mut page = String::from("# Pruning and the temporal filter\n");
     for trial in trials {

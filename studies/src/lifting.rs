@@ -29,7 +29,7 @@ impl Default for Settings {
     }
 }
 
-/// Focal length, pixels, of a picture of [`SIZE`].
+/// Focal length, pixels, of an image of [`SIZE`].
 const FOCAL: f64 = 300.0;
 /// Width and height, pixels.
 const SIZE: [usize; 2] = [320, 240];

@@ -22,7 +22,7 @@ use std::time::{Duration, Instant};
 const MINUTES: f64 = 3.0;
 /// How often a cell that trains is looked at.
 const GLANCE: Duration = Duration::from_millis(100);
-/// Cost of a cell besides its minutes (probes, evaluation, baking, playing), minutes; for the time that is left.
+/// Cost of a cell in addition to its minutes (probes, evaluation, baking, playing), minutes; for the time that is left.
 const OVERHEAD: f64 = 0.6;
 
 const EXAMPLES: &str = "Examples:
@@ -56,13 +56,13 @@ pub(crate) struct Args {
     /// Minutes of training a cell
     #[arg(long, value_name = "M", default_value_t = MINUTES)]
     minutes: f64,
-    /// Reduce pictures by k
+    /// Reduce images by k
     #[arg(long, value_name = "K", default_value_t = 2)]
     downscale: usize,
     /// Also replace what stands between `<!-- models -->` and `<!-- /models -->` in this page
     #[arg(long, value_name = "FILE")]
     into: Option<PathBuf>,
-    /// Set a knob of every cell's recipe; may be repeated
+    /// Set a setting of every cell's recipe; may be repeated
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
 }
@@ -73,7 +73,7 @@ pub(crate) struct Args {
 struct Cell {
     capture: String,
     model: String,
-    /// Why there are no numbers.
+    /// Why there are not finite.
     refused: Option<String>,
     side: Side,
     /// Size of the file that a player gets, bytes.

@@ -22,7 +22,7 @@ pub(crate) struct Study {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Findings {
     pub run: PathBuf,
-    /// For people, and in the names of pictures.
+    /// For people, and in the names of images.
     pub name: String,
     /// Of the scene file, hexadecimal: cells of another scene do not count.
     pub scene: String,

@@ -27,7 +27,7 @@ const ARC_HEIGHTS: [f64; 2] = [1.7, 3.3];
 const ARC_TARGET: V3 = v3(0.0, 0.95, 0.1);
 /// Cameras kept out of training: two of each height, each between training cameras.
 pub(crate) const HELD_OUT: [usize; 4] = [3, 8, 11, 16];
-/// Quantisation step 13 at all frequencies: about 20 KB and 40 dB per picture, so that 600 of them stay below 13 MB.
+/// Quantisation step 13 at all frequencies: about 20 KB and 40 dB per image, so that 600 of them stay below 13 MB.
 /// (Lossless PNG takes 68 KB each.)
 const JPEG_QUALITY: u8 = 60;
 /// Views that come with depth and flow.
@@ -43,7 +43,7 @@ fn rig() -> Vec<Camera> {
     rig_of(WIDTH, HEIGHT, FOCAL)
 }
 
-/// The twenty cameras with pictures of this size; `focal` in pixels.
+/// The twenty cameras with images of this size; `focal` in pixels.
 pub(crate) fn rig_of(width: usize, height: usize, focal: f64) -> Vec<Camera> {
     let camera = |i: usize| {
         let degrees = ARC_DEGREES * (i as f64 / (CAMERAS - 1) as f64 - 0.5);
@@ -54,14 +54,14 @@ pub(crate) fn rig_of(width: usize, height: usize, focal: f64) -> Vec<Camera> {
     (0..CAMERAS).map(camera).collect()
 }
 
-/// Data that one picture leaves behind for the figures and the ground truth.
+/// Data that one image leaves behind for the figures and the ground truth.
 struct View {
     rgb: Vec<u8>,
     bytes: [usize; 2],
     tracks_seen: Vec<u8>,
 }
 
-/// Draws the capture; `maps`: with depth, flow and labels of every picture.
+/// Draws the capture; `maps`: with depth, flow and labels of every image.
 pub(crate) fn write(home: &Path, folder: &Path, maps: bool) -> Result<()> {
     let start = std::time::Instant::now();
     let stage = Stage::load(&home.join("characters"))?;
@@ -133,7 +133,7 @@ fn mask_path(camera: &Camera, t: usize) -> PathBuf {
     Path::new("masks").join(&camera.name).join(format!("{t:04}.png"))
 }
 
-/// The picture as JPEG, the mask as PNG.
+/// The image as JPEG, the mask as PNG.
 fn encode(rgb: &[u8], mask: &[u8]) -> Result<(Vec<u8>, Vec<u8>)> {
     Ok((jpeg(rgb, WIDTH, HEIGHT)?, png(mask, WIDTH, HEIGHT, ExtendedColorType::L8)?))
 }

@@ -1,4 +1,4 @@
-//! How much moves: coverage of the dynamic region and how badly a motionless picture describes it.
+//! How much moves: coverage of the dynamic region and how badly a motionless image describes it.
 
 /// A channel further than this from the camera's temporal mean (of 1) makes a pixel dynamic.
 const DYNAMIC_THRESHOLD: f64 = 0.05;

@@ -8,7 +8,7 @@ use crate::scene::{BACK, FRONT, Frame, SIDE};
 use crate::texture::{Texture, srgb_from_linear};
 use crate::vector::{V3, smooth_step, v3};
 
-/// A rendered picture.
+/// A rendered image.
 pub(crate) struct Picture {
     /// sRGB codes, rows from the top, three per pixel.
     pub rgb: Vec<u8>,
@@ -25,7 +25,7 @@ const REACH: usize = LENS.len() / 2;
 // The weights are written for three samples per pixel.
 const _: () = assert!(SUPERSAMPLING == 3);
 
-/// The picture, black where nothing is seen. `textures`: the characters', knight first.
+/// The image, black where nothing is seen. `textures`: the characters', knight first.
 pub(crate) fn shade(textures: [&Texture; 2], frame: &Frame, camera: &Camera, seen: &Visibility) -> Picture {
     let pixels = camera.width * camera.height;
     let mut out = Picture { rgb: Vec::with_capacity(3 * pixels), mask: Vec::with_capacity(pixels) };
@@ -36,7 +36,7 @@ pub(crate) fn shade(textures: [&Texture; 2], frame: &Frame, camera: &Camera, see
     out
 }
 
-/// The picture of moving objects alone: sRGB codes of their own colour (not dimmed by their coverage) and coverage, four
+/// The image of moving objects alone: sRGB codes of their own colour (not dimmed by their coverage) and coverage, four
 /// per pixel.
 pub(crate) fn cut_out(textures: [&Texture; 2], frame: &Frame, camera: &Camera, seen: &Visibility) -> Vec<u8> {
     let mut out = Vec::with_capacity(4 * camera.width * camera.height);
@@ -80,7 +80,7 @@ fn each_pixel(
     }
 }
 
-/// Shades samples of one picture.
+/// Shades samples of one image.
 struct SampleShader<'a> {
     frame: &'a Frame,
     camera: &'a Camera,

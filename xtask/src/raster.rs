@@ -45,7 +45,7 @@ impl Edges {
     }
 }
 
-/// Visible triangle and inverse depth at every sample of one picture.
+/// Visible triangle and inverse depth at every sample of one image.
 pub(crate) struct Visibility {
     /// Samples across.
     pub width: usize,
@@ -113,7 +113,7 @@ pub(crate) fn rasterize(mesh: &Mesh, camera: &Camera) -> Visibility {
     out
 }
 
-/// Sample columns and rows a triangle may touch (the whole picture when it crosses the near plane).
+/// Sample columns and rows a triangle may touch (the whole image when it crosses the near plane).
 fn bounds(corners: [V3; 3], camera: &Camera, width: usize, height: usize) -> Option<[usize; 4]> {
     if corners.iter().any(|c| c.z <= NEAR) {
         return Some([0, width, 0, height]);

@@ -181,7 +181,7 @@ fn hall() -> Mesh {
     let (depth, width) = (FRONT - BACK, 2.0 * SIDE);
     let up = v3(0.0, HEIGHT, 0.0);
     mesh.quad(v3(-SIDE, 0.0, FRONT), v3(width, 0.0, 0.0), v3(0.0, 0.0, -depth), [0.0; 2], FLOOR, 0);
-    // The floor pattern is laid out in world coordinates, z up the picture being −z.
+    // The floor pattern is laid out in world coordinates, z up the image being −z.
     for vertex in 0..4 {
         mesh.uvs[vertex] = [mesh.positions[vertex].x, mesh.positions[vertex].z];
     }

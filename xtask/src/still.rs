@@ -19,9 +19,9 @@ use rayon::prelude::*;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
-/// Focal length in picture widths: 39.6° across, as the NeRF-synthetic scenes have it (camera_angle_x = 0.691).
+/// Focal length in image widths: 39.6° across, as the NeRF-synthetic scenes have it (camera_angle_x = 0.691).
 const FOCAL: f64 = 1.3889;
-/// The character's bounding sphere fills this share of the picture's height.
+/// The character's bounding sphere fills this share of the image's height.
 const FILL: f64 = 0.95;
 /// Sines of the lowest and highest elevation: 2° above the floor, and short of the pole, where "up" loses its meaning.
 const ELEVATION_SINES: [f64; 2] = [0.035, 0.97];
@@ -137,7 +137,7 @@ fn hemisphere(mesh: &Mesh, views: usize, size: usize) -> Vec<Camera> {
     let (low, high) = (fold(f64::min, f64::INFINITY), fold(f64::max, f64::NEG_INFINITY));
     let target = (v3(low[0], low[1], low[2]) + v3(high[0], high[1], high[2])) * 0.5;
     let radius = mesh.positions.iter().map(|p| (*p - target).length()).fold(0.0, f64::max);
-    // The sphere's silhouette lies on the cone of sin = radius/distance; its tangent is to be FILL/2 picture heights.
+    // The sphere's silhouette lies on the cone of sin = radius/distance; its tangent is to be FILL/2 image heights.
     let tangent = 0.5 * FILL / FOCAL;
     let distance = radius * (1.0 + tangent * tangent).sqrt() / tangent;
     let camera = |i: usize| {

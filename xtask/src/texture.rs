@@ -1,4 +1,4 @@
-//! Pictures in linear light and the sRGB curve, without `powf` (see vector.rs for why).
+//! Images in linear light and the sRGB curve, without `powf` (see vector.rs for why).
 
 use crate::vector::{V3, v3};
 use anyhow::{Context, Result};

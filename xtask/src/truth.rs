@@ -12,7 +12,7 @@ use image::ExtendedColorType;
 use serde_json::json;
 use std::path::Path;
 
-/// Depth codes per scene unit in the 16-bit pictures; code 0 means "nothing".
+/// Depth codes per scene unit in the 16-bit images; code 0 means "nothing".
 pub(crate) const DEPTH_SCALE: f64 = 2048.0;
 /// Flow codes per pixel; code 32768 is no motion (the KITTI 2012 convention).
 pub(crate) const FLOW_SCALE: f64 = 64.0;
@@ -130,7 +130,7 @@ fn is_seen(camera: &Camera, seen: &Visibility, point: V3) -> bool {
 pub(crate) type CloudPoint = ([f32; 3], [u8; 3]);
 
 /// Stands in for structure from motion: random pixels of the first frame, kept when enough cameras see the point,
-/// with noise. `views` are the training cameras with what they see and their pictures.
+/// with noise. `views` are the training cameras with what they see and their images.
 pub(crate) fn sparse_cloud(frame: &Frame, views: &[(&Camera, &Visibility, &[u8])]) -> Vec<CloudPoint> {
     let mut cloud = Vec::with_capacity(CLOUD_POINTS);
     let mut caches: Vec<EdgeCache> = views.iter().map(|_| EdgeCache::default()).collect();
@@ -228,7 +228,7 @@ mod tests {
             flow_errors.push((u - (x1 - x)).abs().max((v - (y1 - y)).abs()));
             moved = moved.max((x1 - x).abs());
         }
-        // At a silhouette the pixel's centre may show something nearer than the vertex beside it.
+        // At a silhouette the pixel's centre may show something nearer than the vertex next to it.
         assert!(10 * covered < flow_errors.len(), "{covered} of {} visible vertices lie behind", flow_errors.len());
         flow_errors.sort_by(f64::total_cmp);
         assert!(flow_errors.len() > 50 && moved > 4.0, "{} visible, moved {moved}", flow_errors.len());

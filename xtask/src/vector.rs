@@ -1,5 +1,5 @@
 //! Vectors, quaternions, affine matrices and angles in f64, built from + − × ÷ √ alone: those are exact by IEEE 754, so
-//! the pictures are the same bits on every machine (the platform's `sin` and `pow` are not).
+//! the images are the same bits on every machine (the platform's `sin` and `pow` are not).
 
 use std::ops::{Add, Mul, Neg, Sub};
 

@@ -14,7 +14,7 @@ use std::path::Path;
 
 const WIDTH: usize = 480;
 const HEIGHT: usize = 360;
-/// Pixels across a picture 480 wide; telephones differ a little.
+/// Pixels across an image 480 wide; telephones differ a little.
 const FOCAL: [f64; 8] = [372.0, 360.0, 366.0, 380.0, 355.0, 368.0, 374.0, 362.0];
 const RADIUS: [f64; 8] = [5.7, 5.9, 5.5, 6.0, 5.8, 5.6, 6.1, 5.7];
 const HEIGHTS: [f64; 8] = [1.6, 2.3, 1.9, 2.6, 1.7, 2.4, 1.8, 2.2];
@@ -98,7 +98,7 @@ fn rig() -> Vec<Camera> {
     (0..count).map(camera).collect()
 }
 
-/// Brightens and tints a picture: codes are about the 2.2th root of light, and small changes of exposure scale them.
+/// Brightens and tints an image: codes are about the 2.2th root of light, and small changes of exposure scale them.
 fn expose(rgb: &mut [u8], camera: usize) {
     // 2^(x/2.2) = exp(0.315·x), to second order: exact enough to be a gain, and the same bits everywhere.
     let gain = |stops: f64| 1.0 + 0.315 * stops + 0.5 * (0.315 * stops) * (0.315 * stops);

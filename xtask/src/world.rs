@@ -31,7 +31,7 @@ const ARC_TARGET: V3 = v3(0.0, 1.0, 0.3);
 /// Sides of a ball's mesh.
 const SIDES: u32 = 32;
 
-/// `--world NAME FOLDER`; `maps`: with depth, flow and labels of every picture.
+/// `--world NAME FOLDER`; `maps`: with depth, flow and labels of every image.
 pub(crate) fn command(name: &str, folder: &Path, maps: bool) -> Result<()> {
     let world = World::new(name).map_err(|e| anyhow!("{e}"))?;
     let stage = Stage::load(&crate::capture::bundled_folder().join("characters"))?;

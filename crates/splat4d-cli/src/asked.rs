@@ -36,7 +36,7 @@ fn remedy() -> String {
 /// Reads points. `views` are the cameras that the scene's file knows.
 ///
 /// Errors, with the line's number: columns that are unknown, missing or twice, a number that is none, a camera that is not
-/// there, a pixel outside of its picture, a time outside of the clip.
+/// there, a pixel outside of its image, a time outside of the clip.
 pub(crate) fn read(text: &str, views: &[View], clip: [f64; 2]) -> Result<Vec<Asked>> {
     let mut lines = text.lines().enumerate().map(|(i, l)| (i + 1, l.trim())).filter(|(_, l)| !l.is_empty());
     let (_, header) = lines.next().ok_or_else(|| Error::input("the file of points is empty").remedy(remedy()))?;

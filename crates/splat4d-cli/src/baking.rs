@@ -26,7 +26,7 @@ use std::path::Path;
 /// Cameras that stand still and times at which baked and model are compared; every one costs two renders.
 const COMPARED_CAMERAS: usize = 4;
 const COMPARED_TIMES: usize = 6;
-/// The same of poses of a camera that moves, each at its own time; and of cameras that stand still beside it.
+/// The same of poses of a camera that moves, each at its own time; and of cameras that stand still next to it.
 const COMPARED_POSES: usize = 12;
 const COMPARED_BESIDE: usize = 2;
 /// Longer side of those renders, pixels.

@@ -1,4 +1,4 @@
-//! One camera as JSON, so that a picture can be compared with any other renderer's.
+//! One camera as JSON, so that an image can be compared with any other renderer's.
 //!
 //! ```json
 //! {"fx": 500, "fy": 500, "cx": 320, "cy": 240, "w": 640, "h": 480, "background": [0, 0, 0],
@@ -15,9 +15,9 @@ use splat4d_train::settings::nearest;
 use std::path::Path;
 
 const KEYS: [&str; 11] = ["fx", "fy", "cx", "cy", "w", "h", "width", "height", "world_to_camera", "near", "background"];
-/// Longest side of a picture that is drawn, pixels.
+/// Longest side of an image that is drawn, pixels.
 pub(crate) const MAX_SIDE: usize = 16_384;
-/// Most pixels of a picture that is drawn: 8K video twice over; about 4 GiB of working memory.
+/// Most pixels of an image that is drawn: 8K video twice over; about 4 GiB of working memory.
 pub(crate) const MAX_PIXELS: usize = 1 << 26;
 /// Largest |R Rᵀ − I| that counts as rounding of the file.
 const MAX_SHEAR: f64 = 0.01;

@@ -407,7 +407,7 @@ impl Original<'_> {
     }
 }
 
-/// Bytes of a file beside its Gaussians: a poster, cameras, a path.
+/// Bytes of a file next to its Gaussians: a poster, cameras, a path.
 const BESIDES: u64 = 48 << 10;
 /// Room that another attempt leaves below the size.
 const AGAIN_MARGIN: f64 = 0.01;

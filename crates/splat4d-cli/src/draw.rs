@@ -1,4 +1,4 @@
-//! The seam to the renderer: a scene, a camera and a time become a picture for people.
+//! The seam to the renderer: a scene, a camera and a time become an image for people.
 
 use crate::console::Console;
 use crate::device::Device;
@@ -99,13 +99,13 @@ const RAMP: [[f32; 3]; 6] = [
 /// Turn of the hue from one label to the next, of a whole one: the golden section, so that few labels are far apart and
 /// many never meet.
 const GOLDEN: f32 = 0.618_034;
-/// Most training pictures that are asked for the uncertainty of a scene, evenly chosen.
+/// Most training images that are asked for the uncertainty of a scene, evenly chosen.
 const WITNESSES: usize = 48;
 
 /// Pixels that a thread turns into bytes at once: enough to be worth its while.
 const CHUNK: usize = 1 << 14;
 
-/// Draws, on the CPU unless told; memory is reused from picture to picture.
+/// Draws, on the CPU unless told; memory is reused from image to image.
 pub struct Painter<'a> {
     player: Player<'a>,
     scene: &'a Scene<f32>,
@@ -115,19 +115,19 @@ pub struct Painter<'a> {
     /// Abilities that the scene needs of a device.
     wanted: Wanted,
     console: Option<&'a Console>,
-    /// The last picture.
+    /// The last image.
     pub image: Image<f32>,
     bytes: Vec<[u8; 4]>,
     channel: Channel,
     /// A number a Gaussian, by layer and row, of channels that show one.
     numbers: Vec<Vec<f32>>,
     instant: Evaluation<f32>,
-    /// Of the last picture: the channel's values and the weight of what has one.
+    /// Of the last image: the channel's values and the weight of what has one.
     field: (Planes<f32>, Planes<f32>),
 }
 
 impl<'a> Painter<'a> {
-    /// `depth`: whether pictures of depth will be asked for.
+    /// `depth`: whether images of depth will be asked for.
     pub fn new(scene: &'a Scene<f32>, background: [f32; 3], antialias: bool, depth: bool) -> Self {
         let config = RenderConfig { antialias: self::antialias(antialias), ..RenderConfig::default() };
         let (player, backend, image) = (Player::of_scene(scene), device::cpu(config), Image::default());
@@ -149,9 +149,9 @@ impl<'a> Painter<'a> {
         }
     }
 
-    /// The same for pictures of this channel. `views`: the training pictures' cameras, which alone can tell of uncertainty.
+    /// The same for images of this channel. `views`: the training images' cameras, which alone can tell of uncertainty.
     ///
-    /// Errors: a scene without labels, or without training pictures to be certain by.
+    /// Errors: a scene without labels, or without training images to be certain by.
     pub fn of_channel(
         mut self,
         channel: Channel,
@@ -245,7 +245,7 @@ impl<'a> Painter<'a> {
         self.field = flow::divided(&self.image.extra);
     }
 
-    /// The numbers of the last picture, plane by plane (`Channel::planes`), NaN where nothing has any: colours over the
+    /// The numbers of the last image, plane by plane (`Channel::planes`), NaN where nothing has any: colours over the
     /// background; alpha; expected depth, scene units; flow, pixels; velocity, scene units a second; unit normals in camera
     /// axes (x right, y down, z forward); the number of the likeliest label, −1 for none; seconds; scene units.
     pub fn raw(&self) -> Planes<f32> {
@@ -282,7 +282,7 @@ impl<'a> Painter<'a> {
         }
     }
 
-    /// Draws and takes over the picture in 8 bits, without more of it where the device has a way to that; `range` as in
+    /// Draws and takes over the image in 8 bits, without more of it where the device has a way to that; `range` as in
     /// [`rgb`](Self::rgb).
     pub(crate) fn picture(&mut self, camera: &Camera, time: f64, channel: Channel, range: [f32; 2]) -> Rgb {
         if channel == Channel::Color {
@@ -298,7 +298,7 @@ impl<'a> Painter<'a> {
         self.rgb(channel, range)
     }
 
-    /// The last picture in 8 bits. `range`: nearest and farthest depth of the depth colours.
+    /// The last image in 8 bits. `range`: nearest and farthest depth of the depth colours.
     pub(crate) fn rgb(&self, channel: Channel, range: [f32; 2]) -> Rgb {
         if channel.is_field() {
             return field_rgb(&self.raw(), channel, range);
@@ -321,7 +321,8 @@ impl<'a> Painter<'a> {
         }
     }
 
-    /// The range of the last picture's numbers that its colours spread over, without the outermost hundredths: of depth and
+    /// The range of the last image's numbers that its colours spread over, without the outermost hundredths: of
+    /// depth and
     /// uncertainty from the least on, of flow and velocity the largest length behind 0, of life the whole clip. `None`:
     /// nothing is seen, or the channel needs no range.
     pub(crate) fn range(&self) -> Option<[f32; 2]> {

@@ -1,4 +1,5 @@
-//! The work behind `edit`: what edits name beside the scene (cameras, masks, other scenes, the capture's pictures), found.
+//! The work behind `edit`: what edits name next to the scene (cameras, masks, other scenes, the capture's images),
+//! found.
 
 use crate::console::Console;
 use crate::files;
@@ -23,9 +24,9 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::SystemTime;
 
-/// Masks of pictures that are looked at for the subject, at most: each costs a look at the whole scene.
+/// Masks of images that are looked at for the subject, at most: each costs a look at the whole scene.
 const MOST_MASKS: usize = 120;
-/// Held-out pictures that are compared before and after floaters are removed.
+/// Held-out images that are compared before and after floaters are removed.
 const COMPARED: usize = 40;
 /// Above this a mask's pixel is white, of 1.
 const WHITE: f32 = 0.5;
@@ -159,10 +160,10 @@ impl Context for Bring<'_> {
     }
 }
 
-/// Gaussians that float, and what held-out pictures say of it.
+/// Gaussians that float, and what held-out images say of it.
 pub(crate) struct Proposal {
     pub selected: Selected,
-    /// Pictures that were compared, and their mean PSNR with and without the floaters, dB.
+    /// Images that were compared, and their mean PSNR with and without the floaters, dB.
     pub pictures: usize,
     pub before: f64,
     pub after: f64,
@@ -194,7 +195,7 @@ impl Bring<'_> {
     }
 }
 
-/// The mean PSNR of some pictures, dB.
+/// The mean PSNR of some images, dB.
 fn mean_psnr(scene: &Scene<f32>, data: &Dataset, frames: &[usize]) -> Result<f64> {
     let (mut picture, mut sum) = (Picture::default(), 0.0);
     for &frame in frames {

@@ -1,5 +1,5 @@
 //! The work behind `view --edit`: a page asks, and a list of edits is replayed, looked at, baked and saved, by the same code
-//! as `edit`. It writes one file, the list, and reads nothing that a page names but files beside the list.
+//! as `edit`. It writes one file, the list, and reads nothing that a page names but files next to the list.
 
 use crate::baking::{Baking, pack_scene};
 use crate::console::{Console, Loudness};
@@ -26,9 +26,9 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// Replayed lists that are kept: undo and redo are then there at once.
 const KEPT: usize = 4;
-/// Most pixels of a picture's side that a page may ask for.
+/// Most pixels of an image's side that a page may ask for.
 const MOST_SIDE: usize = 1280;
-/// Longer side of the picture in which depths are looked up, pixels.
+/// Longer side of the image in which depths are looked up, pixels.
 const PICK_SIDE: usize = 240;
 /// Quality of the JPEG that stands in until the scene is baked.
 const QUALITY: u8 = 80;
@@ -87,14 +87,14 @@ impl Eye {
         })
     }
 
-    /// The same view in a small picture.
+    /// The same view in a small image.
     fn small(&self) -> Result<Camera> {
         let camera = self.camera()?;
         Ok(camera.downscaled(self.width.max(self.height).div_ceil(PICK_SIDE).max(1)))
     }
 }
 
-/// What was drawn on the picture.
+/// What was drawn on the image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 enum Shape {
@@ -119,7 +119,7 @@ struct Pulled {
 enum Ask {
     /// What there is, and the list as it is; `kept`: the list that the page has in its place.
     Open { kept: Option<Vec<Step>> },
-    /// The edited scene as a picture.
+    /// The edited scene as an image.
     Show { steps: Vec<Step>, view: Eye, t: f64 },
     /// The edited scene as a playback file.
     Bake { steps: Vec<Step> },
@@ -127,13 +127,13 @@ enum Ask {
     Save { steps: Vec<Step> },
     /// Who is selected.
     Select { steps: Vec<Step>, select: String, t: f64 },
-    /// A selection in words, by what was drawn on the picture: corners as x/z and y/z in the camera's axes.
+    /// A selection in words, by what was drawn on the image: corners as x/z and y/z in the camera's axes.
     Pick { steps: Vec<Step>, shape: Shape, corners: Vec<[f64; 2]>, view: Eye, t: f64, through: bool, now: bool },
     /// Who floats.
     Floaters { steps: Vec<Step>, strength: f64, t: f64 },
     /// The nodes by which a selection can be bent: their places are meant at second `at`, and shown at `t`.
     Bend { steps: Vec<Step>, select: String, at: f64, t: f64, nodes: usize },
-    /// Nodes pulled: where all are, and a picture.
+    /// Nodes pulled: where all are, and an image.
     Pull { number: u64, handles: Vec<Pulled>, pins: Vec<[f64; 4]>, view: Eye },
 }
 
@@ -405,7 +405,7 @@ fn draw(scene: &Scene<f32>, camera: &Camera, t: f64, depth: bool, image: &mut Im
     device::cpu(RenderConfig::default()).render(&shot, image)
 }
 
-/// A picture as a data URI.
+/// An image as a data URI.
 fn jpeg(image: &Image<f32>) -> Result<String> {
     let rgb = color_rgb(&image.color);
     let mut bytes = Vec::new();
@@ -462,7 +462,7 @@ fn held(select: &str, scene: &Scene<f32>, selected: &Selected, t: f64) -> Value 
     })
 }
 
-/// What was drawn on the picture.
+/// What was drawn on the image.
 struct Drawn<'a> {
     shape: Shape,
     corners: &'a [[f64; 2]],
@@ -489,7 +489,7 @@ impl Drawn<'_> {
         let depth = |i: usize| f64::from(image.depth.data[i] / image.alpha.data[i]);
         let shows = |i: usize| image.alpha.data[i] >= SEEN;
         let nothing = || Error::input("nothing is visible there").remedy("Draw over something visible");
-        // The pixel of a corner, within the picture.
+        // The pixel of a corner, within the image.
         let pixel = |[u, v]: [f64; 2]| {
             let column = (k.fx * u + k.cx).clamp(0.0, (camera.width - 1) as f64) as usize;
             let row = (k.fy * v + k.cy).clamp(0.0, (camera.height - 1) as f64) as usize;

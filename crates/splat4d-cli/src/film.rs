@@ -1,5 +1,5 @@
 //! The playback file of a long take: parts are appended as they are finished, so that it plays as far as it goes; at the end it
-//! is written anew as any other file.
+//! is written again as any other file.
 
 use crate::baking::{self, Baking, Outline, bake_like, poster};
 use crate::console::Console;

@@ -56,7 +56,7 @@ const CUT_STEPS: f64 = 100.0;
 /// Motion models whose motion is straight, or nearly.
 const STRAIGHT: [&str; 3] = ["still", "spacetime", "native4d"];
 
-/// See [`HELD_STEPS`]: a picture with a mask of labels or a picture of features, drawn and taken back once.
+/// See [`HELD_STEPS`]: an image with a mask of labels or an image of features, drawn and taken back once.
 const LABEL_STEPS: f64 = 1.0;
 
 /// The time of what follows training, in training steps at full size: `--minutes` leaves room for it.
@@ -193,7 +193,7 @@ pub fn playback(run: &Path, console: &Console) -> Result<()> {
 
 /// The same, within a time.
 pub(crate) fn playback_by(run: &Path, deadline: &Deadline, console: &Console) -> Result<()> {
-    // The file of a compression is what was learnt: baking anew would lose its codes, palette and masks.
+    // The file of a compression is what was learnt: baking again would lose its codes, palette and masks.
     // That of a long take was made chunk by chunk.
     if run.join(ORDER).is_file() || Chunked::is(run) {
         return Ok(());
@@ -242,10 +242,11 @@ pub fn scores(run: &Path, scene: &Scene<f32>, measure: &Measure, console: &Conso
     Ok(evaluation)
 }
 
-/// Scores one split of a run's capture on some backgrounds, says them, and writes them beside those that the run is judged
+/// Scores one split of a run's capture on some backgrounds, says them, and writes them next to those that the run is
+/// judged
 /// by. `backgrounds` with their names; none: the run's own.
 ///
-/// Errors: the capture has no such views; pictures without alpha, which are composited on nothing; those of measuring.
+/// Errors: the capture has no such views; images without alpha, which are composited on nothing; those of measuring.
 pub(crate) fn scores_on(
     run: &Path,
     measured: Measured,

@@ -15,14 +15,14 @@ use splat4d_train::labels::{self, LabelScores, ROUNDS, learn, measure};
 use splat4d_train::run::{capture_options, corrected};
 use std::path::Path;
 
-/// Whether any picture of a run's capture has a mask of labels or a picture of features.
+/// Whether any image of a run's capture has a mask of labels or an image of features.
 pub(crate) fn has_any(capture: &Capture) -> bool {
     capture.frames.iter().any(|f| f.labels.is_some() || f.features.is_some())
 }
 
 /// Learns the labels and the features of a run's capture, or of another with the same cameras, into its `scene.safetensors`.
 ///
-/// Errors: no training picture has either; files that cannot be read.
+/// Errors: no training image has either; files that cannot be read.
 pub(crate) fn label(run: &Path, from: Option<&Path>, rounds: Option<usize>, console: &Console) -> anyhow::Result<()> {
     let opened = Run::open(run)?;
     let file = opened.scene_file()?;

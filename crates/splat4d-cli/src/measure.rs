@@ -1,5 +1,5 @@
 //! How a scene plays on this machine's CPU: who is alive, how many bytes, frames a second drawn from the capture's own
-//! cameras over its clip. What is compared is measured in turns, picture by picture, so that a machine that is busy
+//! cameras over its clip. What is compared is measured in turns, image by image, so that a machine that is busy
 //! for a while slows all of them.
 
 use crate::draw::color_into;
@@ -20,13 +20,13 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Width and height of the pictures unless told: the frame rates of docs/benchmarks.md are at this size.
+/// Width and height of the images unless told: the frame rates of docs/benchmarks.md are at this size.
 pub const SIZE: [usize; 2] = [800, 800];
-/// Pictures of a round: enough that every side of the scene and all parts of the clip take part.
+/// Images of a round: enough that every side of the scene and all parts of the clip take part.
 const LOOKS: usize = 24;
-/// Rounds of which the best of every picture counts, after one that makes room.
+/// Rounds of which the best of every image counts, after one that makes room.
 const ROUNDS: usize = 5;
-/// Times that the first picture is drawn from bytes; the best counts.
+/// Times that the first image is drawn from bytes; the best counts.
 const DECODES: usize = 3;
 /// Most moments at which Gaussians are counted: ten seconds at 30 frames a second.
 const COUNTED: usize = 300;
@@ -54,13 +54,13 @@ pub struct Side {
     pub flicker: Option<f64>,
     /// Mean over some training views, dB.
     pub psnr_train: Option<f64>,
-    /// Pictures a second of the blend stage alone.
+    /// Images a second of the blend stage alone.
     pub raster_fps: f64,
-    /// Pictures a second end to end: who is alive, motion, drawing, 8-bit colours.
+    /// Images a second end to end: who is alive, motion, drawing, 8-bit colours.
     pub fps: f64,
-    /// From bytes in memory to the first picture, milliseconds.
+    /// From bytes in memory to the first image, milliseconds.
     pub decode_ms: f64,
-    /// Pairs of pixel and Gaussian that the blend loop tests, mean over the pictures.
+    /// Pairs of pixel and Gaussian that the blend loop tests, mean over the images.
     pub pairs: f64,
 }
 
@@ -119,7 +119,7 @@ pub(crate) fn looks_of(source: &Source, size: [usize; 2]) -> Result<Vec<Look>> {
     Ok(looks(&(0..LOOKS).map(orbit).collect::<Vec<_>>(), source.scene.clip, size))
 }
 
-/// Moments in the middle of equal parts of the clip, each from another camera: pictures of this size with the camera's
+/// Moments in the middle of equal parts of the clip, each from another camera: images of this size with the camera's
 /// vertical field of view. Panics: no views.
 pub fn looks(views: &[View], clip: [f64; 2], [width, height]: [usize; 2]) -> Vec<Look> {
     let mut seen = BTreeSet::new();
@@ -183,13 +183,13 @@ pub fn in_turns(subjects: &[Subject<'_>], looks: &[Look], progress: &mut dyn FnM
 struct Seat<'a> {
     side: Side,
     player: Player<'a>,
-    /// Stored bytes that a first picture is drawn from.
+    /// Stored bytes that a first image is drawn from.
     stored: Arc<[u8]>,
     background: [f32; 3],
     renderer: Renderer<f32>,
     image: Image<f32>,
     rgb: Vec<u8>,
-    /// Seconds of the blend stage and of the whole picture, by look.
+    /// Seconds of the blend stage and of the whole image, by look.
     best: Vec<[f64; 2]>,
     decode_ms: f64,
     pairs: f64,
@@ -220,7 +220,7 @@ impl<'a> Seat<'a> {
         })
     }
 
-    /// Draws one picture; seconds of the blend stage and of all.
+    /// Draws one image; seconds of the blend stage and of all.
     fn draw(&mut self, look: &Look) -> Result<[f64; 2]> {
         let clock = Instant::now();
         let splats = self.player.at(look.time)?;
@@ -233,7 +233,7 @@ impl<'a> Seat<'a> {
     fn side(mut self) -> Result<Side> {
         let counts = frames(self.player.meta().clip, self.player.meta().fps)
             .into_iter()
-            // The pages of a moment come into memory with its picture.
+            // The pages of a moment come into memory with its image.
             .map(|t| self.player.at(t).map(|_| ()).map(|()| self.player.alive(t)))
             .collect::<Result<Vec<usize>>>()?;
         let rate = |k: usize| self.best.len() as f64 / self.best.iter().map(|b| b[k]).sum::<f64>().max(f64::EPSILON);
@@ -275,14 +275,14 @@ fn renderer(subject: &Subject<'_>) -> Renderer<f32> {
     Renderer::new(RenderConfig { antialias: subject.antialias, ..RenderConfig::default() })
 }
 
-/// Seconds from bytes in memory to a picture in 8 bits, by a renderer that has no memory yet.
+/// Seconds from bytes in memory to an image in 8 bits, by a renderer that has no memory yet.
 fn first_picture(subject: &Subject<'_>, stored: &Arc<[u8]>, look: &Look) -> Result<f64> {
     let clock = Instant::now();
     let (mut renderer, mut image, mut rgb) = (renderer(subject), Image::default(), Vec::new());
     match &subject.what {
         What::Scene(_) => {
             let (scene, mut moment) = (scene_file::read(stored)?, Evaluation::default());
-            // A player would look up first when everybody lives, which pays from the second picture on.
+            // A player would look up first when everybody lives, which pays from the second image on.
             scene.at(look.time, &mut moment);
             renderer.render(&Shot::new(&scene.splats(&moment), &look.camera, scene.background), &mut image);
         }

@@ -1,5 +1,6 @@
-//! The work behind `predict`: nodes of what was observed, the ladder's forecasts, their scenes, and what they are worth beside
-//! the pictures that training never saw.
+//! The work behind `predict`: nodes of what was observed, the ladder's forecasts, their scenes, and what they are
+//! worth next to
+//! the images that training never saw.
 
 mod assimilate;
 mod score;

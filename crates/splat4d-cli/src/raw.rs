@@ -1,4 +1,4 @@
-//! The numbers behind pictures as files: NumPy arrays, Middlebury flow, OpenEXR.
+//! The numbers behind images as files: NumPy arrays, Middlebury flow, OpenEXR.
 
 use crate::draw::Channel;
 use exr::prelude::{AnyChannel, AnyChannels, Encoding, FlatSamples, Image, Layer, LayerAttributes, WritableImage};

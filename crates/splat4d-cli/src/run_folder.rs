@@ -19,7 +19,7 @@ use std::path::{Path, PathBuf};
 
 /// Files that mark a folder as a run.
 const MARKERS: [&str; 4] = ["recipe.toml", "run.json", "scene.safetensors", "checkpoints"];
-/// File of results that `compress` leaves beside the file that it writes, for the report and for machines.
+/// File of results that `compress` leaves next to the file that it writes, for the report and for machines.
 pub(crate) const COMPRESS: &str = "compress.json";
 /// File that holds the settings `compress` was asked for.
 pub(crate) const ORDER: &str = "compress.toml";
@@ -178,7 +178,7 @@ impl Run {
         self.info.get(key).and_then(Value::as_f64)
     }
 
-    /// The knob `table.field` of the recipe, as text.
+    /// The setting `table.field` of the recipe, as text.
     pub(crate) fn recipe_text(&self, knob: &str) -> Option<String> {
         self.recipe().ok()?.get(knob).map(|v| v.as_str().map_or_else(|| v.to_string(), str::to_owned))
     }
@@ -241,7 +241,7 @@ impl Run {
         out
     }
 
-    /// The folder of the newest held-out pictures.
+    /// The folder of the newest held-out images.
     pub(crate) fn pictures(&self) -> Option<PathBuf> {
         let test = self.path.join("test");
         let told = self.iteration.map(|n| test.join(format!("ours_{n}")));
@@ -292,7 +292,7 @@ pub(crate) fn views_in(file: &Path) -> Result<Option<Vec<View>>> {
     Ok(views.filter(|v| !v.is_empty()))
 }
 
-/// The pictures that a run uses as views, held-out ones marked.
+/// The images that a run uses as views, held-out ones marked.
 pub(crate) fn views_of(capture: &Capture) -> Vec<View> {
     let view = |i: usize| {
         let frame = &capture.frames[i];
@@ -475,7 +475,7 @@ pub fn free_folder(wanted: &Path) -> PathBuf {
     (2usize..).map(numbered).find(|p| !taken(p)).expect("some number is free")
 }
 
-/// An entry `ours_N` of `results.json` beside the one that the run is judged by.
+/// An entry `ours_N` of `results.json` next to the one that the run is judged by.
 #[derive(Clone, Debug)]
 pub struct Beside<'a> {
     /// What it is called: a split, and a background where it is not the run's own.

@@ -20,7 +20,7 @@ const INSTEAD: &str =
 /// Most bytes kept of what ffmpeg says.
 const STDERR_BYTES: usize = 64 << 10;
 
-/// A picture of 8-bit samples, rows from the top.
+/// An image of 8-bit samples, rows from the top.
 #[derive(Clone, Debug)]
 pub(crate) struct Rgb {
     pub width: usize,

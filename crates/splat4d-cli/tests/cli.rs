@@ -1,4 +1,4 @@
-//! The built binary on small made-up captures: what users type, what they get, and what they are told.
+//! The built binary on small synthetic captures: what users type, what they get, and what they are told.
 
 #[path = "cli/bench.rs"]
 mod bench;
@@ -107,7 +107,7 @@ fn images_are_found_in_a_scene_and_cameras_compared_with_their_truth() {
     assert!(said.contains("ATE 0.00000 units") && said.contains("0.00 ms at most"), "{said}");
     let error = &json_of(&run.join("results.json"))["trajectory"];
     assert!(error["ate"].as_f64().unwrap() < 1e-6 && !error["cameras"].as_array().unwrap().is_empty(), "{error}");
-    // A picture of the scene itself, from one of its cameras: nothing need move.
+    // An image of the scene itself, from one of its cameras: nothing need move.
     let (picture, camera, found) =
         (work.path().join("a.png"), work.path().join("cam.json"), work.path().join("b.json"));
     let text = std::fs::read_to_string(capture.join("capture.json")).unwrap();

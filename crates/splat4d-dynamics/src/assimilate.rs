@@ -1,6 +1,7 @@
 //! Correction by what comes in: predict, draw, compare, update.
 //!
-//! A forecast of the next frame is drawn from the cameras and compared with their pictures; some steps of gradient descent on
+//! A forecast of the next frame is drawn from the cameras and compared with their images; some steps of gradient
+//! descent on
 //! the nodes' poses alone make an observation of it. Forecast and observation are fused node by node with a scalar gain
 //! (the Kalman form with separate variances): K = P/(P + R), x ← x + K (x_o − x), P ← (1 − K) P, and before the next frame
 //! P ← P + Q, where Q is what an ensemble's variance grows by in a frame, and R the variance of an observation.
@@ -25,7 +26,7 @@ use std::sync::Arc;
 const STEPS: usize = 50;
 /// Their rates: of shifts, of the scene's size, and of quaternions.
 const RATES: [f64; 2] = [4e-3, 5e-3];
-/// Weight of D-SSIM beside L1 (Kerbl et al. 2023).
+/// Weight of D-SSIM next to L1 (Kerbl et al. 2023).
 const DSSIM: f64 = 0.2;
 /// Standard deviation of an observation, of the scene's size: what a pixel is, about.
 const OBSERVED: f64 = 2e-3;
@@ -57,10 +58,10 @@ impl<'a> Filter<'a> {
         self.clock.at(1)
     }
 
-    /// The forecast of a frame, corrected by its pictures (`frames`, all at [`time`](Self::time)), which `backend` draws.
+    /// The forecast of a frame, corrected by its images (`frames`, all at [`time`](Self::time)), which `backend` draws.
     /// `growth`: how much the variance of each node's forecast grew since the frame before, (scene units)².
     ///
-    /// Errors: pictures that cannot be read, a scene that cannot be carried, a step that is not finite.
+    /// Errors: images that cannot be read, a scene that cannot be carried, a step that is not finite.
     pub fn update(
         &mut self,
         forecast: &Moment,
@@ -82,7 +83,7 @@ impl<'a> Filter<'a> {
         Ok(out)
     }
 
-    /// The nodes where the pictures have them: the forecast after some steps on its poses alone.
+    /// The nodes where the images have them: the forecast after some steps on its poses alone.
     fn measure(&self, forecast: &Moment, frames: Arc<dyn Frames>, backend: Box<dyn Backend>) -> Result<Moment> {
         let scene = predicted(self.scene, self.observed, std::slice::from_ref(forecast), self.clock)?;
         let rates = [("node_shifts", RATES[0] * self.observed.size), ("node_turns", RATES[1])];
@@ -106,7 +107,7 @@ impl<'a> Filter<'a> {
         }
         let rest = self.observed.paths.last();
         let mut sums = vec![([0.0; 3], [0.0; 4], 0.0); rest.len()];
-        // A layer's nodes are moved by the pictures of its own Gaussians: they count by how many these are.
+        // A layer's nodes are moved by the images of its own Gaussians: they count by how many these are.
         for (index, keys) in carried(trainer.learner.scene()) {
             let layer = &trainer.learner.scene().layers[index];
             let weight = layer.params.len() as f64;

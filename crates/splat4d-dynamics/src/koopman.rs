@@ -7,7 +7,8 @@
 //! no rollout grows. Decays and frequencies are fitted to all observed ticks at once by variable projection (Golub and Pereyra
 //! 1973, with Kaufman's Jacobian 1975) on the principal components of y, pair by pair, each from the frequency that explains most
 //! of what is left. Regression from tick to tick, with delays or without, is biased towards decay by noise (Dawson et al. 2016),
-//! which nodes that were learnt from pictures have; a fit of whole paths is not. How many pairs there are is chosen by forecasts
+//! which nodes that were learnt from images have; a fit of whole paths is not. How many pairs there are is chosen by
+//! forecasts
 //! from several ticks of the past. What the model leaves of the last tick fades as such remainders faded so far.
 
 use crate::paths::{Moment, Paths, Pose, nearest};
@@ -269,7 +270,7 @@ fn pose(y: &[f64], k: usize, length: f64) -> Pose {
     Pose { x, q: quat::normalize(quat::from_rotation(&procrustes(turned))).0 }
 }
 
-/// Mean distance over nodes and ticks; infinite where it is no number.
+/// Mean distance over nodes and ticks; infinite where it is not finite.
 fn distance(found: &[Moment], truth: &[Moment]) -> f64 {
     let pairs = found.iter().zip(truth).flat_map(|(a, b)| a.iter().zip(b));
     let (sum, n) = pairs.fold((0.0, 0.0), |(s, n), (a, b)| (s + norm(sub(a.x, b.x)), n + 1.0));

@@ -111,7 +111,7 @@ pub const LEAST_TICKS: usize = 6;
 const HORIZONS: [usize; 5] = [1, 2, 4, 8, 16];
 /// Weight of a frame, of the one before.
 const FADE: f64 = 0.95;
-/// Weight of velocities beside positions.
+/// Weight of velocities next to positions.
 const VELOCITY_WEIGHT: f64 = 0.1;
 /// Up to this share of L errors count by their square, beyond by themselves (Huber).
 const HUBER: f64 = 0.01;

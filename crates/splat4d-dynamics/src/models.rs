@@ -61,7 +61,7 @@ impl Model {
     }
 }
 
-/// What is known of a world besides its paths, and how networks are trained.
+/// What is known of a world in addition to its paths, and how networks are trained.
 #[derive(Clone, Debug, Default)]
 pub struct Settings {
     /// Steps and seed.

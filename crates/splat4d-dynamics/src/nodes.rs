@@ -222,7 +222,8 @@ fn extent(look: &Look) -> ([f64; 3], f64) {
     (middle, quantile(opaque.iter().map(|x| norm(sub(*x, middle))).collect(), CORE))
 }
 
-/// Which Gaussians are fast while they are opaque, and which move: of those that are opaque at last the ones most of whose
+/// Which Gaussians are fast while they are opaque, and which move: of those that are opaque finally the ones most of
+/// whose
 /// neighbours are fast. Of a body all move; what drifts or flickers does so alone.
 fn moving(scene: &Scene<f32>, ticks: &[f64], last: &Look, size: f64) -> (Vec<bool>, Vec<bool>) {
     let n = last.x.len();

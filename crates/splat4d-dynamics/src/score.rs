@@ -36,7 +36,7 @@ pub fn win_rate(a: &[f64], b: &[f64]) -> Option<f64> {
 
 /// The first frame (from 1) at which a node is not finite, or twice as far from where the nodes started as `size`.
 pub fn diverged(found: &[Moment], start: &Moment, size: f64) -> Option<usize> {
-    let near = |far: f64| far <= DIVERGED * size; // false of what is no number
+    let near = |far: f64| far <= DIVERGED * size; // false of what is not finite
     let gone = |m: &Moment| m.iter().zip(start).any(|(a, b)| !near(norm(sub(a.x, b.x))));
     found.iter().position(gone).map(|i| i + 1)
 }

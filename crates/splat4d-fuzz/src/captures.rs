@@ -79,7 +79,8 @@ thread_local! {
     static FOLDERS: RefCell<BTreeMap<&'static str, TempDir>> = const { RefCell::new(BTreeMap::new()) };
 }
 
-/// Opens the capture of this layout in which one file has other bytes, and reads its first picture with what lies beside.
+/// Opens the capture of this layout in which one file has other bytes, and reads its first image with what lies next
+/// to.
 fn open(layout: &'static str, file: &str, bytes: &[u8]) {
     FOLDERS.with_borrow_mut(|folders| {
         let folder = folders.entry(layout).or_insert_with(|| made(layout));
@@ -224,7 +225,7 @@ fn images() -> Vec<u8> {
         [1.0, 0.0, 0.0, 0.0, 0.1 * f64::from(i), 0.0, 4.0].iter().for_each(|x| out.extend(x.to_le_bytes()));
         out.extend(1u32.to_le_bytes());
         out.extend(format!("{i}.png\0").as_bytes());
-        // One point of the picture.
+        // One point of the image.
         out.extend(1u64.to_le_bytes());
         [1.0f64, 2.0].iter().for_each(|x| out.extend(x.to_le_bytes()));
         out.extend(1u64.to_le_bytes());
@@ -331,7 +332,7 @@ fn record3d() -> String {
     .to_string()
 }
 
-/// A capture with everything that may lie beside its first picture.
+/// A capture with everything that may lie next to its first image.
 fn beside() -> String {
     let files = "\"masks\":[\"mask.png\",\"mask.png\"],\"labels\":[\"labels.png\",\"labels.png\"],\
                  \"features\":[\"features.npy\",\"features.npy\"],\"tracks\":\"tracks.csv\",\"name\"";

@@ -148,7 +148,7 @@ fn meta_seeds() -> Vec<Vec<u8>> {
     vec![sog::unzip(SOG).expect("the seed is sound")[sog::META].to_vec()]
 }
 
-/// Another `meta.json` for the seed's pictures.
+/// Another `meta.json` for the seed's images.
 fn sog_meta(bytes: &[u8]) {
     let mut files = sog::unzip(SOG).expect("the seed is sound");
     files.insert(sog::META.into(), Cow::Borrowed(bytes));

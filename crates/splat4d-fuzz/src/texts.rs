@@ -1,4 +1,5 @@
-//! What people and programs give besides scenes and captures: recipes, edits, paths, points, actions, calibrations, requests of a
+//! What people and programs give in addition to scenes and captures: recipes, edits, paths, points, actions,
+//! calibrations, requests of a
 //! page, videos.
 
 use crate::Reader;

@@ -76,7 +76,7 @@ pub struct Camera {
     pub lens: Option<Intrinsic>,
 }
 
-/// Focal lengths, principal point and distortion in pixels of the stored pictures.
+/// Focal lengths, principal point and distortion in pixels of the stored images.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Intrinsic {

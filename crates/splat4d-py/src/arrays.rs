@@ -1,4 +1,4 @@
-//! NumPy in and out: rows are moved, not copied; pictures are the renderer's planes seen as [h, w, channels].
+//! NumPy in and out: rows are moved, not copied; images are the renderer's planes seen as [h, w, channels].
 
 use crate::errors::bad_input;
 use numpy::{IntoPyArray, PyArray1, PyArray3, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
@@ -18,7 +18,7 @@ pub(crate) fn shaped<T: numpy::Element>(py: Python<'_>, numbers: Vec<T>, shape: 
     Ok(flat.reshape(shape.to_vec())?.into_any().unbind())
 }
 
-/// Planes [c, h, w] as a picture [h, w, c] that looks at the same memory.
+/// Planes [c, h, w] as an image [h, w, c] that looks at the same memory.
 pub(crate) fn picture(py: Python<'_>, planes: Planes<f32>) -> PyResult<Bound<'_, PyAny>> {
     let shape = [planes.channels, planes.height, planes.width];
     let array: Bound<'_, PyArray3<f32>> = planes.data.into_pyarray(py).reshape(shape)?;
@@ -70,7 +70,7 @@ pub(crate) fn finite<const N: usize>(value: &Bound<'_, PyAny>, what: &str) -> Py
     }
 }
 
-/// What the numbers of a picture are.
+/// What the numbers of an image are.
 pub(crate) enum Kind {
     /// From 0 to 255.
     Bytes,
@@ -78,7 +78,7 @@ pub(crate) enum Kind {
     Floats,
 }
 
-/// Anything that NumPy makes an array of, in its own type of numbers, if pictures may have that one.
+/// Anything that NumPy makes an array of, in its own type of numbers, if images may have that one.
 pub(crate) fn pixels<'py>(value: &Bound<'py, PyAny>, what: &str) -> PyResult<(Bound<'py, PyAny>, Kind)> {
     let array = value.py().import("numpy")?.call_method1("asarray", (value,)).map_err(|e| {
         bad_input(format!("{what} is no array ({})", e.value(value.py())), "Give an image [height, width, 3]")
@@ -92,7 +92,7 @@ pub(crate) fn pixels<'py>(value: &Bound<'py, PyAny>, what: &str) -> PyResult<(Bo
     }
 }
 
-/// A picture [h, w, 3], as floats nominally from 0 to 1 or 8-bit numbers, as planes.
+/// An image [h, w, 3], as floats nominally from 0 to 1 or 8-bit numbers, as planes.
 pub(crate) fn planes(value: &Bound<'_, PyAny>, what: &str) -> PyResult<Planes<f32>> {
     let (value, kind) = pixels(value, what)?;
     let array = numbers::<f32>(&value, what)?;
@@ -107,7 +107,7 @@ pub(crate) fn planes(value: &Bound<'_, PyAny>, what: &str) -> PyResult<Planes<f3
     for (c, plane) in out.data.chunks_exact_mut(height * width).enumerate() {
         let channel = view.index_axis(numpy::ndarray::Axis(2), c);
         let numbers = plane.iter_mut().zip(channel.iter());
-        // Divided as pictures in files are, so that the same bytes are the same numbers.
+        // Divided as images in files are, so that the same bytes are the same numbers.
         match kind {
             Kind::Bytes => numbers.for_each(|(o, x)| *o = x / 255.0),
             Kind::Floats => numbers.for_each(|(o, x)| *o = *x),

@@ -1,4 +1,4 @@
-//! Pictures in memory become a capture on disk: lossless files and a `capture.json`.
+//! Images in memory become a capture on disk: lossless files and a `capture.json`.
 
 use crate::arrays::{Kind, finite, finite_rows, numbers, pixels};
 use crate::camera::Camera;
@@ -13,7 +13,7 @@ use splat4d_train::capture::PointCloud;
 use splat4d_train::run::checkpoint::write_atomically;
 use std::path::{Path, PathBuf};
 
-/// Steps of a float picture in its file: 16 bits a sample, whose rounding is far below what cameras tell apart.
+/// Steps of a float image in its file: 16 bits a sample, whose rounding is far below what cameras tell apart.
 const LEVELS: f32 = 65535.0;
 
 /// What the caller gave.
@@ -29,7 +29,7 @@ pub(crate) struct Arrays<'a, 'py> {
     pub(crate) hold_out: Option<Vec<String>>,
 }
 
-/// A picture's samples, row by row, in native order.
+/// An image's samples, row by row, in native order.
 struct Samples {
     data: Vec<u8>,
     kind: ExtendedColorType,
@@ -124,7 +124,7 @@ impl Filmed<'_, '_> {
         items(self.cameras, &what)?.iter().map(one).collect()
     }
 
-    /// Writes its pictures; its entry.
+    /// Writes its images; its entry.
     fn write(&self, py: Python<'_>, arrays: &Arrays<'_, '_>, written: &mut Vec<PathBuf>) -> PyResult<Value> {
         let Self { folder, number, name, .. } = *self;
         let (images, views) = (items(self.images, &format!("images[{number}]"))?, self.views()?);
@@ -226,7 +226,7 @@ fn cloud(points: &Bound<'_, PyAny>, colors: Option<&Bound<'_, PyAny>>) -> PyResu
     Ok(PointCloud { points, colors, times, left_out: 0 })
 }
 
-/// A picture [h, w, 3] of a camera's size as samples for a file.
+/// An image [h, w, 3] of a camera's size as samples for a file.
 fn samples(image: &Bound<'_, PyAny>, what: &str, camera: &scene::Camera) -> PyResult<Samples> {
     let fits = |shape: &[usize]| match shape == [camera.height, camera.width, 3] {
         true => Ok(()),

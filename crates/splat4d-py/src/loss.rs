@@ -1,4 +1,4 @@
-//! A loss written in Python beside the recipe's: it gets the picture and the truth, and returns a value and a gradient.
+//! A loss written in Python next to the recipe's: it gets the image and the truth, and returns a value and a gradient.
 
 use crate::arrays::{numbers, pair, picture};
 use crate::errors::bad_input;

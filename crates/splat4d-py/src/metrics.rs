@@ -1,4 +1,4 @@
-//! Metrics of two pictures.
+//! Metrics of two images.
 
 use crate::arrays::pair;
 use pyo3::prelude::*;

@@ -79,7 +79,7 @@ pub(crate) fn with_parameters(scene: &Scene<f32>, new: &Bound<'_, PyDict>) -> Py
     Ok(out)
 }
 
-/// A render that remembers how it came about, so that a gradient to its picture becomes gradients to the scene's
+/// A render that remembers how it came about, so that a gradient to its image becomes gradients to the scene's
 /// parameters, the camera and the time.
 #[pyclass(frozen, module = "splat4d")]
 pub(crate) struct Rendering {
@@ -154,7 +154,8 @@ fn gradient(value: &Bound<'_, PyAny>, what: &str, channels: usize, camera: &Came
 #[pymethods]
 impl Rendering {
     /// Gradients of a scalar L, given dL/d`color` [h, w, 3] and, where L depends on them, dL/d`alpha` and dL/d`depth` [h, w]:
-    /// a dict of arrays with the names and shapes of `Scene.parameters()`, and beside them `time` (dL/dt, a float; 0 before
+    /// a dict of arrays with the names and shapes of `Scene.parameters()`, and next to them `time` (dL/dt, a float;
+    /// 0 before
     /// and after a Gaussian's path), `camera` ([6]: a translation and a rotation of the camera's axes, applied from the left
     /// to `world_to_camera`) and `background` ([3]).
     #[pyo3(signature = (color=None, alpha=None, depth=None))]

@@ -241,7 +241,7 @@ impl Scene {
     /// renders the others.
     ///
     /// With `requires_grad`, renders colour, alpha and depth on the CPU and returns a `Rendering`, whose `backward(d_color)`
-    /// takes the gradient of any function of the picture to the scene's `parameters()`, the camera and the time.
+    /// takes the gradient of any function of the image to the scene's `parameters()`, the camera and the time.
     #[pyo3(signature = (camera, t, *, channel="color", background=None, device="cpu", requires_grad=false))]
     #[allow(clippy::too_many_arguments)]
     fn render<'py>(

@@ -288,7 +288,7 @@ fn spacetime(shapes: &Shapes, moving: &Moving<'_, '_>, polynomial: bool) -> PyRe
     Ok((Layer::new("arrays", params, motion, kind), clip))
 }
 
-/// What a scene says of itself beside its Gaussians.
+/// What a scene says of itself next to its Gaussians.
 pub(crate) struct About<'a, 'py> {
     pub(crate) clip: Option<[f64; 2]>,
     pub(crate) fps: f64,

@@ -1,11 +1,11 @@
-//! Keyword arguments as knobs of the recipe.
+//! Keyword arguments as settings of the recipe.
 
 use crate::errors::{OrRaise, bad_input};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use splat4d_train::recipe::Recipe;
 
-/// Puts settings into a recipe; their names. Errors: an unknown knob, a wrong type or range.
+/// Puts settings into a recipe; their names. Errors: an unknown setting, a wrong type or range.
 pub(crate) fn set(recipe: &mut Recipe, settings: Option<&Bound<'_, PyDict>>) -> PyResult<Vec<String>> {
     let mut names = Vec::new();
     for (name, value) in settings.into_iter().flatten() {
@@ -13,7 +13,7 @@ pub(crate) fn set(recipe: &mut Recipe, settings: Option<&Bound<'_, PyDict>>) -> 
         // Numbers of NumPy become Python's.
         let value = value.call_method0("item").unwrap_or(value);
         let text: String = value.py().import("json")?.call_method1("dumps", (&value,))?.extract()?;
-        // What JSON calls null is nothing that a knob can be.
+        // What JSON calls null is nothing that a setting can be.
         if value.is_none() {
             return Err(bad_input(format!("`{name}` is None"), "Leave it out for its default"));
         }

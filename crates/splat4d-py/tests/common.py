@@ -8,7 +8,7 @@ import unittest
 ROOT = pathlib.Path(__file__).resolve().parents[3]
 KNIGHT = ROOT / "examples/knight"
 PLAYABLE = ROOT / "examples/knight.s4d"
-# A few seconds of training: the pictures are small and few.
+# A few seconds of training: the images are small and few.
 SHORT = dict(iterations=60, downscale=8, max_frames=3, checkpoint_interval=20, motion="spacetime")
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import splat4d
 from common import KNIGHT, PLAYABLE, SHORT, InFolder
 
-# Rounds that fill caches and the allocator's pools, rounds that are watched, and what one of those may leave, bytes: a picture
+# Rounds that fill caches and the allocator's pools, rounds that are watched, and what one of those may leave, bytes: an image
 # that leaked would be 1.4 MB.
 WARM, ROUNDS, LEAK = 10, 20, 200_000
 

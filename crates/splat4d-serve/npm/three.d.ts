@@ -1,7 +1,7 @@
 import { Matrix4, Mesh } from 'three';
 
 export interface Splat4DOptions {
-  /** A better picture can be drawn: pages came, or a new order. */
+  /** A better image can be drawn: pages came, or a new order. */
   onchange?: () => void;
   /** Bytes of Gaussians that stay in memory. */
   budget?: number;

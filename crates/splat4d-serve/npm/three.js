@@ -24,7 +24,7 @@ const AXES = { x: [1, 0, 0], y: [0, 1, 0], z: [0, 0, 1] };
 /// Stands for a clock that waits for pages: no other time can be rendered.
 const HOLD = () => null;
 
-// The picture's rows go up here, so that `focal.y` is negative; `origin`: where the viewport begins.
+// The image's rows go up here, so that `focal.y` is negative; `origin`: where the viewport begins.
 const VERTEX =
   SPLAT.replace('#version 300 es\n', '') +
   `
@@ -111,7 +111,8 @@ export class Splat4D extends THREE.Mesh {
   #waiting = [];
   #scratch = { view: new THREE.Matrix4(), viewport: new THREE.Vector4(), rows: new Float64Array(12) };
 
-  /// `source`: an address, File, Blob or ArrayBuffer. `onchange()` is called when a better picture can be drawn: pages came,
+  /// `source`: an address, File, Blob or ArrayBuffer. `onchange()` is called when a better image can be drawn: pages
+  /// came,
   /// or a new order; pages that render on demand render then. `budget`: bytes of Gaussians that stay in memory. `up`: the object's
   /// axis ('x', 'y', 'z') that points up as the file's up does; null keeps the file's axes.
   constructor(source, { onchange = () => {}, budget, up = 'y' } = {}) {
@@ -250,7 +251,7 @@ export class Splat4D extends THREE.Mesh {
     this.geometry.dispose();
   }
 
-  // three.js: called before every picture, once an eye.
+  // three.js: called before every image, once an eye.
 
   onBeforeRender = (renderer, _scene, camera) => {
     if (!this.#stream) return;

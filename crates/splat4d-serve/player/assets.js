@@ -1,4 +1,4 @@
-// Where the workers come from: files beside this one, or blob URLs in the one-file page (`SPLAT4D_ASSETS`).
+// Where the workers come from: files next to this one, or blob URLs in the one-file page (`SPLAT4D_ASSETS`).
 
 /// Starts the worker called `name` ('decode.worker.js'), a classic one: a page opened from a disk may start no module
 /// workers from blob URLs (Chromium). `start` makes it of its file: `() => new Worker(new URL('./decode.worker.js',

@@ -6,7 +6,7 @@ export const DEGREE = Math.PI / 180;
 export const NEAR = 0.01;
 /** Field of view where nobody states one: that of a normal lens. */
 const FOV_DEFAULT = 45;
-/** Widest and narrowest picture, degrees: wider is a fisheye's business, narrower shows single Gaussians. */
+/** Widest and narrowest image, degrees: wider is a fisheye's business, narrower shows single Gaussians. */
 export const FOV_RANGE = [5, 120];
 /** In a window taller than the scene was seen, the first view shows this share of its width, so that less of what no camera saw is shown. */
 const TALL_SHARE = 0.75;
@@ -89,7 +89,7 @@ export class Camera {
   quat = [1, 0, 0, 0];
   /** To the point that orbiting turns about, scene units. */
   distance = 3;
-  /** Degrees, over the picture's shorter side, so that a portrait window shows as much of the subject. */
+  /** Degrees, over the image's shorter side, so that a portrait window shows as much of the subject. */
   fov = FOV_DEFAULT;
   /** The world's up, unit. */
   up = [0, 1, 0];
@@ -131,7 +131,7 @@ export class Camera {
     const c = b.clone();
     if (u >= 1) return c;
     c.lens = null;
-    // The target moves straight, so that what is looked at stays in the picture.
+    // The target moves straight, so that what is looked at stays in the image.
     const target = mix(a.target, b.target, u);
     c.quat = slerp(a.quat, b.quat, u);
     c.distance = lerp(a.distance, b.distance, u);
@@ -151,7 +151,7 @@ export class Camera {
     }
     const view = { cameraFromWorld: out, width, height };
     if (this.lens) {
-      // All of the dataset camera's picture is shown, centred, with more of the world where the window is wider.
+      // All of the dataset camera's image is shown, centred, with more of the world where the window is wider.
       const l = this.lens, k = Math.min(width / l.width, height / l.height) * this.#nearer(width / l.width, height / l.height);
       return { ...view, fx: l.fx * k, fy: l.fy * k,
         cx: width / 2 + (l.cx - l.width / 2) * k, cy: height / 2 + (l.cy - l.height / 2) * k };

@@ -1,9 +1,9 @@
-// What is drawn over the picture while one edits, and what hands do there: shapes, dots of what is selected, handles of a
+// What is drawn over the image while one edits, and what hands do there: shapes, dots of what is selected, handles of a
 // move, nodes of a bend. Works on any backend: it is a canvas of its own.
 
 import { add, cross, normalize, quatAbout, quatMul, quatTurn } from './camera.js';
 
-/** Pixels: length of a move's arrows, of its rings' radius and of the way to its scale knob, of a dot, of a node. */
+/** Pixels: length of a move's arrows, of its rings' radius and of the way to its scale setting, of a dot, of a node. */
 const ARROW = 84, RING = 62, KNOB = 56, DOT = 1.6, NODE = 3.2;
 /** How near a pointer must come, pixels: a mouse, a finger. */
 const NEAR = { mouse: 9, pen: 12, touch: 20 };
@@ -13,7 +13,7 @@ const TAP = 5;
 const CORNERS = 48, CORNER_STEP = 5;
 /** Segments of a ring. */
 const SEGMENTS = 48;
-/** Pixels of the scale knob for a factor of e. */
+/** Pixels of the scale setting for a factor of e. */
 const SCALE_PIXELS = 120;
 const AXES = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
 const COLORS = ['#e5484d', '#46a758', '#3b82f6'];
@@ -62,7 +62,7 @@ export class Overlay extends EventTarget {
     this.redraw();
   }
 
-  /** A picture of the server's in place of the player's; null takes it away. */
+  /** An image of the server's in place of the player's; null takes it away. */
   async show(source) {
     if (!source) this.#picture = null;
     else {
@@ -99,7 +99,7 @@ export class Overlay extends EventTarget {
     return pixels.map(([x, y]) => [(x - v.cx) / v.fx, (y - v.cy) / v.fy]);
   }
 
-  /** World displacement of a way of pixels across the picture at a depth. */
+  /** World displacement of a way of pixels across the image at a depth. */
   #across([dx, dy], z) {
     const { fx, fy } = this.view, c = this.player.camera;
     return add(c.right.map(x => x * dx * z / fx), c.down, dy * z / fy);
@@ -181,7 +181,7 @@ export class Overlay extends EventTarget {
     this.#emit('drawn', { shape: this.tool, corners: this.corners(path) });
   }
 
-  /** The handles of a move: centre, arrows, rings, knob. */
+  /** The handles of a move: centre, arrows, rings, setting. */
   #gizmo() {
     if (!this.place) return null;
     const center = add(this.place.about, this.place.shift), view = this.view, c = this.project(center, view);
@@ -231,7 +231,7 @@ export class Overlay extends EventTarget {
     return null;
   }
 
-  /** Middles of the box's faces on the picture: [axis, 'low' or 'high', place, [x, y, depth]]. */
+  /** Middles of the box's faces on the image: [axis, 'low' or 'high', place, [x, y, depth]]. */
   #faces() {
     if (!this.box || ['move', 'bend'].includes(this.tool)) return [];
     const { low, high } = this.box, view = this.view;
@@ -267,7 +267,7 @@ export class Overlay extends EventTarget {
     this.nodes.forEach((p, node) => {
       const q = this.project(p, view);
       const away = q && far(at, q);
-      // Of nodes that are about as near on the picture, the one in front.
+      // Of nodes that are about as near on the image, the one in front.
       if (q && away <= reach && (!best || q[2] + away * q[2] / view.fx * 4 < best.key)) {
         best = { node, z: q[2], key: q[2] + away * q[2] / view.fx * 4 };
       }
@@ -287,7 +287,7 @@ export class Overlay extends EventTarget {
     };
   }
 
-  // The picture.
+  // The image.
 
   draw() {
     const { canvas } = this, ratio = Math.min(devicePixelRatio || 1, 2);

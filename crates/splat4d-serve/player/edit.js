@@ -7,7 +7,7 @@ import { Overlay } from './edit-tools.js';
 import { allow, button, choice, clock, field, h, segments, tool } from './dom.js';
 import { clamp } from './camera.js';
 
-/** Longer side of pictures that the program draws, pixels: at rest, and while something is pulled. */
+/** Longer side of images that the program draws, pixels: at rest, and while something is pulled. */
 const SIDE = 960, SIDE_PULLING = 384;
 /** Rest after which the selection is looked up at another moment, ms. */
 const REST = 180;
@@ -80,7 +80,7 @@ const slider = (label, low, high, value, onchange, oninput) => {
 export class Editing {
   #timers = {};
   #run = 0;
-  /** Whether a picture stands in, one is being made for another view, and one is wanted for yet another. */
+  /** Whether an image stands in, one is being made for another view, and one is wanted for yet another. */
   #standing = false;
   #looking = false;
   #again = false;
@@ -314,7 +314,7 @@ export class Editing {
     this.#properties();
     this.#diamonds();
     this.#state();
-    // What was made anew under somebody's keys is theirs again.
+    // What was made again under somebody's keys is theirs again.
     if (focused && !this.panel.contains(this.ui.focused())) this.panel.querySelector(`[aria-label="${CSS.escape(focused)}"]`)?.focus();
   }
 
@@ -572,7 +572,7 @@ export class Editing {
     } catch (error) { this.say(error.message, true); }
   }
 
-  /** The list is replayed: at once as a picture, then as a scene that plays. */
+  /** The list is replayed: at once as an image, then as a scene that plays. */
   async #apply() {
     const run = ++this.#run, steps = ready(this.steps);
     this.#standing = true;
@@ -600,7 +600,7 @@ export class Editing {
     this.say(error.message, true);
   }
 
-  /** The program's own picture of the list from here, which stands in until the scene is baked. */
+  /** The program's own image of the list from here, which stands in until the scene is baked. */
   async #look(steps, run) {
     const told = await this.ask({ do: 'show', steps, view: this.view(), t: this.time });
     if (run !== this.#run || !this.#standing) return;
@@ -609,7 +609,7 @@ export class Editing {
     this.refresh();
   }
 
-  /** The picture that stands in goes along with camera and time. */
+  /** The image that stands in goes along with camera and time. */
   async #follow() {
     if (!this.#standing || this.overlay.busy) return;
     this.#again = true;
@@ -634,7 +634,7 @@ export class Editing {
   }
 
   #moving() {
-    // Numbers beside the handles follow; the picture comes when they are let go.
+    // Numbers next to the handles follow; the image comes when they are let go.
     const shift = this.overlay.place?.shift;
     'xyz'.split('').forEach((axis, k) => {
       const input = this.props.querySelector(`[aria-label="Shift ${axis}"]`);
@@ -666,7 +666,7 @@ export class Editing {
     return round(GRIP * Math.sqrt(places.reduce((s, p) => s + p.reduce((q, x, k) => q + (x - middle[k]) ** 2, 0), 0) / places.length));
   }
 
-  /** Asks for the picture of what is pulled; while one is on its way, only for the newest. */
+  /** Asks for the image of what is pulled; while one is on its way, only for the newest. */
   async #pulling() {
     const bent = this.#bent, o = this.overlay;
     if (!bent) return;
@@ -679,7 +679,7 @@ export class Editing {
         const told = await this.ask({ do: 'pull', number: bent.number, handles, pins, view: this.view(SIDE_PULLING) });
         if (bent !== this.#bent || o.tool !== 'bend') return;
         o.nodes = told.nodes;
-        // After the hand has let go, the list's own picture comes.
+        // After the hand has let go, the list's own image comes.
         if (o.busy || this.#standing) {
           if (o.busy) await o.show(told.picture);
         } else await o.show(null);

@@ -1,6 +1,6 @@
 // The WebGL2 backend's shaders: the twins of render/project.rs, math/sh.rs and docs/format.md.
 
-/// What a picture shows; the numbers are those of the shaders.
+/// What an image shows; the numbers are those of the shaders.
 export const CHANNELS = { color: 0, depth: 1, alpha: 2, flow: 3 };
 /// Texels (RGBA32F) of a block in the block texture: 24 numbers of its header, then span from, span to, first row of
 /// its palette or -1, SH degree, then the palette's three ranges, then the span's length.
@@ -11,7 +11,7 @@ export const ORDER_WIDTH = 1024;
 
 /// What both ways of drawing share: unpacks, moves, projects and shades one Gaussian.
 ///
-/// Culls: outside its span, z ≤ near, opacity·σ < 1/255, determinant ≤ 0, nothing in the picture.
+/// Culls: outside its span, z ≤ near, opacity·σ < 1/255, determinant ≤ 0, nothing in the image.
 /// Constants: low-pass 0.3 px² and α ≥ 1/255 of Kerbl et al. 2023, τ margin of project.rs.
 export const SPLAT = `#version 300 es
 precision highp float; precision highp int;
@@ -29,7 +29,7 @@ uniform int channel, count;
 struct Splat { vec4 shape, place, tint; float depth; };
 
 const float LOW_PASS = 0.3, ALPHA_MIN = 1.0 / 255.0, TAU_MARGIN = 1e-3;
-// Only an order that is older than this picture can hold pages outside their span: s.
+// Only an order that is older than this image can hold pages outside their span: s.
 const float SPAN_SLACK = 1e-4;
 const int BLOCK_TEXELS = ${BLOCK_TEXELS}, PALETTE_WIDTH = 2048;
 
@@ -152,7 +152,7 @@ Splat splat(ivec2 texel) {
 `;
 
 /// Splats an instance. One each would be slow: graphics processors fill their lanes from one instance, and SwiftShader
-/// starts anew for each (measured: about 50 µs an instance).
+/// starts again for each (measured: about 50 µs an instance).
 export const BATCH = 256;
 
 /// Four corners a splat, close around its ellipse: a needle's upright box would be empty for the most part.
@@ -228,7 +228,7 @@ uniform vec3 background;
 // 1, or 0 where what lies behind is not ours to draw.
 uniform float opaque;
 uniform ivec2 origin;
-// Height of the picture where rows must be turned round, else 0.
+// Height of the image where rows must be turned round, else 0.
 uniform int turned;
 uniform int channel;
 out vec4 color;

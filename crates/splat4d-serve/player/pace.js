@@ -1,7 +1,7 @@
-// How large the picture is drawn, so that it keeps pace: lowered where frames come too slowly, raised again where there
+// How large the image is drawn, so that it keeps pace: lowered where frames come too slowly, raised again where there
 // is time to spare, and left alone where fewer pixels do not help.
 
-/** Frames a second that are kept, and above which the picture may grow again. */
+/** Frames a second that are kept, and above which the image may grow again. */
 const KEEP = 30;
 const SPARE = 48;
 /** Smallest scale: a quarter of the pixels a side is still legible. */

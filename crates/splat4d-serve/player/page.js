@@ -1,4 +1,4 @@
-// The page around the element: reads what to show, from the page itself or from the server beside it.
+// The page around the element: reads what to show, from the page itself or from the server next to it.
 
 import './element.js';
 

@@ -12,7 +12,7 @@ import { Track } from './track.js';
 
 export const CHANNELS = ['color', 'depth', 'alpha', 'flow'];
 export const SPEED_RANGE = [0.1, 4];
-/** Where pictures are drawn without a GPU, the first one should not take seconds either. */
+/** Where images are drawn without a GPU, the first one should not take seconds either. */
 const SCALE_SOFTWARE = 0.5;
 /**
  * Images that the graphics processor may work on: more would only be shown later. Two keep a fast one busy; where one takes
@@ -37,7 +37,7 @@ const REST = 150, AT_ONCE = 1000, FIRST_STEP = 400, NEXT_STEP = 300;
 const CONTENT = 1, MOTION = 2;
 /** Stands for a clock that waits for pages: no other time can be rendered. */
 const HOLD = () => null;
-/** A move of half the picture's height in a second shows at full strength in the flow view. */
+/** A move of half the image's height in a second shows at full strength in the flow view. */
 const FLOW_SHARE = 0.5;
 /** Beyond this share of the way to what is looked at nothing is cut off. */
 const NEAR_SHARE = 0.2;
@@ -211,7 +211,7 @@ export class Player extends EventTarget {
     this.emit('camerachange', { camera: this.camera.toJSON() });
   }
 
-  /** The picture of now stays over the canvas until the next scene has one of its own. */
+  /** The image of now stays over the canvas until the next scene has one of its own. */
   #freeze() {
     // A canvas can be copied only in the task that rendered it.
     if (!this.#stream || !this.#paintedScale || !this.#paint(this.#paintedScale, { force: true })) return;
@@ -476,7 +476,7 @@ export class Player extends EventTarget {
 
   reset() { this.setCamera(firstCamera(this.meta), { glide: true }); }
 
-  /** Orbits about what is in the picture's middle from now on, at the scene's own distance. */
+  /** Orbits about what is in the image's middle from now on, at the scene's own distance. */
   setMode(mode) {
     this.controls.mode = mode;
     if (mode === 'orbit') {

@@ -15,7 +15,8 @@ const cost = (page) => page.count * GAUSSIAN + (page.maskBytes ?? 0);
 /// Looked ahead while playing, s of the viewer's time; to both sides while not, s of the scene's.
 const AHEAD = 2,
   BESIDE = 0.5;
-/// Times on the scene clock change each frame; a plan is made anew when one moved by this part of what is looked ahead.
+/// Times on the scene clock change each frame; a plan is made again when one moved by this part of what is looked
+/// ahead.
 const STEP = 8;
 /// Pages in flight for later: few, so that a seek is not behind many.
 const LATER = 4;
@@ -109,7 +110,7 @@ export class Stream {
       [this.#begun, this.#ended, this.#active] = [begun, ended, this.#file.activePages(t)];
     }
     const active = this.#active;
-    // What lies ahead is looked at anew in coarse steps only.
+    // What lies ahead is looked at again in coarse steps only.
     const reach = playing ? Math.max(Math.abs(speed), 0.1) * AHEAD : BESIDE;
     const step = Math.floor((t / reach) * STEP);
     const last = this.#last;

@@ -14,7 +14,7 @@ const BLOCK = 256,
 export const BLOCKS_WIDTH = (ROW / BLOCK) * BLOCK_TEXELS;
 /// Header numbers that are times on the scene clock: life centre min and max, alive from and to.
 const TIMES = [6, 7, 8, 9];
-/// x/z and y/z inside J may leave the picture by this share of its half-width's tangent (CONVENTIONS.md).
+/// x/z and y/z inside J may leave the image by this share of its half-width's tangent (CONVENTIONS.md).
 export const J_MARGIN = 0.3;
 /// Two triangles of a quad's four corners.
 const CORNERS = [0, 1, 2, 2, 1, 3];

@@ -74,7 +74,7 @@ export class Track {
       fps: this.fps,
       keys: this.keys.map(({ time, sceneTime, camera }) => ({
         time: +time.toFixed(4), position: tidy(camera.position), look_at: tidy(camera.target),
-        // The camera's own up, so that a rolled picture stays rolled.
+        // The camera's own up, so that a rolled image stays rolled.
         up: tidy(camera.down.map(x => -x)), fov_y: +camera.fov.toFixed(4),
         ...(sceneTime === null ? {} : { scene_time: +sceneTime.toFixed(6) }),
       })),

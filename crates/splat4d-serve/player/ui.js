@@ -258,7 +258,7 @@ export class Interface {
     this.refresh();
   }
 
-  /** Shows a picture until the first frame: an address or a Blob; null takes it away. */
+  /** Shows an image until the first frame: an address or a Blob; null takes it away. */
   setPoster(what) {
     if (this.#poster) URL.revokeObjectURL(this.#poster);
     this.#poster = what instanceof Blob ? URL.createObjectURL(what) : null;

@@ -275,7 +275,7 @@ export class WebGL2Backend {
     this.#redraw(false);
   }
 
-  /// The picture of the last `draw`: {width, height, data: RGBA bytes, rows from the top}.
+  /// The image of the last `draw`: {width, height, data: RGBA bytes, rows from the top}.
   async readPixels() {
     const gl = this.#gl,
       [width, height] = this.#size;
@@ -516,7 +516,7 @@ export class WebGL2Backend {
     gl.disable(gl.BLEND);
   }
 
-  /// Writes the sums as a picture; `turned`: its height where rows go from the bottom.
+  /// Writes the sums as an image; `turned`: its height where rows go from the bottom.
   #resolve(framebuffer, x, y, turned) {
     const gl = this.#gl,
       { program, at } = this.#show,

@@ -132,7 +132,7 @@ export class WebGPUBackend {
     if (hardware && (info.isFallbackAdapter || SOFTWARE.test(`${info.architecture} ${info.description}`))) {
       throw new SceneError('WebGPU would run on the CPU', '', 'Let the player use WebGL2.');
     }
-    // Everything fits the default limits; larger ones only make room for more Gaussians and larger pictures.
+    // Everything fits the default limits; larger ones only make room for more Gaussians and larger images.
     const requiredLimits = {};
     for (const name of ['maxStorageBufferBindingSize', 'maxBufferSize', 'maxTextureDimension2D']) {
       requiredLimits[name] = adapter.limits[name];
@@ -338,13 +338,13 @@ export class WebGPUBackend {
     return true;
   }
 
-  /// Resolves when the last picture is complete. Throws what the device complained about.
+  /// Resolves when the last image is complete. Throws what the device complained about.
   async settled() {
     if (!this.#gone) await this.#queue.onSubmittedWorkDone();
     if (this.#error) throw this.#error;
   }
 
-  /// The last picture: RGBA, rows from the top.
+  /// The last image: RGBA, rows from the top.
   async readPixels() {
     if (this.#error) throw this.#error;
     const { width, height } = this.#canvas, device = this.#device;
@@ -402,7 +402,7 @@ export class WebGPUBackend {
     this.#onlost?.(this.#error);
   }
 
-  /// The pages or their places are not what they were: the list and the picture are out of date.
+  /// The pages or their places are not what they were: the list and the image are out of date.
   #changed() {
     this.#list = { ...this.#list, at: NaN, from: Infinity };
     this.#culled.valid = false;
@@ -463,7 +463,7 @@ export class WebGPUBackend {
     return true;
   }
 
-  /// Buffers of one frame's lists. Their content is made anew each time.
+  /// Buffers of one frame's lists. Their content is made again each time.
   #roomForList(blocks) {
     if (blocks <= this.#listRoom) return;
     const most = Math.floor(this.#maxBytes / RECORD_BYTES);
@@ -638,7 +638,7 @@ export class WebGPUBackend {
     return true;
   }
 
-  /// Without a timer drawMs is the time from the call to the picture's end, sort included.
+  /// Without a timer drawMs is the time from the call to the image's end, sort included.
   #readStats(start) {
     this.#reading = true;
     const { readback } = this.#b, { stats } = this;

@@ -33,7 +33,7 @@ impl Guard {
     }
 
     /// Whether a request may be answered. `posts`: whether one of this path may be sent something, which has rules of its own
-    /// besides.
+    /// in addition.
     pub(crate) fn check(&self, request: &Parts, posts: bool) -> Result<(), Refusal> {
         let known = request.method == Method::GET || request.method == Method::HEAD;
         let posts = posts && request.method == Method::POST;

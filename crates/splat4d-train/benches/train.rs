@@ -1,4 +1,4 @@
-//! The stages of training outside the renderer, and searches and measures that training uses, on made-up data:
+//! The stages of training outside the renderer, and searches and measures that training uses, on synthetic data:
 //! `cargo bench -p splat4d-train`. `splat4d bench` measures whole steps on real scenes.
 
 use divan::Bencher;
@@ -120,7 +120,7 @@ fn neighbours(bencher: Bencher<'_, '_>, k: usize) {
 const ALEX: [(usize, usize, usize, usize); 5] =
     [(0, 3, 64, 11), (3, 64, 192, 5), (6, 192, 384, 3), (8, 384, 256, 3), (10, 256, 256, 3)];
 
-/// LPIPS with made-up weights of AlexNet's shapes.
+/// LPIPS with synthetic weights of AlexNet's shapes.
 #[divan::bench(sample_count = FEW)]
 fn lpips(bencher: Bencher<'_, '_>) {
     let made = |name: &str, shape: Vec<usize>, scale: f64| {

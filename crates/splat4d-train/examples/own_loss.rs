@@ -72,7 +72,7 @@ fn is_right(gaussian: usize) -> bool {
     gaussian % 2 == 1
 }
 
-/// Pictures of a still scene.
+/// Images of a still scene.
 struct Pictures {
     cameras: Vec<Camera>,
     colors: Vec<Planes<f32>>,
@@ -101,7 +101,7 @@ impl Frames for Pictures {
 }
 
 fn main() -> Result<()> {
-    // What a capture and a program that labels pixels would give: pictures, and a number from 0 to 1 a pixel.
+    // What a capture and a program that labels pixels would give: images, and a number from 0 to 1 a pixel.
     let mut scene = balls()?;
     let camera = |i: usize| {
         let angle = std::f64::consts::TAU * i as f64 / CAMERAS as f64;

@@ -90,7 +90,7 @@ fn main() -> Result<()> {
         }
     }
 
-    // The recipe holds every knob; the plan adds what a program must know of the capture.
+    // The recipe holds every setting; the plan adds what a program must know of the capture.
     let mut recipe = Recipe::default();
     for knob in ["iterations=400", "init=random", "num_pts=400", "max_cap=800", "sh_degree=0", "half_size_until=0"] {
         recipe.set(knob)?;

@@ -1,4 +1,5 @@
-//! Numbers of Gaussians as training pictures blend them, and the way back: what is learnt beside pictures while shapes, places
+//! Numbers of Gaussians as training images blend them, and the backward pass: what is learnt next to images while
+//! shapes, places
 //! and colours stay as they are ([`labels`](crate::labels), [`features`](crate::features)).
 
 use crate::capture::Capture;
@@ -9,12 +10,12 @@ use splat4d::scene::{Planes, Table};
 /// A pixel that shows less than this teaches nothing, and is not measured.
 pub(crate) const SEEN: f32 = 0.5;
 
-/// Memory of a picture after the other.
+/// Memory of an image after the other.
 pub(crate) struct Blended {
     renderer: Renderer<f32>,
     instant: Evaluation<f32>,
     columns: Table<f32>,
-    /// The last picture; its further channels are the blended numbers.
+    /// The last image; its further channels are the blended numbers.
     pub image: Image<f32>,
     grads: RenderGrads<f32>,
 }

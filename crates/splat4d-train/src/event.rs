@@ -52,7 +52,7 @@ pub enum Event {
         iterations: usize,
         /// Gaussians at most.
         gaussians: usize,
-        /// Width and height of its pictures, pixels.
+        /// Width and height of its images, pixels.
         size: [usize; 2],
         /// Seconds from the command's start to its end, about.
         seconds: f64,

@@ -1,11 +1,12 @@
-//! Feature channels of a trained scene, learnt from pictures of features while all else stays as it is.
+//! Feature channels of a trained scene, learnt from images of features while all else stays as it is.
 //!
 //! A Gaussian has D numbers f_i. A pixel shows F = Σ w_i f_i / Σ w_i, w_i = α_i T_i, and the loss is ½ Σ_pixels |F − F*|² over the
 //! pixels that are known and show something, plus ½ ε Σ |f_i|². With shapes fixed F is linear in f, so that the loss has one
 //! minimum, which conjugate gradients come near in few rounds without any rate (Hestenes and Stiefel 1952), each channel by
-//! itself: a round draws every picture once, forth and back. Few rounds also keep what pixels hardly see from growing.
+//! itself: a round draws every image once, forth and back. Few rounds also keep what pixels hardly see from growing.
 //!
-//! Features of Gaussians as blended channels: Feature 3DGS (Zhou et al. 2024), which learns them by steps beside colours.
+//! Features of Gaussians as blended channels: Feature 3DGS (Zhou et al. 2024), which learns them by steps next to
+//! colours.
 
 use crate::blended::{Blended, SEEN};
 use crate::capture::Capture;
@@ -19,15 +20,15 @@ use splat4d::scene::{Planes, Table};
 
 /// Rounds unless told.
 pub const ROUNDS: usize = 8;
-/// Most pictures of a round, evenly chosen: more say the same again.
+/// Most images of a round, evenly chosen: more say the same again.
 pub const MOST_PICTURES: usize = 240;
-/// ε, pixels' worth of features that are 0: what no picture shows has none.
+/// ε, pixels' worth of features that are 0: what no image shows has none.
 const PRIOR: f64 = 1e-3;
 
 /// How well features are learnt.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FeatureScores {
-    /// Pictures that were measured.
+    /// Images that were measured.
     pub pictures: usize,
     /// Share of the variance of the known pixels' features that is explained.
     pub explained: f64,
@@ -119,7 +120,7 @@ fn show(scene: &mut Scene<f32>, f: &Vector) {
     }
 }
 
-/// A pass over the pictures: Σ of the gradients of [`compare`] to the features of the scene, the loss and its pixels.
+/// A pass over the images: Σ of the gradients of [`compare`] to the features of the scene, the loss and its pixels.
 fn pass(
     scene: &Scene<f32>,
     capture: &Capture,
@@ -145,10 +146,11 @@ fn pass(
     Ok((sum, loss, pixels))
 }
 
-/// Learns the features of the capture's training pictures into the scene, in place of those it had. Returns the mean loss of a
-/// known pixel before each round and after the last. `progress` hears how many pictures of how many are done.
+/// Learns the features of the capture's training images into the scene, in place of those it had. Returns the mean
+/// loss of a
+/// known pixel before each round and after the last. `progress` hears how many images of how many are done.
 ///
-/// Errors: no training picture has features; one that cannot be read, or of other channels than the first.
+/// Errors: no training image has features; one that cannot be read, or of other channels than the first.
 pub fn learn(
     scene: &mut Scene<f32>,
     capture: &Capture,
@@ -202,7 +204,7 @@ pub fn learn(
 
 /// Measures a scene's features on frames of its capture; `None`: none of them has features, or the scene has none.
 ///
-/// Errors: a picture of features that cannot be read, or of other channels than the scene.
+/// Errors: an image of features that cannot be read, or of other channels than the scene.
 pub fn measure(scene: &Scene<f32>, capture: &Capture, frames: &[usize]) -> Result<Option<FeatureScores>> {
     let (frames, channels) = (featured(capture, frames), scene.feature_channels());
     if frames.is_empty() || channels == 0 {
@@ -346,7 +348,7 @@ mod tests {
         assert_eq!(features::row(&scene.layers[0].params, key, 400), [0.0; 3], "what nobody sees has none");
         let scores = measure(&scene, &capture, &capture.train).unwrap().unwrap();
         assert!(scores.explained > 0.93 && scores.cosine > 0.97 && scores.pictures == 2, "{scores:?}");
-        // Learning again begins anew.
+        // Learning again begins again.
         let again = learn(&mut scene, &capture, 1, &mut |_, _| {}).unwrap();
         assert!((again[0] - losses[0]).abs() < 1e-9);
     }

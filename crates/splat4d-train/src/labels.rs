@@ -1,13 +1,13 @@
-//! Labels of a trained scene, learnt from masks of labels in its training pictures while all else stays as it is.
+//! Labels of a trained scene, learnt from masks of labels in its training images while all else stays as it is.
 //!
 //! A Gaussian has a probability of each label, p_i. A pixel shows P = Σ w_i p_i / Σ w_i, w_i = α_i T_i, and the cross-entropy
 //! −Σ_pixels ln P_y, y the pixel's label, is made least by expectation and maximisation: p_ik becomes the share of label k in
 //! Σ_pixels with y = k of w_i p_ik / P_k. That is exact for blended probabilities, has no rate, and never makes the loss
 //! larger. The first round, from even probabilities, is the vote of FlashSplat (Shen et al. 2024); the following ones give a
 //! pixel to those of its Gaussians that others agree with. The sums are the renderer's gradient to the blended
-//! probabilities, with 1/P_y at label y as the picture's gradient.
+//! probabilities, with 1/P_y at label y as the image's gradient.
 //!
-//! Shapes and places learn nothing from labels: they are those that make the best pictures.
+//! Shapes and places learn nothing from labels: they are those that make the best images.
 
 use crate::blended::{Blended, SEEN};
 use crate::capture::Capture;
@@ -21,9 +21,9 @@ use splat4d::scene::{Planes, Table};
 
 /// Rounds unless told: the cross-entropy of the bundled capture then changes by less than a percent a round.
 pub const ROUNDS: usize = 4;
-/// Most pictures of a round, evenly chosen: more say the same again.
+/// Most images of a round, evenly chosen: more say the same again.
 pub const MOST_PICTURES: usize = 240;
-/// Pixels' worth of an even vote that every Gaussian has: what no picture shows keeps no label.
+/// Pixels' worth of an even vote that every Gaussian has: what no image shows keeps no label.
 const PRIOR: f64 = 1e-3;
 /// Probabilities are kept this far from 0: a wrong mask must not forbid a label for ever.
 const LEAST: f64 = 1e-6;
@@ -33,11 +33,11 @@ const LEAST: f64 = 1e-6;
 pub struct LabelScores {
     /// The labels' names.
     pub names: Vec<String>,
-    /// Pictures that were measured.
+    /// Images that were measured.
     pub pictures: usize,
     /// Share of the labelled pixels that show something whose likeliest label is right.
     pub accuracy: f64,
-    /// By label: pixels in both over pixels in either; `None`: it is in no picture, neither true nor drawn.
+    /// By label: pixels in both over pixels in either; `None`: it is in no image, neither true nor drawn.
     pub iou: Vec<Option<f64>>,
 }
 
@@ -56,10 +56,10 @@ fn labelled(capture: &Capture, frames: &[usize], most: usize) -> Vec<usize> {
     all.into_iter().step_by(step).collect()
 }
 
-/// Learns the labels of the capture's training pictures into the scene, in place of those it had. Returns the mean
-/// cross-entropy of a pixel before each round, nats. `progress` hears how many pictures of how many are done.
+/// Learns the labels of the capture's training images into the scene, in place of those it had. Returns the mean
+/// cross-entropy of a pixel before each round, nats. `progress` hears how many images of how many are done.
 ///
-/// Errors: no training picture has labels; a mask that cannot be read.
+/// Errors: no training image has labels; a mask that cannot be read.
 pub fn learn(
     scene: &mut Scene<f32>,
     capture: &Capture,
@@ -167,7 +167,7 @@ fn draw(work: &mut Blended, scene: &Scene<f32>, capture: &Capture, frame: usize)
     work.draw(scene, capture, frame, |instant| label_columns(scene, instant).expect("the scene has labels"));
 }
 
-/// Adds a picture's votes; returns its cross-entropy and how many pixels that is of.
+/// Adds an image's votes; returns its cross-entropy and how many pixels that is of.
 fn vote(
     work: &mut Blended,
     scene: &Scene<f32>,
@@ -272,7 +272,7 @@ mod tests {
         let mut right = 0;
         for r in 0..400 {
             let [x, y] = before.read::<2>(r, 0);
-            // Those on the border may be of either, those at the picture's edge of none.
+            // Those on the border may be of either, those at the image's edge of none.
             let asked = x.abs() > 0.3 && x.abs() < 1.4 && y.abs() < 1.3;
             right += usize::from(!asked || of[r] == Some(usize::from(x > 0.0)));
         }
@@ -282,7 +282,7 @@ mod tests {
         // One pixel in nine of one mask of two is wrong.
         assert!(scores.accuracy > 0.92 && scores.mean_iou() > 0.85, "{scores:?}");
         assert_eq!(scores.names, ["left", "right"]);
-        // Learning again begins anew.
+        // Learning again begins again.
         let again = learn(&mut scene, &capture, 1, &mut |_, _| {}).unwrap();
         assert!((again[0] - losses[0]).abs() < 1e-9);
         let mut other = scene.clone();

@@ -184,7 +184,7 @@ impl Learner {
 
     /// Changes the scene at will: layers, models, tables. Moments that still fit are kept, but for layers of another name;
     /// those of pages for which `learns` (of a layer and one of its column groups) does not hold are forgotten, and
-    /// statistics begin anew.
+    /// statistics begin again.
     pub(crate) fn rebuild(
         &mut self,
         learns: &dyn Fn(usize, &str) -> bool,
@@ -212,7 +212,7 @@ impl Learner {
         Ok(())
     }
 
-    /// Notes that who is near whom was looked up anew, although no row was edited.
+    /// Notes that who is near whom was looked up again, although no row was edited.
     pub(crate) fn neighbours_changed(&mut self) {
         self.touch(Touched::Rows);
     }

@@ -1,8 +1,10 @@
 //! The recipe: every setting of a run, a table a subject. It is TOML on disk; the effective one is saved with the run, and a
 //! run repeats bit for bit from it (on the same SIMD level).
 //!
-//! Tables are declared beside what they set (`settings!`); here they are only put together. Learning rates of positions
-//! are in units of the scene's extent; everything with time in it is stated per clip length. Iteration knobs left at 0
+//! Tables are declared next to what they set (`settings!`); here they are only put together. Learning rates of
+//! positions
+//! are in units of the scene's extent; everything with time in it is stated per clip length. Iteration settings left
+//! at 0
 //! follow from `run.iterations` (see [`Recipe::resolve`]). Names without a table (`max_cap` for `densify.max_cap`), which
 //! recipes had before they had tables, are read as well.
 
@@ -132,7 +134,7 @@ impl Recipe {
         r
     }
 
-    /// Fills every knob that is 0 and follows from others, so that the saved recipe says all.
+    /// Fills every setting that is 0 and follows from others, so that the saved recipe says all.
     #[must_use]
     pub fn resolve(&self) -> Self {
         let mut r = self.clone();

@@ -1,4 +1,4 @@
-//! Settings: typed knobs, each declared once and beside what it sets.
+//! Settings: typed settings, each declared once and next to what it sets.
 //!
 //! `settings!` makes a struct of one table of the recipe, and from the same lines its
 //! defaults, documentation, ranges and units; [`Recipe`](crate::recipe::Recipe) puts the tables together.
@@ -9,7 +9,7 @@ mod when;
 pub(crate) use value::{Choice, Value, among};
 pub use when::{When, is_off};
 
-/// One knob, for help, documents and checks.
+/// One setting, for help, documents and checks.
 #[derive(Clone, Debug)]
 pub struct Knob {
     /// The table that it stands in.
@@ -33,10 +33,10 @@ impl Knob {
     }
 }
 
-/// The numbers that a knob may be.
+/// The numbers that a setting may be.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Range {
-    /// Zero or above: the rule, for few knobs mean anything below zero.
+    /// Zero or above: the rule, for few settings mean anything below zero.
     NotNegative,
     /// Any finite number.
     Finite,
@@ -87,14 +87,14 @@ impl std::fmt::Display for Range {
     }
 }
 
-/// The permitted values of a knob, its unit, and when it has an effect.
+/// The permitted values of a setting, its unit, and when it has an effect.
 #[derive(Clone, Copy, Debug)]
 pub struct Rule {
     /// Numbers that it takes.
     pub range: Range,
     /// Unit of its number; empty: none.
     pub unit: &'static str,
-    /// When it has an effect, beside its table's condition.
+    /// When it has an effect, next to its table's condition.
     pub when: When,
     /// Whether its table's condition does not count: it is what switches the table on.
     pub switch: bool,
@@ -168,13 +168,13 @@ pub(crate) const fn within(low: usize, high: usize) -> Rule {
 pub(crate) trait Table {
     /// Its subject, in a sentence.
     fn about(&self) -> &'static str;
-    /// When its knobs have an effect.
+    /// When its settings have an effect.
     fn when(&self) -> When;
-    /// Its knobs, in order. `table`: the name that the recipe gives it.
+    /// Its settings, in order. `table`: the name that the recipe gives it.
     fn knobs(&self, table: &'static str) -> Vec<Knob>;
-    /// The value of a knob; `None`: it has no such knob.
+    /// The value of a setting; `None`: it has no such setting.
     fn get(&self, field: &str) -> Option<toml::Value>;
-    /// Sets a knob. Errors: what its value must be, to stand behind "It must be"; an unknown name is our bug.
+    /// Sets a setting. Errors: what its value must be, to stand behind "It must be"; an unknown name is our bug.
     fn put(&mut self, field: &str, value: &toml::Value) -> Result<(), String>;
     /// Whether every number is in its range. Errors: the field, and what it must be.
     fn check(&self) -> Result<(), (&'static str, String)>;
@@ -280,7 +280,7 @@ macro_rules! settings {
 }
 pub(crate) use settings;
 
-/// Declares what a knob may be called: `Variant = "name",`.
+/// Declares what a setting may be called: `Variant = "name",`.
 macro_rules! choices {
     ($(#[$meta:meta])* pub enum $name:ident { $($(#[doc = $doc:literal])* $variant:ident = $word:literal,)* }) => {
         $(#[$meta])*

@@ -84,9 +84,9 @@ impl Trained {
         format::scene::read(&bytes).map_err(|e| e.at(path.display()))
     }
 
-    /// Draws the held-out views, compares them with their pictures and writes `results.json` and `per_view.json`.
+    /// Draws the held-out views, compares them with their images and writes `results.json` and `per_view.json`.
     ///
-    /// Errors: those of [`scene`](Self::scene); a picture that cannot be read.
+    /// Errors: those of [`scene`](Self::scene); an image that cannot be read.
     pub fn evaluate(&self) -> Result<Scores> {
         let store = Arc::new(ImageStore::new(self.capture.clone(), STORE_BYTES));
         let options = EvalOptions {
@@ -99,5 +99,5 @@ impl Trained {
     }
 }
 
-/// Memory for decoded pictures while they are measured: each is looked at once.
+/// Memory for decoded images while they are measured: each is looked at once.
 const STORE_BYTES: usize = 64 << 20;

@@ -26,7 +26,7 @@ mod own_motion;
 use own_motion::Sway;
 
 const CAMERAS: usize = 4;
-/// A swing takes two seconds; five pictures are of its first half.
+/// A swing takes two seconds; five images are of its first half.
 const TIMES: usize = 5;
 const FPS: f64 = 5.0;
 const SIZE: usize = 40;

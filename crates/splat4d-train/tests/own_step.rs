@@ -1,4 +1,4 @@
-//! What a caller may bring to a step from outside the library: an operation of upkeep, and an engine.
+//! What a caller may bring to a step from outside the library: an operation of maintenance, and an engine.
 
 use splat4d::Result;
 use splat4d::layers::{Layer, Scene};

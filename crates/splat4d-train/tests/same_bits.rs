@@ -1,7 +1,7 @@
 //! The same run makes the same bits as ever: short runs of every motion model, their checkpoints, what compression makes of
 //! them and their playback files against a table of hashes, a line for each named tensor.
 //!
-//! A change of behaviour on purpose records the table anew (`UPDATE_GOLDEN=1 cargo test -p splat4d-train --test
+//! A change of behaviour on purpose records the table again (`UPDATE_GOLDEN=1 cargo test -p splat4d-train --test
 //! same_bits`) and says in its commit why. SIMD levels round differently, so that each has lines of its own: the machine's
 //! own level a line a tensor, the levels below it one line a run, of models without networks (whose matrix products choose
 //! their instructions themselves). Runs for which a level has no line are passed over. Loss values, clocks and metadata
@@ -23,15 +23,15 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 const TABLE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/same_bits.txt");
-/// Pictures are this wide and high: two bins of the renderer, the last one not full.
+/// Images are this wide and high: two bins of the renderer, the last one not full.
 const SIZE: u32 = 40;
 const CAMERAS: usize = 4;
 const FRAMES: usize = 5;
-/// Knobs of every run: short, and with all that edits rows well within it.
+/// Settings of every run: short, and with all that edits rows well within it.
 const COMMON: &str = "iterations=36 num_pts=96 max_cap=150 init=random densification_interval=6 densify_from_iter=6 \
     densify_until_iter=30 densify_grad_threshold=1e-5 checkpoint_interval=1000";
 
-/// Runs by name: what they set beside [`COMMON`].
+/// Runs by name: what they set next to [`COMMON`].
 const RUNS: [(&str, &str); 26] = [
     ("still", "motion=still sh_degree=2 sh_degree_interval=7 opacity_reset_interval=8"),
     ("still-mcmc", "motion=still strategy=mcmc batch_size=2 antialias=true"),
@@ -100,7 +100,7 @@ fn hash(bytes: &[u8]) -> u64 {
     bytes.iter().fold(0xcbf2_9ce4_8422_2325, |h, b| (h ^ u64::from(*b)).wrapping_mul(0x0100_0000_01b3))
 }
 
-/// Four cameras around a ball that moves and pulses, in whole numbers only: the same pictures on every machine.
+/// Four cameras around a ball that moves and pulses, in whole numbers only: the same images on every machine.
 fn write_capture(folder: &Path) {
     for camera in 0..CAMERAS {
         for sub in ["images", "masks", "flow"] {

@@ -49,7 +49,7 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-/// Grey pictures from three sides at two times: what they show does not matter here.
+/// Grey images from three sides at two times: what they show does not matter here.
 struct Grey(Vec<Camera>);
 
 impl Frames for Grey {

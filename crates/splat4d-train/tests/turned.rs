@@ -1,4 +1,4 @@
-//! A turned world needs no new training: what was learnt of a capture explains the same pictures of the world turned,
+//! A turned world needs no new training: what was learnt of a capture explains the same images of the world turned,
 //! shifted and scaled once its layer's frame says so, whatever the model. Models that see no absolute coordinates may also be
 //! asked in the turned world itself; the others, asked so, fail.
 
@@ -21,7 +21,7 @@ const FRAMES: usize = 6;
 /// Decibels that rounding may make.
 const ROUNDING: f64 = 0.01;
 /// Decibels that are lost at least where a model is asked for what it did not learn: its motion goes the wrong way, and what
-/// it draws of it in 300 steps is little. A picture of a world that was not turned loses more.
+/// it draws of it in 300 steps is little. An image of a world that was not turned loses more.
 const LOST: f64 = 0.25;
 
 /// Where the ball is, in units of the world.
@@ -35,7 +35,7 @@ fn pose(camera: usize) -> Se3 {
     Se3::look_at([3.0 * angle.sin(), 0.4, -3.0 * angle.cos()], [0.0; 3], [0.0, -1.0, 0.0])
 }
 
-/// The take of a ball in a world that `g` turned: pictures are the same for every `g`.
+/// The take of a ball in a world that `g` turned: images are the same for every `g`.
 fn write_capture(folder: &Path, g: &Sim3) {
     let mut cameras = Vec::new();
     for camera in 0..CAMERAS {
@@ -132,7 +132,7 @@ fn a_turned_world_needs_no_new_training() {
         train(capture, recipe.clone(), &run, &TrainOptions::default(), &AtomicBool::new(false), &mut |_| {}).unwrap();
         let scene = splat4d::format::scene::read(&std::fs::read(run.join("scene.safetensors")).unwrap()).unwrap();
         let before = psnr(&scene, &here, &recipe);
-        // Turned, shifted and scaled by the frame: the same pictures, and by no frame another place.
+        // Turned, shifted and scaled by the frame: the same images, and by no frame another place.
         let mut framed = scene.clone();
         framed.layers[0].frame = grown;
         let after = psnr(&framed, &larger, &recipe);
@@ -140,7 +140,7 @@ fn a_turned_world_needs_no_new_training() {
         assert!((after - before).abs() < ROUNDING, "{motion}: {before} and {after} dB");
         assert!(psnr(&scene, &larger, &recipe) < before - LOST, "{motion}: nothing was turned");
         // Gaussians and nodes stand in the turned world, and the model is asked there. What nodes know of their surroundings is
-        // taken anew, as it is wherever nodes are moved: also in the world that was not turned, since nodes learn.
+        // taken again, as it is wherever nodes are moved: also in the world that was not turned, since nodes learn.
         let ask = |g: &Sim3, capture: &Path| {
             let mut asked = moved(&scene, g);
             if let Some(e) = context {

@@ -1,4 +1,5 @@
-//! The renderer's stages, one by one and together, on 30,000 made-up Gaussians with spherical harmonics of degree 3 at
+//! The renderer's stages, one by one and together, on 30,000 synthetic Gaussians with spherical harmonics of degree
+//! 3 at
 //! 400x400, on one and two threads: `cargo bench -p splat4d`. `splat4d bench` measures real scenes against the roofline.
 
 use divan::{Bencher, black_box};
@@ -30,7 +31,7 @@ struct Made {
     out: Table<f32>,
     sh: Table<f32>,
     camera: Camera,
-    /// A gradient to the picture.
+    /// A gradient to the image.
     grad: Planes<f32>,
 }
 

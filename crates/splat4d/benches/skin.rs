@@ -1,4 +1,4 @@
-//! Linear blend skinning of 100,000 Gaussians over 512 nodes, weights included, beside the bytes
+//! Linear blend skinning of 100,000 Gaussians over 512 nodes, weights included, next to the bytes
 //! that skinning reads and writes: `cargo bench -p splat4d --bench skin`.
 
 use divan::{Bencher, black_box};

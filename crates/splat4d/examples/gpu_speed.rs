@@ -21,7 +21,7 @@ fn main() -> splat4d::Result<()> {
 
     let rng = Rng::new(1, "speed", 0);
     let (mut out, mut sh) = (Table::<f32>::new(&SPLAT_COLUMNS, n), Table::<f32>::new(&[("sh", 48)], n));
-    // The picture is covered as often whatever their number; about 2 px of standard deviation at half a million.
+    // The image is covered as often whatever their number; about 2 px of standard deviation at half a million.
     let scale = 0.004 * (500_000.0 / n as f64).sqrt();
     for j in 0..n {
         let r = rng.fork(j as u64);

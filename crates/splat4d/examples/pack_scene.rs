@@ -16,9 +16,9 @@ use std::sync::Arc;
 
 /// Shortest span of time that gets a node of its own, seconds.
 const SHORTEST: f64 = 0.2;
-/// Made-up Gaussians.
+/// Synthetic Gaussians.
 const COUNT: usize = 120_000;
-/// Pixels across and down of the pictures that are compared.
+/// Pixels across and down of the images that are compared.
 const SIZE: [usize; 2] = [480, 360];
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -242,7 +242,7 @@ fn stage(nodes: &[Node], up: [f64; 3]) -> ([f64; 3], [f64; 3], f64) {
     (std::array::from_fn(|k| middle[k] + radius * (0.4 * up[k] - 2.0 * side[k])), middle, radius)
 }
 
-/// PSNR of the packed scene's pictures against the scene's, over several views and times.
+/// PSNR of the packed scene's images against the scene's, over several views and times.
 fn compare(scene: &Scene<f32>, back: &Scene<f32>, draft: &Draft) {
     let (_, middle, radius) = stage(&draft.nodes, scene.up);
     let (mut worst, mut sum, mut count) = (f64::INFINITY, 0.0, 0.0);

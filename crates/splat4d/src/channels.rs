@@ -1,4 +1,5 @@
-//! What pictures show beside colour, alpha and depth: normals, labels, features, lives and uncertainty, each as further channels of the
+//! What images show next to colour, alpha and depth: normals, labels, features, lives and uncertainty, each as
+//! further channels of the
 //! renderer ([`Shot::extra`](crate::render::Shot::extra)) with a last column that is 1 where a splat has a value, so that
 //! [`divided`](crate::flow::divided) gives the mean over what a pixel shows. Velocity and flow are in [`flow`](crate::flow).
 
@@ -10,7 +11,7 @@ use crate::scene::{Camera, Table, Time, features, labels};
 
 /// The least gap between the two smallest variances, as a share of the largest, at which the shortest axis is one.
 const LEAST_GAP: f64 = 1e-3;
-/// Standard deviation of a pixel's error that [`uncertainties`] takes for granted: pictures of 26 dB.
+/// Standard deviation of a pixel's error that [`uncertainties`] takes for granted: images of 26 dB.
 pub const PIXEL_NOISE: f64 = 0.05;
 
 /// Unit normals, the shortest axes of the splats turned towards the camera, in camera axes (x right, y down, z forward):
@@ -116,7 +117,7 @@ pub fn lifetimes(scene: &Scene<f32>) -> Vec<Vec<f32>> {
     scene.layers.iter().map(|l| l.spans().into_iter().map(length).collect()).collect()
 }
 
-/// A picture that says where Gaussians are.
+/// An image that says where Gaussians are.
 #[derive(Clone, Copy, Debug)]
 pub struct Witness<'a> {
     /// From where.
@@ -125,10 +126,11 @@ pub struct Witness<'a> {
     pub t: Time,
 }
 
-/// The standard deviation of each Gaussian's place that its pictures leave open, scene units, by layer and row:
-/// √(tr (Σ_views H/σ² + I/ρ²)⁻¹ / 3), H the mean's 3x3 block of the Fisher information of a picture
+/// The standard deviation of each Gaussian's place that its images leave open, scene units, by layer and row:
+/// √(tr (Σ_views H/σ² + I/ρ²)⁻¹ / 3), H the mean's 3x3 block of the Fisher information of an image
 /// ([`Sensitivity::fisher`](crate::render::Sensitivity::fisher)), σ [`PIXEL_NOISE`] and ρ `reach`, how far a Gaussian may be
-/// from where it is when no picture shows it. Each witness stands for `share` pictures. Other Gaussians are taken for known,
+/// from where it is when no image shows it. Each witness stands for `share` images. Other Gaussians are taken for
+/// known,
 /// so that it says too little where several could explain a pixel.
 ///
 /// Source: the Fisher blocks of PUP 3D-GS (Hanson et al. 2025), read as the precision of a Laplace approximation with a
@@ -185,7 +187,7 @@ mod tests {
         Camera::with_fov_y(Se3::look_at([0.0, 0.0, 4.0], [0.0; 3], [0.0, 1.0, 0.0]), 0.7, 48, 32)
     }
 
-    /// Two discs that face the camera: one to the left of the picture, one to the right and farther.
+    /// Two discs that face the camera: one to the left of the image, one to the right and farther.
     fn scene() -> Scene<f32> {
         let mut p = Params::new(2, 1, LifeKind::GaussHalf.columns());
         for (r, x) in [(0, -0.6), (1, 0.6)] {
@@ -251,9 +253,9 @@ mod tests {
         };
         let (none, one, both) = (of(&[]), of(&[(&front, 0.5)]), of(&[(&front, 0.5), (&side, 0.5)]));
         assert!((none[0] - 10.0).abs() < 1e-4 && (none[1] - 10.0).abs() < 1e-4);
-        // One picture says little of the depth, a second from the side says it.
+        // One image says little of the depth, a second from the side says it.
         assert!(one[0] < none[0] && one[0] > 2.0 * both[0], "{one:?} {both:?}");
-        // What lives for a moment is not known better by a picture of another time.
+        // What lives for a moment is not known better by an image of another time.
         let late = of(&[(&front, 0.5), (&side, 0.0)]);
         assert!(late[0] < 0.5 * one[0] && (late[1] / one[1] - 1.0).abs() < 1e-4, "{late:?}");
     }

@@ -66,7 +66,8 @@ fn or_cpu(config: RenderConfig, gpu: Result<(Box<dyn Backend>, String)>) -> Open
     }
 }
 
-/// The device that was asked for, with the CPU beside it: what the GPU cannot draw is drawn by the CPU, picture by picture,
+/// The device that was asked for, with the CPU next to it: what the GPU cannot draw is drawn by the CPU, image by
+/// image,
 /// and a GPU that fails is left for good. Each is told once ([`Backend::notice`]), and neither is an error.
 pub fn open_to_train(device: Device, config: RenderConfig) -> Opened {
     let opened = open(device, config, &Wanted { backward: true, ..Wanted::default() }, Tables::Changing);
@@ -95,12 +96,12 @@ struct WithCpu {
     /// Until it fails.
     other: Option<Box<dyn Backend>>,
     cpu: Box<dyn Backend>,
-    /// Whether the last picture is the other's.
+    /// Whether the last image is the other's.
     drawn_by_other: bool,
     /// What it was refused for.
     refused: Vec<String>,
     notices: Vec<String>,
-    /// Where a picture that is drawn again goes.
+    /// Where an image that is drawn again goes.
     again: Image,
     name: String,
 }
@@ -226,7 +227,7 @@ impl Backend for WithCpu {
 
 /// Splats of the self-test.
 const TEST_SPLATS: usize = 200;
-/// Width and height of its picture: no whole tiles.
+/// Width and height of its image: no whole tiles.
 const TEST_SIZE: [usize; 2] = [75, 45];
 /// Largest difference of a channel, and of a gradient as a share of its length, at which a device is trusted: far above
 /// roundings and a splat at the α cut-off, far below any mistake.

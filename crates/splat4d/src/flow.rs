@@ -2,7 +2,7 @@
 //!
 //! A motion model already *is* scene flow; everything here is written once over [`Motion::at`] and
 //! [`Motion::velocity`](crate::motion::Motion::velocity) and drawn as further channels of the renderer, with the blend
-//! weights w_i = α_i T_i of the first instant's picture.
+//! weights w_i = α_i T_i of the first instant's image.
 //!
 //! [`Motion::at`]: crate::motion::Motion::at
 
@@ -36,7 +36,7 @@ pub struct Flow<F = f32> {
     pub vectors: Planes<F>,
     /// Σ w_i over splats that have a vector, [1, h, w]; where it is small the vector means nothing.
     pub weight: Planes<F>,
-    /// The first instant's picture.
+    /// The first instant's image.
     pub image: Image<F>,
 }
 
@@ -67,7 +67,7 @@ pub fn render_velocity<F: Real>(scene: &Scene<F>, shot: Shot<'_>, renderer: &mut
     draw(&scene.splats(&instant), shot.camera, scene.background, &extra, renderer)
 }
 
-/// [`velocities`] as further channels of a picture: [splats, 4], x, y, z and 1 ([`divided`]).
+/// [`velocities`] as further channels of an image: [splats, 4], x, y, z and 1 ([`divided`]).
 ///
 /// Panics: `instant` is not this scene's.
 pub fn velocity_columns<F: Real>(scene: &Scene<F>, instant: &Evaluation<F>) -> Table<F> {
@@ -93,7 +93,8 @@ pub fn render_flow<F: Real>(scene: &Scene<F>, from: Shot<'_>, to: Shot<'_>, rend
     draw(&scene.splats(&start), from.camera, scene.background, &extra, renderer)
 }
 
-/// The way of every splat on the screen as further channels of a picture: [splats, 3], u, v in pixels and 1, or zeros for a
+/// The way of every splat on the screen as further channels of an image: [splats, 3], u, v in pixels and 1, or zeros
+/// for a
 /// splat that is behind a camera ([`divided`]).
 ///
 /// Panics: `start` is not this scene's.

@@ -22,7 +22,7 @@ const BLOCK: usize = crate::format::playback::BLOCK_GAUSSIANS;
 /// Memory for unpacked pages unless told, bytes.
 pub const DEFAULT_BUDGET: usize = 1 << 30;
 
-/// A picture of a scene at a time, on the CPU, over the scene's own background. Whoever draws many keeps a [`Player`], a
+/// An image of a scene at a time, on the CPU, over the scene's own background. Whoever draws many keeps a [`Player`], a
 /// [`Backend`](crate::render::Backend) and an [`Image`].
 ///
 /// Errors: a driver's; the CPU has none.

@@ -39,7 +39,7 @@ pub const RASTERIZE_BACK_SUBGROUP: &str = include_str!("gpu/rasterize_back_subgr
 pub const RASTERIZE_BACK_VECTOR: &str = include_str!("gpu/rasterize_back_vector.wgsl");
 /// The blend's way back: a record a (tile, splat) pair. After [`BLEND_BACK`].
 pub const RASTERIZE_BACK: &str = include_str!("gpu/rasterize_back.wgsl");
-/// A picture compared with its truth: L1, D-SSIM and their gradient: `moments`, `gradient`.
+/// An image compared with its truth: L1, D-SSIM and their gradient: `moments`, `gradient`.
 pub const LOSS: &str = include_str!("gpu/loss.wgsl");
 /// Learnable rows at time t, and their lives. Reads `params`, which whoever includes it binds.
 pub const LEARNT: &str = include_str!("gpu/learnt.wgsl");

@@ -15,7 +15,7 @@ const ZERO: f64 = 32_768.0;
 const STEPS: f64 = 64.0;
 /// Flow of fewer pixels is that of things that stand still.
 const MOVING: f64 = 1.0;
-/// A picture that is less opaque has no flow to compare.
+/// An image that is less opaque has no flow to compare.
 const OPAQUE: f32 = 0.5;
 
 /// Mean end-point errors, pixels.
@@ -30,7 +30,7 @@ pub(crate) struct FlowError {
 /// A frame of the capture and the file with its flow.
 pub(crate) type Truth = (usize, PathBuf);
 
-/// The frames whose flow is known: a frame a picture, whatever split it belongs to.
+/// The frames whose flow is known: a frame an image, whatever split it belongs to.
 pub(crate) fn truths(capture: &Capture) -> Vec<Truth> {
     let folder = capture.root.join("truth").join("flow");
     if !folder.is_dir() {
@@ -49,7 +49,7 @@ pub(crate) fn truths(capture: &Capture) -> Vec<Truth> {
 
 /// The scene's error over all of them; `None` where there is no truth.
 ///
-/// Errors: a file that is no such picture, or of another size than its camera's.
+/// Errors: a file that is no such image, or of another size than its camera's.
 pub(crate) fn error(
     scene: &Scene<f32>,
     capture: &Capture,

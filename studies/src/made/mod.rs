@@ -18,9 +18,9 @@ use splat4d_cli::files;
 use std::path::Path;
 use world::{Pinhole, V3};
 
-/// The generator's version: drawings of another are drawn anew.
+/// The generator's version: drawings of another are drawn again.
 pub(crate) const VERSION: usize = 2;
-/// Codes of depth a world unit, in pictures of 16 bits: depths to 16 units.
+/// Codes of depth a world unit, in images of 16 bits: depths to 16 units.
 const DEPTH_CODES: f64 = 4096.0;
 /// Codes of flow a pixel, and the code of none (KITTI 2012).
 const FLOW_CODES: f64 = 64.0;
@@ -36,7 +36,7 @@ const SEEN: f64 = 0.01;
 /// Error of a point along each axis, pixels at its distance, at most: what good structure from motion has.
 const NOISE: f64 = 0.5;
 
-/// Draws a made-up capture into a folder. `capture.json` is written last: where it is, all is.
+/// Draws a synthetic capture into a folder. `capture.json` is written last: where it is, all is.
 ///
 /// Errors: there is none of this name; files that cannot be written.
 pub(crate) fn write(name: &str, folder: &Path) -> anyhow::Result<()> {
@@ -62,7 +62,7 @@ pub(crate) fn write(name: &str, folder: &Path) -> anyhow::Result<()> {
     Ok(files::write(&folder.join("capture.json"), (text + "\n").as_bytes())?)
 }
 
-/// Depth and flow of the pictures to train on. Flow lies in `truth/`: it is measured with, not listed.
+/// Depth and flow of the images to train on. Flow lies in `truth/`: it is measured with, not listed.
 fn write_truth(scene: &Scene, folder: &Path) -> anyhow::Result<()> {
     let training = scene.viewers.iter().enumerate().filter(|(_, v)| !v.held);
     for (c, viewer) in training {
@@ -148,8 +148,8 @@ fn description(name: &str, scene: &Scene) -> Value {
 /// A coloured point, in the world's units.
 type Point = (V3, [u8; 3]);
 
-/// A sparse cloud as structure from motion would find it: random pixels of the training pictures of the first moment (of
-/// a moving camera: of all moments), kept where a second training picture sees the place from a different direction.
+/// A sparse cloud as structure from motion would find it: random pixels of the training images of the first moment (of
+/// a moving camera: of all moments), kept where a second training image sees the place from a different direction.
 fn cloud(scene: &Scene) -> Vec<Point> {
     let training = scene.viewers.iter().filter(|v| !v.held);
     let views: Vec<(&Pinhole, usize)> =
@@ -202,7 +202,7 @@ fn ply(points: &[Point], units: f64) -> Vec<u8> {
     out
 }
 
-/// `studies make`: one of the made-up captures.
+/// `studies make`: one of the synthetic captures.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
@@ -245,7 +245,7 @@ mod tests {
         assert!(write("two-walls", Path::new("nowhere")).unwrap_err().to_string().contains("one-wall"));
     }
 
-    /// What every name is made of, without drawing it whole: a small picture, the points and the description.
+    /// What every name is made of, without drawing it whole: a small image, the points and the description.
     fn print_of(name: &str) -> String {
         let scene = scene(name).unwrap();
         let (viewer, moment) = (&scene.viewers[scene.viewers.len() - 1], scene.moments / 2);
@@ -329,7 +329,7 @@ hand-held-60 36359dac295000bb
         let angle = dot(own.cam_from_world.rotation[2], told.cam_from_world.rotation[2]).acos().to_degrees();
         assert!((angle - 3.0).abs() < 1e-9 && norm(sub(own.center(), told.center())) < 1e-12);
         assert!(told.cam_from_world.orthogonality_error() < 1e-12 && !camera.held);
-        // What enters is in no picture of the first half, and in all of the last.
+        // What enters is in no image of the first half, and in all of the last.
         let enters = of("enters");
         let number = enters.world.things.len() - 1;
         let shown = |viewer: &Viewer, moment: usize| {

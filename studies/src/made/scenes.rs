@@ -1,10 +1,11 @@
-//! The made-up captures: what is there, who looks at it, and what is hard about it. Nothing here was chosen by how well it
+//! The synthetic captures: what is there, who looks at it, and what is hard about it. Nothing here was chosen by how
+//! well it
 //! is learnt.
 
 use super::world::{Pinhole, Shape, Texture, Thing, V3, World, sin_cos};
 use splat4d::math::Se3;
 
-/// Pictures, pixels; the focal length gives 59° across, as an ordinary camera has it.
+/// Images, pixels; the focal length gives 59° across, as an ordinary camera has it.
 const SIZE: [usize; 2] = [160, 120];
 const FOCAL: f64 = 140.0;
 /// Distance of the cameras from what they look at, scene units.
@@ -31,7 +32,7 @@ const WRONG_CAMERA: usize = 4;
 const SHORT_PATH: usize = 12;
 const LONG_PATH: usize = 60;
 
-/// A camera of a made-up capture.
+/// A camera of a synthetic capture.
 #[derive(Clone, Debug)]
 pub(crate) struct Viewer {
     /// Its pose at every moment, or the one that it keeps.
@@ -64,11 +65,11 @@ pub(crate) struct Scene {
     pub units: f64,
     /// Whether points of moving things belong to the cloud.
     pub moving_points: bool,
-    /// Whether depth and flow of the pictures to train on are written beside them.
+    /// Whether depth and flow of the images to train on are written next to them.
     pub truth: bool,
 }
 
-/// Names of the made-up captures, each with what is hard about it.
+/// Names of the synthetic captures, each with what is hard about it.
 pub(crate) const NAMES: [(&str, &str); 11] = [
     ("far-background", "an object before a background at a hundred times the cameras' distance"),
     ("one-wall", "one moment of one textured wall, seen from the front, and little else"),
@@ -83,7 +84,7 @@ pub(crate) const NAMES: [(&str, &str); 11] = [
     ("hand-held-60", "the same with sixty moments"),
 ];
 
-/// A made-up capture by its name.
+/// A synthetic capture by its name.
 pub(crate) fn scene(name: &str) -> Option<Scene> {
     let room = || Scene {
         world: room(),
@@ -152,7 +153,7 @@ fn bounces(at: f64) -> V3 {
     [-1.3 + 2.6 * at, 0.3 + 2.4 * half * (1.0 - half), 0.6]
 }
 
-/// Above all pictures until half time, on the floor at nine tenths of the take.
+/// Above all images until half time, on the floor at nine tenths of the take.
 fn falls(at: f64) -> V3 {
     let fall = ((at - 0.5) / 0.4).clamp(0.0, 1.0);
     [-0.1, 3.2 - 2.85 * fall, 0.9]

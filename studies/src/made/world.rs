@@ -1,4 +1,4 @@
-//! A made-up world that is looked at by casting rays: boxes and balls with textures in space, cameras at exact poses.
+//! A synthetic world that is looked at by casting rays: boxes and balls with textures in space, cameras at exact poses.
 //!
 //! Everything is built from + − × ÷ √ and integer hashes, which give the same bits on every machine.
 
@@ -7,7 +7,7 @@ use splat4d::math::{Rng, Se3};
 
 /// A place, a direction or a colour.
 pub(crate) type V3 = [f64; 3];
-/// A place in a picture, pixels.
+/// A place in an image, pixels.
 pub(crate) type V2 = [f64; 2];
 
 /// Rays a pixel in each direction: their mean is the pixel.
@@ -216,14 +216,14 @@ impl Pinhole {
         self.cam_from_world.inverse().translation
     }
 
-    /// The direction (of length 1) in which a place in the picture lies.
+    /// The direction (of length 1) in which a place in the image lies.
     pub(crate) fn ray(&self, [x, y]: [f64; 2]) -> V3 {
         let [width, height] = self.size.map(|s| s as f64);
         let own = [(x - 0.5 * width) / self.focal, (y - 0.5 * height) / self.focal, 1.0];
         normalize(mat_vec(&transpose(&self.cam_from_world.rotation), own))
     }
 
-    /// Where a point is in the picture; `None`: it is not in it.
+    /// Where a point is in the image; `None`: it is not in it.
     pub(crate) fn project(&self, point: V3) -> Option<[f64; 2]> {
         let p = self.cam_from_world.apply(point);
         let [width, height] = self.size.map(|s| s as f64);
@@ -232,7 +232,7 @@ impl Pinhole {
         (p[2] > 0.0 && inside).then_some(at)
     }
 
-    /// The picture at a share of the take, sRGB in 8 bits; `gain` multiplies every value.
+    /// The image at a share of the take, sRGB in 8 bits; `gain` multiplies every value.
     pub(crate) fn picture(&self, world: &World, at: f64, gain: f64) -> Vec<u8> {
         let eye = self.center();
         let mut out = Vec::with_capacity(3 * self.size[0] * self.size[1]);

@@ -17,9 +17,9 @@ const REPOSITORY: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/..");
 /// How thoroughly the suite measures.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum Tier {
-    /// Small pictures and few steps: all captures in some ten minutes
+    /// Small images and few steps: all captures in some ten minutes
     Quick,
-    /// For the record: larger pictures, more steps, and the playback files
+    /// For the record: larger images, more steps, and the playback files
     Full,
 }
 
@@ -56,17 +56,17 @@ pub(crate) struct Entry {
     data: Option<PathBuf>,
     /// A folder of the repository.
     bundled: Option<PathBuf>,
-    /// The name of a made-up capture.
+    /// The name of a synthetic capture.
     made: Option<String>,
     /// Whether its initial cloud is used.
     #[serde(default = "yes")]
     points: bool,
     /// Held-out views; none: the capture's own.
     pub hold_out: Option<String>,
-    /// Factor by which pictures are reduced.
+    /// Factor by which images are reduced.
     #[serde(default = "whole")]
     pub downscale: ByTier,
-    /// Further knobs of the recipe that the capture needs.
+    /// Further settings of the recipe that the capture needs.
     #[serde(default)]
     pub set: Vec<String>,
 }

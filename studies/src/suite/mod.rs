@@ -64,7 +64,7 @@ pub(crate) struct Args {
     /// A list of captures [default: studies/suite.toml as it was when the program was built]
     #[arg(long, value_name = "FILE")]
     list: Option<PathBuf>,
-    /// Set a knob of every recipe; may be repeated
+    /// Set a setting of every recipe; may be repeated
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
     /// Train each for four times the steps too, and say where that costs quality
@@ -86,12 +86,12 @@ struct Found {
     steps: usize,
     /// Of the program, the recipe and the capture's place.
     print: String,
-    /// Why there are no numbers.
+    /// Why there are not finite.
     refused: Option<String>,
     motion: String,
-    /// Held-out views: whole pictures, where things move, and (from these two and the share that moves) elsewhere.
+    /// Held-out views: whole images, where things move, and (from these two and the share that moves) elsewhere.
     psnr: Option<f64>,
-    /// Whole pictures after each camera's colour matrix.
+    /// Whole images after each camera's colour matrix.
     psnr_cc: Option<f64>,
     psnr_dynamic: Option<f64>,
     psnr_still: Option<f64>,
@@ -317,7 +317,7 @@ fn trained(order: &Order<'_>, run: &Path, blank: Found, stop: &AtomicBool, conso
     })
 }
 
-/// PSNR where nothing moves, by the means of whole pictures and of what moves.
+/// PSNR where nothing moves, by the means of whole images and of what moves.
 fn elsewhere(whole: Option<f64>, moving: Option<f64>, share: Option<f64>) -> Option<f64> {
     let error = |psnr: f64| 10f64.powf(-0.1 * psnr);
     let (whole, moving, share) = (error(whole?), error(moving?), share?);
@@ -325,10 +325,12 @@ fn elsewhere(whole: Option<f64>, moving: Option<f64>, share: Option<f64>) -> Opt
     (rest > 0.0 && rest.is_finite()).then(|| -10.0 * rest.log10())
 }
 
-/// What a run is measured on, opened when it has begun: points that it found in its pictures say from how near its cameras see.
+/// What a run is measured on, opened when it has begun: points that it found in its images say from how near its
+/// cameras see.
 struct Judges {
     whole: Judge,
-    /// The same at half the size. While pictures of half the size are trained on, they are what training views are: at full
+    /// The same at half the size. While images of half the size are trained on, they are what training views are: at
+    /// full
     /// size a scene that has never seen one gets worse and better at random.
     coarse: Judge,
 }

@@ -27,7 +27,7 @@ pub(crate) struct Fall {
     pub to: usize,
 }
 
-/// The largest fall from one probe to a later one. Falls across `change` (the step at which pictures change their
+/// The largest fall from one probe to a later one. Falls across `change` (the step at which images change their
 /// resolution) do not count: before it, training views are of half the size.
 pub(crate) fn largest_fall(probes: &[Probe], change: usize) -> Option<Fall> {
     let (coarse, fine) = probes.split_at(probes.partition_point(|p| p.step <= change));
@@ -87,7 +87,7 @@ mod tests {
             assert_eq!(largest_fall(&dip, change), Some(Fall { db: 3.0, from: 20, to: 40 }), "{change}");
         }
         assert_eq!(largest_fall(&[], 10), None);
-        // From 22 to 27 and on to 26.9: what the pictures' change cost does not count.
+        // From 22 to 27 and on to 26.9: what the images' change cost does not count.
         let fall = largest_fall(&dip, 20).unwrap();
         assert!((fall.db - 2.5).abs() < 1e-12 && fall.from == 30);
         let fall = largest_fall(&dip, 30).unwrap();

@@ -59,7 +59,7 @@ fn a_scene_and_the_file_of_it_are_measured_alike() {
         assert!((side.active_mean / alive - 1.0).abs() < 0.05 && side.active_max == 200, "half live: {side:?}");
         assert!(side.fps > 0.0 && side.raster_fps > side.fps && side.decode_ms > 0.0 && side.pairs > 100.0, "{side:?}");
     }
-    // Both draw the same picture, so the blend loop has about the same to do.
+    // Both draw the same image, so the blend loop has about the same to do.
     assert!((scene_side.pairs / file.pairs - 1.0).abs() < 0.1, "{sides:?}");
     let text = serde_json::to_string(&sides).unwrap();
     assert_eq!(serde_json::from_str::<Vec<Side>>(&text).unwrap().len(), 2);

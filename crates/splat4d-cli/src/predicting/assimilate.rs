@@ -18,7 +18,7 @@ use std::sync::Arc;
 
 /// Forecasts one frame ahead, each from the corrected frame before; what they are worth.
 ///
-/// Errors: a model without nodes of its own, no pictures of training cameras in the future.
+/// Errors: a model without nodes of its own, no images of training cameras in the future.
 pub(super) fn run(
     work: &Work,
     of: &Forecast,
@@ -59,7 +59,7 @@ pub(super) fn run(
     Ok(worth)
 }
 
-/// The pictures that training cameras take of one frame of the future, at the time that the filter asks at.
+/// The images that training cameras take of one frame of the future, at the time that the filter asks at.
 struct NewFrame {
     pictures: Dataset,
     time: f64,

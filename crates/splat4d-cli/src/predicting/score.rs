@@ -1,4 +1,4 @@
-//! Forecasts beside the pictures of what really came.
+//! Forecasts next to the images of what really came.
 
 use super::{Forecast, Work};
 use crate::console::Console;
@@ -17,21 +17,21 @@ use splat4d_train::eval::tracks;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// A pixel has changed where a channel differs by more from the last observed picture (the metrics' threshold of motion).
+/// A pixel has changed where a channel differs by more from the last observed image (the metrics' threshold of motion).
 const CHANGED: f32 = 0.05;
 /// Nodes that carry a true point.
 const CARRIERS: usize = 4;
-/// dB at which equal pictures stand: 8 bits tell no more.
+/// dB at which equal images stand: 8 bits tell no more.
 const MOST_DB: f64 = 99.0;
 
-/// A picture of the future, and the last observed one of the same camera.
+/// An image of the future, and the last observed one of the same camera.
 struct View {
     frame: usize,
     horizon: usize,
     before: Option<usize>,
 }
 
-/// The pictures that forecasts are compared with.
+/// The images that forecasts are compared with.
 pub(super) struct Views {
     views: Vec<View>,
     /// True paths of points: \[frames]\[points], from the first observed frame on.
@@ -82,7 +82,7 @@ fn square(db: f64) -> f64 {
 }
 
 impl Views {
-    /// Pictures of the future of cameras that training never saw, where there are such; else of all.
+    /// Images of the future of cameras that training never saw, where there are such; else of all.
     pub(super) fn new(work: &Work) -> Result<Self> {
         let capture = &work.capture;
         let camera = |i: &usize| capture.frames[*i].camera;
@@ -108,12 +108,12 @@ impl Views {
         self.views.len()
     }
 
-    /// Frames of the horizon that there are pictures of.
+    /// Frames of the horizon that there are images of.
     pub(super) fn pictured(&self) -> usize {
         self.views.iter().map(|v| v.horizon).collect::<BTreeSet<_>>().len()
     }
 
-    /// Draws a scene from where pictures were taken, and compares.
+    /// Draws a scene from where images were taken, and compares.
     pub(super) fn cases(&self, work: &Work, scene: &Scene<f32>) -> Result<Vec<Case>> {
         let mut painter = Painter::new(scene, scene.background, work.antialias, false);
         let mut out = Vec::new();
@@ -198,7 +198,7 @@ fn changed(now: &Planes<f32>, before: &Planes<f32>) -> Vec<bool> {
     (0..now.pixels()).map(differs).collect()
 }
 
-/// Two pictures of one size side by side.
+/// Two images of one size side by side.
 fn beside(left: &Rgb, right: &Rgb) -> Rgb {
     let rows = left.data.chunks_exact(3 * left.width).zip(right.data.chunks_exact(3 * right.width));
     let data = rows.flat_map(|(l, r)| [l, r].concat()).collect();

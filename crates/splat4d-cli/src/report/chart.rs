@@ -138,7 +138,7 @@ pub(crate) fn lines(series: &[Series], x_label: &str, unit: &str) -> Option<Stri
     Some(svg)
 }
 
-/// The colours of the page's style sheet, for pictures that stand alone.
+/// The colours of the page's style sheet, for images that stand alone.
 const STYLE: &str = "svg{--c0:#b4501e;--c1:#2463a8;--c2:#3d8a4d;--c3:#8a56ac;--c4:#0f8a80;--c5:#5c6b73;--soft:#6d6a66;\
 --line:#e6e2dc;font-family:sans-serif}@media(prefers-color-scheme:dark){svg{--c0:#f08c4e;--c1:#6fb1f2;--c2:#7cc68d;\
 --c3:#c69be4;--c4:#5fd0c5;--c5:#9fb0ba;--soft:#a09a92;--line:#35322e}}.grid{stroke:var(--line)}\
@@ -168,7 +168,7 @@ pub fn file(series: &[Series], x_label: &str, unit: &str) -> Option<String> {
     Some(svg.replace("</svg>", &format!("{names}</svg>")))
 }
 
-/// One horizontal bar a row: label, value, and the text beside it. Bars start at `from`.
+/// One horizontal bar a row: label, value, and the text next to it. Bars start at `from`.
 pub(crate) fn bars(rows: &[(String, f64, String)], from: f64, label: &str) -> Option<String> {
     const ROW: f64 = 24.0;
     const LABEL: f64 = 128.0;

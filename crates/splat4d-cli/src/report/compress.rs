@@ -1,5 +1,5 @@
-//! What compression did, as part of a run's page: before and after side by side, where the bytes are, the pictures of
-//! both, and how it was done. All of it comes from `compress.json`, the file itself and the two runs' pictures.
+//! What compression did, as part of a run's page: before and after side by side, where the bytes are, the images of
+//! both, and how it was done. All of it comes from `compress.json`, the file itself and the two runs' images.
 
 use super::chart::{Series, bars, escape, lines, short};
 use super::{panels, pictures};
@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
-/// Held-out views of which both pictures are shown.
+/// Held-out views of which both images are shown.
 const VIEWS: usize = 4;
 
 /// The content of `compress.json`.
@@ -24,9 +24,9 @@ pub(crate) struct Compressed {
     /// The run that was compressed.
     #[serde(with = "splat4d_train::path_text")]
     pub source: PathBuf,
-    /// 0, 1 or 2; `None` where knobs were told instead.
+    /// 0, 1 or 2; `None` where settings were told instead.
     pub level: Option<u8>,
-    /// Every knob and its value.
+    /// Every setting and its value.
     pub settings: Value,
     /// The source.
     pub before: Side,

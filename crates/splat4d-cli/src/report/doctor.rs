@@ -1,4 +1,4 @@
-//! `doctor.html`: what is wrong with a capture, worst first, and every camera's picture and figures.
+//! `doctor.html`: what is wrong with a capture, worst first, and every camera's image and figures.
 
 use super::chart::escape;
 use super::{STYLE, pictures};

@@ -260,7 +260,7 @@ fn scores(out: &mut String, run: &Run) {
         }
     }
     let mean = |views: &[&ViewScore]| views.iter().filter_map(|v| v.psnr).sum::<f64>() / views.len().max(1) as f64;
-    // What its colours cost a camera stands beside its score.
+    // What its colours cost a camera stands next to its score.
     let label = |views: &[&ViewScore]| {
         let all: Vec<f64> = views.iter().filter_map(|v| v.corrected).collect();
         let corrected = all.iter().sum::<f64>() / all.len() as f64;

@@ -1,4 +1,4 @@
-//! Pictures inside the page: held-out views beside their truth and error, as small JPEGs in data URIs.
+//! Images inside the page: held-out views next to their truth and error, as small JPEGs in data URIs.
 
 use crate::draw::color_rgb;
 use crate::files::{self, base64};
@@ -10,7 +10,7 @@ use splat4d::scene::Planes;
 use splat4d_train::eval::metrics::error_map;
 use std::path::{Path, PathBuf};
 
-/// Width of a picture in the page, pixels: three stand side by side on a wide screen.
+/// Width of an image in the page, pixels: three stand side by side on a wide screen.
 const WIDTH: u32 = 420;
 /// JPEG quality: no artefact that could be taken for one of the scene's.
 const QUALITY: u8 = 90;
@@ -23,12 +23,12 @@ const DIFFERENCE_FULL: f32 = 0.1;
 /// The same in words.
 pub(super) const DIFFERENCE_WORDS: &str = "a tenth";
 
-/// A JPEG data URI of a picture file, reduced; `None` where it cannot be read.
+/// A JPEG data URI of an image file, reduced; `None` where it cannot be read.
 pub(super) fn inline(path: &Path) -> Option<String> {
     reduced(image::open(path).ok()?.to_rgb8())
 }
 
-/// The same of where two pictures differ; `None` where one cannot be read or their sizes differ.
+/// The same of where two images differ; `None` where one cannot be read or their sizes differ.
 pub(super) fn difference(a: &Path, b: &Path) -> Option<String> {
     let read = |path: &Path| {
         let picture = image::open(path).ok()?.to_rgb32f();
@@ -43,7 +43,7 @@ pub(super) fn difference(a: &Path, b: &Path) -> Option<String> {
     reduced(RgbImage::from_raw(width as u32, height as u32, data)?)
 }
 
-/// A JPEG data URI of a picture, reduced.
+/// A JPEG data URI of an image, reduced.
 pub(super) fn reduced(picture: RgbImage) -> Option<String> {
     let (w, h) = picture.dimensions();
     let picture: RgbImage = if w > WIDTH {
@@ -57,12 +57,12 @@ pub(super) fn reduced(picture: RgbImage) -> Option<String> {
     Some(format!("data:image/jpeg;base64,{}", base64(&bytes)))
 }
 
-/// The orbit film: inside the page if small, else linked beside it.
+/// The orbit film: inside the page if small, else linked next to it.
 pub(super) fn film(run: &Path) -> Option<String> {
     film_file(&orbit(run)?, "The scene, from a camera on an orbit")
 }
 
-/// A film's file: inside the page if small, else linked beside it.
+/// A film's file: inside the page if small, else linked next to it.
 pub(super) fn film_file(path: &Path, alt: &str) -> Option<String> {
     let video = path.extension().is_some_and(|e| e == "mp4");
     let small = path.metadata().ok()?.len() <= FILM_BYTES;

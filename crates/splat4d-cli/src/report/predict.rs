@@ -1,4 +1,4 @@
-//! `predict/report.html`: every model beside its baselines, by horizon, and films of truth and prediction.
+//! `predict/report.html`: every model next to its baselines, by horizon, and films of truth and prediction.
 
 use super::chart::{Series, escape, lines};
 use super::{STYLE, panels, pictures};
@@ -19,7 +19,7 @@ pub(crate) struct Told {
     pub fps: f64,
     pub observed_frames: usize,
     pub horizon: usize,
-    /// Frames of the horizon that there are pictures of.
+    /// Frames of the horizon that there are images of.
     pub pictured: usize,
     pub views: usize,
     pub nodes: usize,
@@ -44,7 +44,7 @@ pub(crate) struct ModelScores {
     pub name: String,
     /// dB, mean over all views.
     pub psnr: Option<f64>,
-    /// dB where pixels differ from the last observed picture; fixed cameras.
+    /// dB where pixels differ from the last observed image; fixed cameras.
     pub psnr_dynamic: Option<f64>,
     pub psnr_by_horizon: Vec<Option<f64>>,
     pub psnr_dynamic_by_horizon: Vec<Option<f64>>,

@@ -11,7 +11,8 @@ use splat4d::{Error, Result};
 use std::borrow::Cow;
 use std::path::{Component, Path, PathBuf};
 
-/// Files beside them without which they are not the scene: networks that move Gaussians (Deformable 3DGS, 4DGaussians) or
+/// Files next to them without which they are not the scene: networks that move Gaussians (Deformable 3DGS,
+/// 4DGaussians) or
 /// make them (Scaffold-GS).
 const NETWORKS: [&str; 4] = ["deformation.pth", "deform.pth", "opacity_mlp.pt", "checkpoints.pth"];
 
@@ -127,7 +128,7 @@ fn read_sog(folder: &Path) -> Result<(Params, splat4d::format::Warnings)> {
     sog::read(&files).map_err(|e| e.at(folder.display()))
 }
 
-/// The file beside `index` that it names. Errors: the name leads out of the folder.
+/// The file next to `index` that it names. Errors: the name leads out of the folder.
 fn within(index: &Path, name: &str) -> Result<PathBuf> {
     if Path::new(name).components().any(|c| !matches!(c, Component::Normal(_))) {
         return Err(Error::input(format!("refers to the file `{name}`, which is outside its folder"))

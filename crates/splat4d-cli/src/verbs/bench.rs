@@ -208,7 +208,7 @@ pub(crate) fn run(args: &Args, threads: Option<u16>, console: &Console) -> anyho
     Ok(())
 }
 
-/// Measures a GPU, with the most threads beside it.
+/// Measures a GPU, with the most threads next to it.
 #[cfg(feature = "gpu")]
 fn on_gpu(scenes: &[Pinned], way: Way, args: &Args, console: &Console) -> anyhow::Result<Vec<Row>> {
     let pool = pool(way.threads)?;

@@ -24,7 +24,7 @@ Examples:
 The result is a run: DIR/scene.s4d plays anywhere, DIR/report.html compares before and after. The original run is \
 unchanged. docs/compression.md explains the settings.";
 
-/// Default of `--guard`, dB: less is not seen in a moving picture.
+/// Default of `--guard`, dB: less is not seen in a moving image.
 const GUARD: f64 = 0.5;
 
 /// Make a trained run smaller and faster to play: prune, mask, quantise, fine-tune; measured before and after

@@ -285,7 +285,7 @@ fn tracks(scene: &Scene<f32>, args: &Args, out: &Path, console: &Console) -> any
     Ok(())
 }
 
-/// Writes the page, and the scene beside it where that is wanted.
+/// Writes the page, and the scene next to it where that is wanted.
 fn page(path: &Path, args: &Args, console: &Console) -> anyhow::Result<()> {
     let out = args.output.as_ref().expect("clap asks for an output");
     if !["html", "htm"].iter().any(|e| out.extension().is_some_and(|own| own.eq_ignore_ascii_case(e)))
@@ -301,7 +301,7 @@ fn page(path: &Path, args: &Args, console: &Console) -> anyhow::Result<()> {
             .remedy("Use --link NAME.s4d.")
             .into());
     }
-    // A playback file may lie beside its page as it is.
+    // A playback file may lie next to its page as it is.
     let is_read = |link: &&PathBuf| link.canonicalize().ok().is_some_and(|l| path.canonicalize().is_ok_and(|p| p == l));
     if let Some(link) = args.link.as_ref().filter(|link| !is_read(link)) {
         keep(path, run.as_ref(), link, &[])?;

@@ -21,7 +21,7 @@ use std::sync::atomic::Ordering;
 
 /// The file that a capture is told by.
 const CAPTURE: &str = "capture.json";
-/// What an import writes into its folder, besides its corrections.
+/// What an import writes into its folder, in addition to its corrections.
 const WRITTEN: [&str; 5] = [CAPTURE, "points.ply", "images", "masks", "import"];
 
 const EXAMPLES: &str = "\
@@ -36,11 +36,11 @@ Examples:
 my-take/import.toml contains the result of every camera: correct an offset or a lens, or leave a camera out, and run \
 the same command again. Then: splat4d train my-take. How to record: docs/filming.md.";
 
-/// Pixels of the shorter side that pictures get: training on a CPU sees no more.
+/// Pixels of the shorter side that images get: training on a CPU sees no more.
 const SIZE: usize = 1080;
 /// Findings of the doctor that are printed; its page has all.
 const MOST: usize = 6;
-/// Frames per second of folders of pictures.
+/// Frames per second of folders of images.
 const FPS: f64 = 30.0;
 
 /// Make a capture from videos: frames, synchronization, poses, lenses and points
@@ -147,7 +147,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let folder = &args.output;
     check_ours(folder)?;
     let read = args.videos.iter().chain(&args.masks).map(|v| Input::new(v, "what is imported,"));
-    // A capture may lie beside the videos, in the folder of their calibration.
+    // A capture may lie next to the videos, in the folder of their calibration.
     let calibration = args.calibration.iter().map(|c| Input { may_hold: true, ..Input::new(c, "the calibration") });
     check_apart(folder, &read.chain(calibration).collect::<Vec<_>>())?;
     let _owned = OutputFolder::amend(folder, "import")?;

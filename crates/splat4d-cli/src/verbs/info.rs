@@ -161,7 +161,7 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
     if let Some(found) = shipped::contents(path)? {
         return Ok(of_shipped(path, &found));
     }
-    // What lies beside pictures is told also where this recipe would not look at it.
+    // What lies next to images is told also where this recipe would not look at it.
     let all = recipe.clone().with(|r| (r.loss.depth, r.loss.flow, r.loss.tracks) = (1.0, 1.0, 1.0));
     let mut capture = open_capture(path, &all)?;
     let priors = priors(&capture);
@@ -172,7 +172,7 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
     }
     if args.doctor {
         check_apart(&args.output, &Origin::of(&capture).inputs().collect::<Vec<_>>())?;
-        // Before the pictures are looked at, which takes a while.
+        // Before the images are looked at, which takes a while.
         files::make_folder(&args.output)?;
         return doctor::of(&capture, &args.output, console);
     }
@@ -323,7 +323,7 @@ fn in_short(names: &[&str]) -> String {
     }
 }
 
-/// What lies beside the pictures, in words.
+/// What lies next to the images, in words.
 fn priors(capture: &Capture) -> Vec<String> {
     let count = |has: fn(&Frame) -> bool| capture.frames.iter().filter(|f| has(f)).count();
     type Has = fn(&Frame) -> bool;

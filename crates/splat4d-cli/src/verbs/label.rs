@@ -1,4 +1,4 @@
-//! `label`: labels and features learnt into a trained run from masks and pictures of features.
+//! `label`: labels and features learnt into a trained run from masks and images of features.
 
 use crate::console::Console;
 use crate::run_folder::Run;

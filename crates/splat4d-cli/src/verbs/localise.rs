@@ -1,4 +1,4 @@
-//! `localise`: from where and when pictures of a scene were taken.
+//! `localise`: from where and when images of a scene were taken.
 
 use crate::camera_file;
 use crate::console::Console;
@@ -14,7 +14,7 @@ use splat4d_train::capture::Rgb8;
 use splat4d_train::eval::localise::{Located, Question, SURE, localise};
 use std::path::{Path, PathBuf};
 
-/// Largest difference of the shapes (width over height) of a picture and a start's.
+/// Largest difference of the shapes (width over height) of an image and a start's.
 const SHAPE: f64 = 0.02;
 
 const EXAMPLES: &str = "\
@@ -126,7 +126,7 @@ fn starts(args: &Args, source: &Source) -> Result<Vec<View>> {
     Ok(views)
 }
 
-/// The starts with the picture's size. Errors: none has its shape.
+/// The starts with the image's size. Errors: none has its shape.
 fn resized(starts: &[View], picture: &Planes<f32>) -> Result<Vec<Camera>> {
     let shape = |w: usize, h: usize| w as f64 / h as f64;
     let of_shape = |c: &&View| {

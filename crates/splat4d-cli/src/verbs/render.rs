@@ -1,4 +1,4 @@
-//! `render`: pictures and films of a run, a scene file or a plain 3DGS .ply.
+//! `render`: images and films of a run, a scene file or a plain 3DGS .ply.
 
 use crate::console::Console;
 use crate::device::Device;
@@ -120,7 +120,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     }
 }
 
-/// One picture from a camera file.
+/// One image from a camera file.
 fn one(args: &Args, path: &Path, camera: &Path, console: &Console) -> anyhow::Result<()> {
     let (camera, background) = camera_file::read(camera)?;
     let Some(output) = args.output.as_ref().or(args.raw.as_ref()) else {
@@ -209,7 +209,7 @@ fn channel<'a>(
     Ok(painter)
 }
 
-/// Many pictures along a path.
+/// Many images along a path.
 fn film(args: &Args, path: &Path, console: &Console) -> anyhow::Result<()> {
     if let Some(out) = &args.output {
         video::check(out)?;
@@ -304,7 +304,7 @@ fn film(args: &Args, path: &Path, console: &Console) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Takes the folders of frames: of pictures, where the output is no single file, and of numbers.
+/// Takes the folders of frames: of images, where the output is no single file, and of numbers.
 fn folders(args: &Args, output: &Path, count: usize, read: &sequence::Read<'_>) -> splat4d::Result<Vec<OutputFolder>> {
     let pictures = output.extension().is_none().then(|| Pattern::plain(output, "png"));
     let numbers = args.raw.as_deref().map(|raw| Pattern::plain(raw, args.raw_format.ending()));

@@ -25,7 +25,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-/// A new picture of the learning scene about so often: sooner than anybody would reload, later than they could follow.
+/// A new image of the learning scene about so often: sooner than anybody would reload, later than they could follow.
 const SNAPSHOT_INTERVAL: Duration = Duration::from_secs(3);
 
 /// Time between two looks whether the worker that begins a long take is done with that.
@@ -54,7 +54,7 @@ A capture is a folder with one of these: capture.json (write it for your own rig
 Blender), transforms.json (Nerfstudio), sparse/ (COLMAP), train_meta.json (PanopticSports), dataset.json (HyperNeRF) or \
 poses_bounds.npy (N3DV). `splat4d info CAPTURE` checks one. `--help-knobs` lists all settings.";
 
-/// The knobs that most runs are told by, for `--help`.
+/// The settings that most runs are told by, for `--help`.
 const IMPORTANT: [&str; 12] = [
     "run.iterations",
     "run.half_size_until",
@@ -498,7 +498,7 @@ fn place(
     Ok(asked.begin(&run, args.force, TRAIN)?)
 }
 
-/// Every fixed camera once: a long take has too many pictures to name them all.
+/// Every fixed camera once: a long take has too many images to name them all.
 fn once(capture: &Capture) -> Capture {
     let mut seen = vec![false; capture.cameras.len()];
     let mut new = |i: &usize| {
@@ -552,7 +552,7 @@ fn minutes(text: &str) -> Result<f64, String> {
     if value > 0.0 && value <= MOST { Ok(value) } else { Err(format!("expected minutes above 0, at most {MOST}")) }
 }
 
-/// The examples, and the knobs that most runs are told by.
+/// The examples, and the settings that most runs are told by.
 fn long_help() -> String {
     let knobs = Recipe::knobs();
     let lines: String = IMPORTANT
@@ -562,7 +562,7 @@ fn long_help() -> String {
     format!("{EXAMPLES}\n\nSettings (--set KEY=VALUE, or a TOML file for --recipe; --help-knobs: all):\n{lines}")
 }
 
-/// Every knob, those of a table, or those with the topic in their name. Errors: there is none.
+/// Every setting, those of a table, or those with the topic in their name. Errors: there is none.
 fn knob_list(topic: &str) -> Result<String, Error> {
     let knobs = Recipe::knobs();
     let named = |k: &Knob| k.key().contains(topic) || Recipe::flat_name(&k.key()).is_some_and(|n| n.contains(topic));
@@ -588,7 +588,7 @@ fn knob_list(topic: &str) -> Result<String, Error> {
     Ok(text)
 }
 
-/// A knob in a line of help: its names, meaning, unit and default.
+/// A setting in a line of help: its names, meaning, unit and default.
 fn line(knob: &Knob) -> String {
     let default = if knob.default == "\"\"" { "empty" } else { &knob.default };
     let unit = if knob.rule.unit.is_empty() { String::new() } else { format!(" {}", knob.rule.unit) };

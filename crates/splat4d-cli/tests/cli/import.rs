@@ -1,4 +1,4 @@
-//! `import` on the bundled capture's pictures, of which nothing but the pictures is told.
+//! `import` on the bundled capture's images, of which nothing but the images is told.
 
 use crate::sample::splat4d;
 use crate::{json_of, str};
@@ -67,7 +67,8 @@ fn images_alone_become_a_capture_with_clocks_and_poses() {
     }
 }
 
-/// Samples of sound a second, and the films' frames a second: slow, so that a second of pictures is long enough to listen.
+/// Samples of sound a second, and the films' frames a second: slow, so that a second of images is long enough to
+/// listen.
 const SOUND_RATE: u32 = 16_000;
 const SLOW: usize = 10;
 

@@ -1,4 +1,5 @@
-//! A made-up capture: four cameras on an arc look at a bright square that crosses a grey wall, four frames each; and a
+//! A synthetic capture: four cameras on an arc look at a bright square that crosses a grey wall, four frames each;
+//! and a
 //! way to call the binary.
 
 use image::{GrayImage, Luma, Rgb, RgbImage};
@@ -25,11 +26,11 @@ pub(crate) struct Capture {
     pub frames: usize,
     pub distance: f64,
     pub focal: f64,
-    /// Size of the picture files.
+    /// Size of the image files.
     pub pictures: [u32; 2],
-    /// (camera, frame) whose picture is not there.
+    /// (camera, frame) whose image is not there.
     pub missing: Option<(usize, usize)>,
-    /// (camera, frame) whose picture file ends early.
+    /// (camera, frame) whose image file ends early.
     pub truncated: Option<(usize, usize)>,
     pub mirrored: bool,
     /// Two cameras have one pose.

@@ -32,7 +32,7 @@ fn cameras() -> Vec<Camera> {
     [[0.4, 0.3, -4.0], [3.5, 0.3, -2.0], [-3.0, 0.5, -2.0]].map(at).to_vec()
 }
 
-/// Pictures of a scene, said to be of another time.
+/// Images of a scene, said to be of another time.
 struct Seen {
     cameras: Vec<Camera>,
     pictures: Vec<splat4d::scene::Planes<f32>>,
@@ -91,7 +91,7 @@ fn a_wrong_forecast_is_corrected_by_images() {
     let draw = || Box::new(Renderer::new(RenderConfig::default()));
     let corrected = filter.update(&forecast, &unsure, seen.clone(), draw()).unwrap();
     assert!(error(&corrected) < 0.5 * error(&forecast), "{} of {}", error(&corrected), error(&forecast));
-    // Who is sure of a forecast believes pictures less.
+    // Who is sure of a forecast believes images less.
     let doubted = Filter::new(&scene, &observed, clock).update(&forecast, &sure, seen, draw()).unwrap();
     assert!(error(&doubted) > error(&corrected) && error(&doubted) < error(&forecast));
 }

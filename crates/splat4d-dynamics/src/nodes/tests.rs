@@ -1,4 +1,4 @@
-//! Nodes on scenes that are made up, and the futures that are made of them.
+//! Nodes on scenes that are synthetic, and the futures that are made of them.
 
 use super::*;
 use crate::future::{Clock, predicted};

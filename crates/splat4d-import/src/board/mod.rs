@@ -88,7 +88,7 @@ impl FromStr for Board {
     }
 }
 
-/// A tag in a picture.
+/// A tag in an image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Tag {
     /// Its number in its family.
@@ -97,7 +97,7 @@ pub struct Tag {
     pub corners: [[f64; 2]; 4],
 }
 
-/// The tags of a family in a grey picture, by number; those that are there twice are left out.
+/// The tags of a family in a grey image, by number; those that are there twice are left out.
 pub fn tags(picture: &Planes<f32>, family: &Family) -> Vec<Tag> {
     let codes = family.codes();
     let mut found: Vec<Tag> =

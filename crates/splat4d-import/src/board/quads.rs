@@ -1,4 +1,4 @@
-//! Dark regions of a picture whose outline is a square seen from somewhere.
+//! Dark regions of an image whose outline is a square seen from somewhere.
 
 use splat4d::scene::Planes;
 use splat4d_train::vision::raster::sample;
@@ -58,7 +58,7 @@ pub(super) fn quads(picture: &Planes<f32>) -> Vec<[[f64; 2]; 4]> {
     out
 }
 
-/// Which pixels are dark beside what is around them.
+/// Which pixels are dark next to what is around them.
 fn dark(picture: &Planes<f32>) -> Vec<bool> {
     let (w, h) = (picture.width, picture.height);
     let (across, down) = (w.div_ceil(TILE), h.div_ceil(TILE));

@@ -8,7 +8,7 @@ use splat4d::{Error, Result};
 pub struct Video<'a> {
     /// Its name.
     pub name: &'a str,
-    /// Pixels across and down of its upright pictures.
+    /// Pixels across and down of its upright images.
     pub size: [usize; 2],
 }
 

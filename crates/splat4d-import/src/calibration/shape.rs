@@ -1,4 +1,4 @@
-//! A calibrated camera for pictures of another size: halved, padded by a codec, or with black bars.
+//! A calibrated camera for images of another size: halved, padded by a codec, or with black bars.
 
 use super::Calibrated;
 use splat4d::scene::{Intrinsics, Planes};
@@ -6,15 +6,16 @@ use splat4d::{Error, Result};
 
 /// Pixels that a side may differ from the calibrated shape: sides are whole.
 const ROUNDING: f64 = 1.0;
-/// Pixels to whose multiples codecs pad the sides of pictures, right and below (H.264's macroblocks); programs cut that off or
+/// Pixels to whose multiples codecs pad the sides of images, right and below (H.264's macroblocks); programs cut
+/// that off or
 /// leave it.
 const BLOCK: usize = 16;
-/// Of a side, the most that bars take: a wide film in a square picture.
+/// Of a side, the most that bars take: a wide film in a square image.
 const MOST_BARS: f64 = 0.45;
-/// Pixels of the stored pictures that bars may be wider or narrower than they should.
+/// Pixels of the stored images that bars may be wider or narrower than they should.
 const BAR_ROUNDING: f64 = 3.0;
 
-/// How a video of another size has come of the calibrated pictures.
+/// How a video of another size has come of the calibrated images.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Shape {
     /// Scaled as a whole.
@@ -25,7 +26,7 @@ pub enum Shape {
     Boxed([f64; 2]),
 }
 
-/// How a video can have come of the calibrated pictures.
+/// How a video can have come of the calibrated images.
 ///
 /// Errors: it is of another shape.
 pub fn shape(camera: &Calibrated, video: [usize; 2]) -> Result<Shape> {
@@ -59,10 +60,12 @@ fn sizes(size: [usize; 2], video: [usize; 2]) -> String {
     format!("the video has {}x{} pixels, the calibration is for {}x{}", video[0], video[1], size[0], size[1])
 }
 
-/// The camera for pictures of a video's size that are stored in another one, where so many pixels of the stored pictures are black
+/// The camera for images of a video's size that are stored in another one, where so many pixels of the stored images
+/// are black
 /// bars: at the left, above, at the right, below. And what that means, a sentence, where it is not plain.
 ///
-/// Errors: the video is of another shape than the pictures it was calibrated with, and neither bars nor padding tell why; the
+/// Errors: the video is of another shape than the images it was calibrated with, and neither bars nor padding tell
+/// why; the
 /// principal point lies outside.
 pub fn fitted(
     camera: &Calibrated,
@@ -73,7 +76,7 @@ pub fn fitted(
     let size = camera.size.unwrap_or(video);
     let [w, h] = size.map(|v| v as f64);
     let to_stored = [stored[0] as f64 / video[0] as f64, stored[1] as f64 / video[1] as f64];
-    // What a calibrated pixel becomes in the stored pictures.
+    // What a calibrated pixel becomes in the stored images.
     let (mut scale, mut shift) = ([stored[0] as f64 / w, stored[1] as f64 / h], [0.0; 2]);
     let mut note = None;
     if let Shape::Boxed(expected) = shape(camera, video)? {
@@ -112,7 +115,7 @@ pub fn fitted(
     Ok((Calibrated { intrinsics, size: Some(stored), ..camera.clone() }, note))
 }
 
-/// Pixels of black bars at the left, above, at the right and below, that all these grey pictures of one size have.
+/// Pixels of black bars at the left, above, at the right and below, that all these grey images of one size have.
 pub fn bars(pictures: &[Planes<f32>]) -> [f64; 4] {
     /// In [0, 1]: what is brighter in the mean of a line, or anywhere in it, is no bar. Codecs make black noisy.
     const MEAN: f32 = 0.1;

@@ -515,7 +515,7 @@ fn intrinsics_follow_the_size_and_other_shapes_are_refused() {
     let bare = Calibrated { size: None, ..camera.clone() };
     assert_eq!(whole(&bare, [1280, 720], [1280, 720]).unwrap().intrinsics, camera.intrinsics);
     assert!(whole(&bare, [640, 360], [640, 360]).unwrap_err().to_string().contains("principal point"));
-    // A point is seen at the same place of the picture.
+    // A point is seen at the same place of the image.
     let x = mat_vec(&pose_of(camera).rotation, [0.3, 0.2, 0.1]);
     let z = x[2] + pose_of(camera).translation[2];
     let at = |c: &Calibrated| c.intrinsics.fx * x[0] / z + c.intrinsics.cx;
@@ -538,7 +538,7 @@ fn bars_and_padding_are_seen_through() {
     let (padded, note) = fitted(camera, [1280, 712], [1280, 712], [0.0; 4]).unwrap();
     assert_eq!(padded.intrinsics, k);
     assert!(note.expect("it is not plain").contains("multiples of 16"));
-    // Pictures with bars, one of which is dark where the other is not.
+    // Images with bars, one of which is dark where the other is not.
     let picture = |dark: usize| {
         let mut p = Planes::new(1, 40, 60);
         for (i, v) in p.data.iter_mut().enumerate() {

@@ -1,4 +1,4 @@
-//! What a camera's own pictures say.
+//! What a camera's own images say.
 
 use super::finding::{GAMMA, SHARPNESS, Told, grade, unit, worse};
 use super::look::Seen;
@@ -9,18 +9,19 @@ use splat4d_train::capture::Capture;
 /// What stands still went so far, pixels of 1920, and at least so many own ones.
 const MOVED: [f64; 2] = [0.5, 2.0];
 const MOVED_PIXELS: [f64; 2] = [0.35, 1.0];
-/// Brightness that jumps from picture to picture, stops.
+/// Brightness that jumps from image to image, stops.
 const FLICKER: [f64; 2] = [0.05, 0.15];
 /// Missing and doubled frames, of all.
 const FRAMES: [f64; 2] = [0.01, 0.05];
-/// Part of the pixels that is clipped black or white: backgrounds of data sets are, so that only most of a picture tells.
+/// Part of the pixels that is clipped black or white: backgrounds of data sets are, so that only most of an image
+/// tells.
 const CLIPPED: f64 = 0.6;
-/// Mean below which a picture is too dark, of 255.
+/// Mean below which an image is too dark, of 255.
 const DARK: f64 = 20.0;
-/// How much larger steps across blocks are, of 255. Pictures of two takes that look sound have 0.9 to 1.4.
+/// How much larger steps across blocks are, of 255. Images of two takes that look sound have 0.9 to 1.4.
 const BLOCKS: [f64; 2] = [2.5, 5.0];
 
-/// What a camera's own pictures say.
+/// What a camera's own images say.
 pub(super) fn alone(capture: &Capture, camera: usize, s: &Seen, report: &mut Report) {
     let name = capture.cameras[camera].name.clone();
     let who = Some(name.as_str());

@@ -17,9 +17,9 @@ use splat4d_train::event::Progress;
 use splat4d_train::vision::features::{Limits, find};
 use splat4d_train::vision::raster::grey;
 
-/// Distance of matches from their epipolar lines, pixels of a picture 1920 wide.
+/// Distance of matches from their epipolar lines, pixels of an image 1920 wide.
 const EPIPOLAR: [f64; 2] = [1.0, 2.0];
-/// And at least so many of the picture's own: of the bundled capture, whose poses are exact, up to 0.8 were measured.
+/// And at least so many of the image's own: of the bundled capture, whose poses are exact, up to 0.8 were measured.
 const OWN_PIXELS: [f64; 2] = [1.0, 2.0];
 /// Exposure, and one channel against green, stops.
 const EXPOSURE: [f64; 2] = [0.15, 0.5];

@@ -1,5 +1,6 @@
 //! The checks. Thresholds are of the project's own study of captures ("Doctor": what is seen in results) where no other source
-//! is named: the first of two is a warning, the second is bad. Those of flicker, dark and clipped pictures are chosen by eye.
+//! is named: the first of two is a warning, the second is bad. Those of flicker, dark and clipped images are chosen
+//! by eye.
 
 use super::finding::{Told, grade};
 use super::look::Seen;

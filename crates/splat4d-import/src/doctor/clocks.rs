@@ -17,7 +17,7 @@ const OFFSET: [f64; 2] = [0.5, 1.5];
 /// to 0.59 frames were found, other cameras with other settings, so that less than this is no evidence.
 const OFFSET_SIGMAS: f64 = 4.0;
 const OFFSET_FRAMES: f64 = 0.75;
-/// Seconds from the first to the last row of a picture, and standard deviations from which on they are believed.
+/// Seconds from the first to the last row of an image, and standard deviations from which on they are believed.
 const SHUTTER: [f64; 2] = [0.004, 0.010];
 const SHUTTER_SIGMAS: f64 = 4.0;
 /// Neighbours with which a camera's clock is compared.

@@ -24,7 +24,7 @@ pub(super) fn worse([a, b]: [f64; 2], [c, d]: [f64; 2]) -> [f64; 2] {
     [a.max(c), b.max(d)]
 }
 
-/// Pixels of a picture 1920 wide for each of its own.
+/// Pixels of an image 1920 wide for each of its own.
 pub(super) fn unit(view: &Camera) -> f64 {
     /// The longer side of what thresholds are about.
     const WIDE: f64 = 1920.0;

@@ -1,4 +1,4 @@
-//! What is looked at of a camera: a few pictures over the take, and some in a row.
+//! What is looked at of a camera: a few images over the take, and some in a row.
 
 use super::Options;
 use crate::Result;
@@ -10,11 +10,11 @@ use splat4d::math::median_by;
 use splat4d::scene::{Camera, Planes};
 use splat4d_train::capture::{Capture, ImageStore, Rgb8};
 
-/// Pictures over the take whose median is what stands still.
+/// Images over the take whose median is what stands still.
 const SPREAD: usize = 15;
 /// From so many on a median knows what stands still.
 const MEDIAN_FROM: usize = 3;
-/// Pictures of a moving camera that are compared with others.
+/// Images of a moving camera that are compared with others.
 const STANDS: usize = 16;
 /// A value at or above (at or below one minus) this is clipped, of 255.
 const CLIPPED: [u8; 2] = [2, 253];
@@ -25,7 +25,7 @@ pub(super) const CELL: usize = 8;
 /// A cell moves from this part of its pixels on.
 const MOVING: f64 = 0.25;
 
-/// A picture from a place: of what stands still, or one of a moving camera.
+/// An image from a place: of what stands still, or one of a moving camera.
 pub(super) struct Stand {
     pub(super) view: Camera,
     pub(super) picture: Rgb8,
@@ -38,9 +38,9 @@ pub(super) struct Seen {
     /// Corners that move, by the camera's clock.
     pub(super) tracks: Vec<Track>,
     pub(super) clock: Clock,
-    /// Pictures that were looked at in a row.
+    /// Images that were looked at in a row.
     pub(super) row: usize,
-    /// Mean of 255 and detail of pictures in a row.
+    /// Mean of 255 and detail of images in a row.
     pub(super) means: Vec<f64>,
     pub(super) detail: Vec<f64>,
     /// Part of the pixels that is black, and white.
@@ -51,17 +51,17 @@ pub(super) struct Seen {
     pub(super) moved: Option<f64>,
     /// Detail of the take's last third relative to its first.
     pub(super) focus: Option<f64>,
-    /// The cells, row by row, in which something moves, of pictures evenly over the take.
+    /// The cells, row by row, in which something moves, of images evenly over the take.
     pub(super) motion: Vec<Vec<bool>>,
     pub(super) sizes: Vec<[usize; 2]>,
 }
 
-/// How often a picture of this size is halved.
+/// How often an image of this size is halved.
 fn halvings(view: &Camera) -> u32 {
     (0..).find(|k| (view.width >> k) * (view.height >> k) <= PIXELS).unwrap_or(0)
 }
 
-/// The view of a picture as it is looked at.
+/// The view of an image as it is looked at.
 fn looked(view: &Camera) -> Camera {
     view.downscaled(1 << halvings(view))
 }
@@ -116,7 +116,7 @@ fn blocks(g: &Grey) -> f64 {
     let mut sums = [[0.0f64; 2]; 2];
     for row in g.data.chunks_exact(g.width) {
         for x in 2..g.width.saturating_sub(1) {
-            // The bend of a step, so that slopes of the picture itself count little.
+            // The bend of a step, so that slopes of the image itself count little.
             let step =
                 (row[x] - row[x - 1]).abs() - 0.5 * ((row[x - 1] - row[x - 2]).abs() + (row[x + 1] - row[x]).abs());
             let side = usize::from(x % BLOCK == 0);
@@ -128,7 +128,7 @@ fn blocks(g: &Grey) -> f64 {
     255.0 * (mean(1) - mean(0))
 }
 
-/// The cells of a picture that differ from what stands still.
+/// The cells of an image that differ from what stands still.
 fn cells(picture: &Grey, still: &Grey) -> Vec<bool> {
     let (across, down) = (picture.width.div_ceil(CELL), picture.height.div_ceil(CELL));
     let mut counts = vec![[0usize; 2]; across * down];
@@ -140,9 +140,9 @@ fn cells(picture: &Grey, still: &Grey) -> Vec<bool> {
     counts.into_iter().map(|[m, all]| m as f64 >= MOVING * all.max(1) as f64).collect()
 }
 
-/// How much more detail the last third of pictures has than the first, relative to their brightness.
+/// How much more detail the last third of images has than the first, relative to their brightness.
 fn focus(pictures: &[Rgb8]) -> Option<f64> {
-    /// Pictures of a third.
+    /// Images of a third.
     const LEAST: usize = 2;
     let third = pictures.len() / 3;
     if third < LEAST {
@@ -158,7 +158,8 @@ fn focus(pictures: &[Rgb8]) -> Option<f64> {
     (first > 0.0).then(|| last / first)
 }
 
-/// How far what stands still went from the first pictures to the last, pixels: the median of corners beside which nothing
+/// How far what stands still went from the first images to the last, pixels: the median of corners next to which
+/// nothing
 /// moves in either of them. `None` if there are too few to tell.
 fn moved(ends: [&[Rgb8]; 2]) -> Option<f64> {
     let still = ends.map(|end| Grey::of(&median_of(end)));
@@ -207,7 +208,7 @@ pub(super) fn camera(capture: &Capture, store: &ImageStore, camera: usize, optio
     if pictures.iter().any(|p| p.width.min(p.height) < 32) {
         return Ok(seen);
     }
-    // Blocks of pictures that were made smaller are no longer of 8 pixels.
+    // Blocks of images that were made smaller are no longer of 8 pixels.
     if halvings(&capture.frames[chosen[0]].view) == 0 {
         seen.blocks = blocks(&Grey::of(&pictures[pictures.len() / 2]));
     }
@@ -229,7 +230,7 @@ pub(super) fn camera(capture: &Capture, store: &ImageStore, camera: usize, optio
         }
     }
     let first = (frames.len() - frames.len().min(options.window)) / 2;
-    // Of a moving camera only its darkness is asked, which a few pictures tell.
+    // Of a moving camera only its darkness is asked, which a few images tell.
     let row = if fixed { &frames[first..first + frames.len().min(options.window)] } else { &chosen[..] };
     let still = (fixed && same && frames.len() >= MEDIAN_FROM).then(|| Grey::of(&seen.stands[0].picture));
     let mut tracker = Tracker::new(options.tracks, APART);

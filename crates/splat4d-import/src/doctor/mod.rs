@@ -56,14 +56,14 @@ pub struct Finding {
     pub alike: Vec<Finding>,
 }
 
-/// What was measured of a camera, and a picture of it.
+/// What was measured of a camera, and an image of it.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct CameraReport {
     /// Its name.
     pub name: String,
     /// Whether it stands still.
     pub fixed: bool,
-    /// Distance of matches from their epipolar lines, pixels of a picture 1920 wide.
+    /// Distance of matches from their epipolar lines, pixels of an image 1920 wide.
     pub epipolar: Option<f64>,
     /// Seconds that its clock is off, and their standard deviation.
     pub offset: Option<[f64; 2]>,
@@ -71,13 +71,13 @@ pub struct CameraReport {
     pub exposure: Option<[f64; 3]>,
     /// Sharpness relative to other cameras, at places that both see.
     pub sharpness: Option<f64>,
-    /// Pixels (of 1920) that what stands still went between the first and the last pictures.
+    /// Pixels (of 1920) that what stands still went between the first and the last images.
     pub moved: Option<f64>,
     /// Detail of the take's last third relative to its first.
     pub focus: Option<f64>,
-    /// Seconds from the first to the last row of a picture, and their standard deviation.
+    /// Seconds from the first to the last row of an image, and their standard deviation.
     pub shutter: Option<[f64; 2]>,
-    /// Its picture.
+    /// Its image.
     #[serde(skip)]
     pub picture: Rgb8,
 }
@@ -89,7 +89,7 @@ pub struct PairReport {
     pub cameras: [String; 2],
     /// Features that both see.
     pub matches: usize,
-    /// How far those lie from their epipolar lines, pixels of a picture 1920 wide.
+    /// How far those lie from their epipolar lines, pixels of an image 1920 wide.
     pub epipolar: f64,
     /// Stops by which the second is brighter: red, green, blue.
     pub gain: [f64; 3],
@@ -130,9 +130,9 @@ pub struct Report {
 /// How closely to look.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Options {
-    /// Consecutive pictures of a camera that are followed.
+    /// Consecutive images of a camera that are followed.
     pub window: usize,
-    /// Features of a picture.
+    /// Features of an image.
     pub features: usize,
     /// Corners of a camera that are followed.
     pub tracks: usize,
@@ -142,12 +142,12 @@ pub struct Options {
 
 impl Default for Options {
     fn default() -> Self {
-        // 31 cameras of 30 pictures at 640x360 are to take about a minute.
+        // 31 cameras of 30 images at 640x360 are to take about a minute.
         Self { window: 30, features: 900, tracks: 50, memory: None }
     }
 }
 
-/// Bytes of decoded pictures that are kept at once: each is looked at once or twice, so that more gains nothing.
+/// Bytes of decoded images that are kept at once: each is looked at once or twice, so that more gains nothing.
 const STORE: usize = 64 << 20;
 
 /// Bytes of memory that the machine has, or less where it is a container that may take less; none: it does not tell (it is no
@@ -162,7 +162,7 @@ fn machine_memory() -> Option<u64> {
 
 /// Looks for everything that commonly spoils results.
 ///
-/// Errors: a capture without pictures, pictures that cannot be read.
+/// Errors: a capture without images, images that cannot be read.
 pub fn examine(capture: &Capture, options: &Options, progress: &mut Progress<'_>) -> Result<Report> {
     if capture.frames.is_empty() {
         return Err(Error::input("the capture has no images").at(capture.root.display()).remedy("Add some."));

@@ -1,4 +1,5 @@
-//! Rolling shutters: a camera that reads its pictures row by row sees what is low in them later than what is high, and what
+//! Rolling shutters: a camera that reads its images row by row sees what is low in them later than what is high, and
+//! what
 //! moves leaves its epipolar line by as much.
 
 use super::look::Seen;
@@ -31,10 +32,12 @@ struct Sighting {
     rows: [f64; 2],
 }
 
-/// Seconds between the first and the last row of each camera's pictures with their standard deviations; None where too few
+/// Seconds between the first and the last row of each camera's images with their standard deviations; None where too
+/// few
 /// tracks tell. Shutters that all cameras share alike show less than their differences, which the deviation says.
 ///
-/// Of one event the cameras a and b have the times t and s with `s − t = lag + r_a·ρ_a − r_b·ρ_b` (r: seconds over the picture,
+/// Of one event the cameras a and b have the times t and s with `s − t = lag + r_a·ρ_a − r_b·ρ_b` (r: seconds over
+/// the image,
 /// ρ: row from −½ to ½), so that at `s = t + lag` the distance from the line and its speed times what is missing sum to nothing, to first order. Least
 /// squares over all r and a correction of each lag; deviations by clusters of tracks (White 1980), for what is wrong with a track
 /// is wrong at all of its times.

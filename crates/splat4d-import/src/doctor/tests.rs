@@ -72,7 +72,7 @@ fn clean() -> &'static Clip {
     CLIP.get_or_init(|| (0..CAMERAS).map(|c| (0..FRAMES).map(|n| draw(&camera(c), n as f64 / FPS)).collect()).collect())
 }
 
-/// What the doctor says of these pictures, where the ill camera's pose is turned by so many radians about its own x axis.
+/// What the doctor says of these images, where the ill camera's pose is turned by so many radians about its own x axis.
 fn says(clip: &Clip, turned: f64, cameras: usize) -> Report {
     let folder = tempfile::tempdir().unwrap();
     let capture = write(folder.path(), clip, turned, cameras);
@@ -200,7 +200,8 @@ fn a_camera_that_was_pushed_is_found() {
     is_found(&clip, "moved");
 }
 
-/// A camera that stands still before one body that fills most of its picture and drifts, so that most corners are the body's.
+/// A camera that stands still before one body that fills most of its image and drifts, so that most corners are the
+/// body's.
 #[test]
 fn a_large_passing_object_is_not_reported_as_camera_motion() {
     let near = |t: f64| {

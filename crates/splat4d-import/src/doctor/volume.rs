@@ -16,7 +16,7 @@ const MOVES: f64 = 0.75;
 /// Cells in all moments that must move before a share means anything.
 const LEAST: usize = 60;
 
-/// Where so many cameras look, by their pictures' middles.
+/// Where so many cameras look, by their images' middles.
 pub(super) fn target(views: &[&Camera]) -> Option<[f64; 3]> {
     let middle = |v: &&Camera| [0.5 * v.width as f64, 0.5 * v.height as f64];
     let sights: Vec<Sight<'_>> = views.iter().map(|v| Sight { camera: v, pixel: middle(v) }).collect();
@@ -51,7 +51,7 @@ pub(super) fn seen_by_three(seen: &[&Seen], target: [f64; 3]) -> Option<f64> {
     (known >= LEAST).then(|| shaped as f64 / known as f64)
 }
 
-/// The cell of a camera's picture in which a place is seen.
+/// The cell of a camera's image in which a place is seen.
 fn cell_of(view: &Camera, place: [f64; 3]) -> Option<usize> {
     let ([u, v], _) = view.project(place)?;
     let inside = u >= 0.0 && v >= 0.0 && u < view.width as f64 && v < view.height as f64;

@@ -52,7 +52,7 @@ pub struct Bundle {
     pub sightings: Vec<Sighting>,
 }
 
-/// What is adjusted besides points.
+/// What is adjusted in addition to points.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Free {
     /// Poses.
@@ -554,7 +554,7 @@ mod tests {
                 let h = 1e-5;
                 let (here, after, ago) = (at(0.0), at(h), at(-h));
                 let velocity: [f64; 2] = std::array::from_fn(|k| (after[k] - ago[k]) / (2.0 * h));
-                // Seen τ ago, moving evenly in the picture.
+                // Seen τ ago, moving evenly in the image.
                 let pixel = std::array::from_fn(|k| here[k] - velocity[k] * view.tau);
                 bundle.sightings.push(Sighting { view: v, point: p, pixel, velocity });
             }

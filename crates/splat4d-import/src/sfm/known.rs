@@ -14,7 +14,7 @@ use splat4d_train::event::Progress;
 /// Rays farther off the axis than this (tangent; 72 degrees) are left out: a straightened pixel there is wide, and of little use.
 const WIDEST: f64 = 3.0;
 
-/// Takes pixels of pictures to those of the pinhole camera with its principal point in the middle.
+/// Takes pixels of images to those of the pinhole camera with its principal point in the middle.
 pub(crate) struct Straight {
     from: Intrinsics,
     lens: Distortion,
@@ -22,7 +22,7 @@ pub(crate) struct Straight {
 }
 
 impl Known {
-    /// For pictures of this size, which are `factor` times smaller than the files'.
+    /// For images of this size, which are `factor` times smaller than the files'.
     pub(crate) fn straight(&self, [width, height]: [usize; 2], factor: f64) -> Straight {
         let k = &self.intrinsics;
         let from = Intrinsics { fx: k.fx / factor, fy: k.fy / factor, cx: k.cx / factor, cy: k.cy / factor };
@@ -68,10 +68,11 @@ impl Straight {
 
 /// Points and clocks of cameras whose poses and lenses are given. `links` were found without them, and tell how right they are.
 ///
-/// What moves lies beside its epipolar lines as long as clocks are off: first clocks are found of what looks alike, within wide
+/// What moves lies next to its epipolar lines as long as clocks are off: first clocks are found of what looks alike,
+/// within wide
 /// bounds; then points of what lies on the lines, which it does at any clock, so that they tell none.
 pub(crate) fn about(sights: &[Sight], links: &[Link], how: &Mapping, progress: &mut Progress<'_>) -> Mapped {
-    /// Of the tolerance: two frames of what is followed at all, in pictures 1920 across.
+    /// Of the tolerance: two frames of what is followed at all, in images 1920 across.
     const WIDE: f64 = 8.0;
     /// Of what moves and was matched, the least share that must fit a clock: of matches by chance few do.
     const CLOCK_SHARE: f64 = 0.5;
@@ -115,7 +116,7 @@ const QUARTILE_TO_MEDIAN: f64 = 2.117;
 const AGREE: usize = 2;
 const TELL: usize = 3;
 
-/// How far what each camera shows lies from where the given poses say, pixels of the files' pictures.
+/// How far what each camera shows lies from where the given poses say, pixels of the files' images.
 ///
 /// Links must have been found without these poses. Distances are epipolar, as the doctor takes them: the lower quartile of a
 /// pair, as the median that it implies, for chance matches only add large ones; of a camera the second least of its pairs.
@@ -154,7 +155,7 @@ fn errors(sights: &[Sight], links: &[Link]) -> Vec<Option<f64>> {
     pairs.into_iter().map(of).collect()
 }
 
-/// Pixels of a camera's files for one of a picture 1920 across, but no less than half a pixel.
+/// Pixels of a camera's files for one of an image 1920 across, but no less than half a pixel.
 pub fn pixel_unit([width, height]: [usize; 2]) -> f64 {
     unit(width.max(height) as f64)
 }

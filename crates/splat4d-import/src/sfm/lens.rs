@@ -6,10 +6,11 @@ use splat4d::scene::{Camera, Intrinsics, Lens as SceneLens};
 
 /// Pixels across for which tolerances are stated.
 const FULL: f64 = 1920.0;
-/// Tolerances shrink with the picture, but not below this share: features of small pictures are no more exact than half a pixel.
+/// Tolerances shrink with the image, but not below this share: features of small images are no more exact than half
+/// a pixel.
 const SMALLEST_UNIT: f64 = 0.5;
 
-/// Pixels of a picture of this larger side for one of a picture of 1920.
+/// Pixels of an image of this larger side for one of an image of 1920.
 pub(crate) fn unit(size: f64) -> f64 {
     (size / FULL).max(SMALLEST_UNIT)
 }
@@ -69,7 +70,7 @@ impl Lens {
 
     /// The direction seen at a pixel, depth 1 (camera axes).
     pub fn ray(&self, pixel: [f64; 2]) -> [f64; 3] {
-        /// Newton's method on the radius: far fewer are needed within a picture.
+        /// Newton's method on the radius: far fewer are needed within an image.
         const STEPS: usize = 20;
         let bent = [(pixel[0] - self.center[0]) / self.focal, (pixel[1] - self.center[1]) / self.focal];
         let radius = bent[0].hypot(bent[1]);
@@ -112,7 +113,7 @@ impl Lens {
         Camera { lens, ..self.pinhole(pose, width, height) }
     }
 
-    /// For pictures `factor` times as large.
+    /// For images `factor` times as large.
     pub fn scaled(&self, factor: f64) -> Self {
         Self { focal: self.focal * factor, k1: self.k1, center: self.center.map(|c| c * factor) }
     }
@@ -128,7 +129,7 @@ pub(crate) fn off(lens: &Lens, pose: &Se3, x: [f64; 3], pixel: [f64; 2]) -> f64 
 /// What is known of a camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Known {
-    /// Pixels of the files' pictures.
+    /// Pixels of the files' images.
     pub intrinsics: Intrinsics,
     /// Distortion.
     pub lens: SceneLens,

@@ -24,15 +24,15 @@ pub struct Mapping {
     pub starts: usize,
     /// Whether clocks are adjusted.
     pub clocks: bool,
-    /// Farthest that a point is seen from where it should be, pixels of a picture 1920 across.
+    /// Farthest that a point is seen from where it should be, pixels of an image 1920 across.
     pub tolerance: f64,
     /// Least angle between the outermost rays of a point, degrees.
     pub angle: f64,
-    /// Standard deviation of principal points about the pictures' middles, of the larger side.
+    /// Standard deviation of principal points about the images' middles, of the larger side.
     pub center: f64,
     /// Standard deviation of k1 about zero.
     pub k1: f64,
-    /// Robust loss, pixels of a picture 1920 across.
+    /// Robust loss, pixels of an image 1920 across.
     pub scale: f64,
 }
 
@@ -46,7 +46,8 @@ impl Default for Mapping {
     }
 }
 
-/// Focal lengths that are tried where nothing is known, of the picture's larger side: from wide phones to short telephoto lenses.
+/// Focal lengths that are tried where nothing is known, of the image's larger side: from wide phones to short
+/// telephoto lenses.
 pub const FOCALS: [f64; 12] = [0.6, 0.66, 0.72, 0.79, 0.86, 0.94, 1.03, 1.12, 1.22, 1.33, 1.45, 1.6];
 /// Median angle of a pair to start with, degrees.
 const START_ANGLE: f64 = 8.0;
@@ -78,7 +79,7 @@ const GUIDED_WITHIN: f64 = 0.5;
 const ALIKE: f64 = 0.06;
 const FAMILY_FROM: usize = 4;
 const FAMILY: f64 = 0.003;
-/// Where pictures contradict that, lenses differ by this share: of phones of several models, some per cent.
+/// Where images contradict that, lenses differ by this share: of phones of several models, some per cent.
 const STRANGERS: f64 = 0.05;
 /// Twice the loss that it costs to take lenses for equal, of the variance of a sighting and for each lens: more contradicts it.
 /// Were sightings' errors independent, 1 would be usual (Wilks 1938).
@@ -443,7 +444,8 @@ impl Map<'_> {
         Some((report.after, bundle.sightings.len()))
     }
 
-    /// Whether the pictures contradict that all lenses are of one model, where that was assumed: the likelihood ratio of both.
+    /// Whether the images contradict that all lenses are of one model, where that was assumed: the likelihood ratio
+    /// of both.
     fn are_strangers(&self) -> bool {
         const STEPS: usize = 30;
         let lenses: std::collections::BTreeSet<usize> = self.order.iter().map(|&s| self.lens_of[s]).collect();
@@ -461,7 +463,7 @@ impl Map<'_> {
     }
 
     /// Whether all lenses seem to be of one model: rigs are often made of equal cameras, and what differs between them is then the
-    /// error of each. Of too few, or of pictures of several sizes, it is not asked.
+    /// error of each. Of too few, or of images of several sizes, it is not asked.
     fn family(&self, lenses: &[usize]) -> bool {
         if lenses.len() < FAMILY_FROM || self.order.len() < ALL_FROM {
             return false;
@@ -695,7 +697,7 @@ impl Map<'_> {
 pub struct Stand {
     /// Takes world points into the camera's axes.
     pub pose: Se3,
-    /// Of pictures of the sight's size.
+    /// Of images of the sight's size.
     pub lens: Lens,
     /// How far its clock is ahead, seconds.
     pub tau: f64,
@@ -735,7 +737,7 @@ pub struct Mapped {
     pub stray: Vec<bool>,
 }
 
-/// Places cameras: from several starts, the best of which is kept. `None`: no two pictures fit together.
+/// Places cameras: from several starts, the best of which is kept. `None`: no two images fit together.
 pub fn map(
     sights: &[Sight],
     tracks: &[Track],

@@ -40,7 +40,7 @@ pub struct Options {
     pub walking: Option<usize>,
 }
 
-/// Where a picture was taken from: a fixed camera's, or one frame's of a moving one.
+/// Where an image was taken from: a fixed camera's, or one frame's of a moving one.
 #[derive(Clone, Debug)]
 pub struct Taken {
     /// The camera.
@@ -58,15 +58,15 @@ pub struct Taken {
 pub struct Placed {
     /// Takes world points into the camera's axes.
     pub pose: Se3,
-    /// In pixels of the files' pictures; of cameras whose lens was known without distortion, which took it away.
+    /// In pixels of the files' images; of cameras whose lens was known without distortion, which took it away.
     pub lens: Lens,
-    /// Pixels across and down of the files' pictures (of those that were halved: a little less).
+    /// Pixels across and down of the files' images (of those that were halved: a little less).
     pub size: [usize; 2],
     /// How far its clock is ahead, seconds: to be taken from its times. Only differences between cameras mean anything.
     pub tau: f64,
     /// Points that it sees where they are.
     pub sightings: usize,
-    /// Their median distance from where they are seen, pixels of the files' pictures.
+    /// Their median distance from where they are seen, pixels of the files' images.
     pub error: f64,
 }
 
@@ -79,9 +79,9 @@ pub struct Point {
     pub color: [u8; 3],
     /// 0: it stands still; otherwise the moment it was seen at.
     pub moment: usize,
-    /// Pictures that see it, by their place in [`Solution::taken`].
+    /// Images that see it, by their place in [`Solution::taken`].
     pub seen: Vec<usize>,
-    /// Mean distance from where it is seen, pixels of the pictures that were worked with.
+    /// Mean distance from where it is seen, pixels of the images that were worked with.
     pub error: f64,
 }
 
@@ -94,10 +94,10 @@ pub struct Solution {
     pub points: Vec<Point>,
     /// Upwards in the world, guessed: what most cameras hold upwards (unit).
     pub up: [f64; 3],
-    /// Pairs of pictures that were found to show one scene.
+    /// Pairs of images that were found to show one scene.
     pub pairs: usize,
     /// For each camera whose place was known, how far what it shows lies from where that says: epipolar distance of matches that
-    /// were found without it, at the median, pixels of the files' pictures. None: too few matches.
+    /// were found without it, at the median, pixels of the files' images. None: too few matches.
     pub contradiction: Vec<Option<f64>>,
     /// Of each of [`Solution::taken`], the points that move by which its clock was found.
     pub moving: Vec<usize>,
@@ -105,13 +105,13 @@ pub struct Solution {
     pub stray: Vec<bool>,
 }
 
-/// Finds where pictures were taken from.
+/// Finds where images were taken from.
 ///
 /// The world's unit is the median distance of the cameras from what they see; its axes are those of the camera that was placed
 /// first. Lengths and the vertical must come from elsewhere. Where all places are known, so are unit and axes: then only points
 /// and clocks are found.
 ///
-/// Errors: pictures that cannot be read; no two that show one scene.
+/// Errors: images that cannot be read; no two that show one scene.
 pub fn solve(pictures: &dyn Pictures, options: &Options, progress: &mut Progress<'_>) -> Result<Solution> {
     let (who, sights, pairing): (Vec<Who>, Vec<Sight>, Pairing) = match options.walking {
         None => {

@@ -1,8 +1,10 @@
-//! Places of features made exact: the windows about one point in all its pictures are laid over each other.
+//! Places of features made exact: the windows about one point in all its images are laid over each other.
 //!
 //! A detector finds the middle of a blob, which is another place of the thing from every side, some tenths of a pixel off. What
-//! counts for poses is that all pictures mean the same place: the window of one picture, warped as a small plane at the point
-//! would be seen from the other camera, is moved over the other picture until they agree best (Lucas and Kanade 1981, with an
+//! counts for poses is that all images mean the same place: the window of one image, warped as a small plane at the
+//! point
+//! would be seen from the other camera, is moved over the other image until they agree best (Lucas and Kanade 1981,
+//! with an
 //! affine warp and gain and offset of brightness; features are adjusted before bundle adjustment as by Lindenberger et al. 2021).
 
 use super::lens::Lens;
@@ -12,27 +14,27 @@ use splat4d::math::mat3::solve;
 use splat4d::math::se3::{dot, mat_vec, normalize, sub, transpose};
 use splat4d::scene::Planes;
 
-/// Part of a picture as features were taken from it, grey.
+/// Part of an image as features were taken from it, grey.
 #[derive(Clone, Debug)]
 pub struct Shown {
-    /// Pixel of the whole picture at which it begins.
+    /// Pixel of the whole image at which it begins.
     pub corner: [usize; 2],
     pub width: usize,
     pub height: usize,
     /// Row by row.
     pub grey: Vec<u8>,
-    /// How much later than the picture its features' places are, seconds.
+    /// How much later than the image its features' places are, seconds.
     pub later: f64,
 }
 
 impl Shown {
-    /// Of a grey picture in [0, 1].
+    /// Of a grey image in [0, 1].
     pub(crate) fn new(grey: &Planes<f32>, corner: [usize; 2], later: f64) -> Self {
         let bytes = grey.plane(0).iter().map(|v| (v * 255.0).round().clamp(0.0, 255.0) as u8).collect();
         Self { corner, width: grey.width, height: grey.height, grey: bytes, later }
     }
 
-    /// Value and gradient at a pixel of the whole picture, between pixels; `None` outside.
+    /// Value and gradient at a pixel of the whole image, between pixels; `None` outside.
     fn at(&self, [u, v]: [f64; 2]) -> Option<[f64; 3]> {
         let x = u - 0.5 - self.corner[0] as f64;
         let y = v - 0.5 - self.corner[1] as f64;
@@ -112,10 +114,10 @@ impl Eye<'_> {
     }
 }
 
-/// A point in a camera's picture.
+/// A point in a camera's image.
 #[derive(Clone, Copy)]
 pub(super) struct Seen<'a> {
-    /// The picture.
+    /// The image.
     pub shown: Option<&'a Shown>,
     /// Where in it.
     pub place: [f64; 2],
@@ -174,7 +176,7 @@ pub(super) fn aligned(x: [f64; 3], seen: &[Seen<'_>], more: &[Seen<'_>]) -> Vec<
     out
 }
 
-/// How pixels about a point in one picture lie in another one, if it stands on a plane with this normal.
+/// How pixels about a point in one image lie in another one, if it stands on a plane with this normal.
 fn warp(x: [f64; 3], normal: [f64; 3], from: &Seen<'_>, to: &Seen<'_>) -> Option<[[f64; 2]; 2]> {
     /// Pixels over which the slope is taken.
     const STEP: f64 = 2.0;

@@ -1,4 +1,4 @@
-//! What cameras see, as features: of what stands still on the median picture, of what moves at moments that all share.
+//! What cameras see, as features: of what stands still on the median image, of what moves at moments that all share.
 
 use super::lens::Known;
 use super::overlay::Shown;
@@ -12,7 +12,7 @@ use splat4d_train::event::Progress;
 use splat4d_train::vision::features::{self, Limits, NUMBERS};
 use splat4d_train::vision::raster::{blurred, grey};
 
-/// Pictures of cameras, by number.
+/// Images of cameras, by number.
 pub trait Pictures: Sync {
     /// How many cameras.
     fn cameras(&self) -> usize;
@@ -22,7 +22,7 @@ pub trait Pictures: Sync {
     fn frames(&self, camera: usize) -> usize;
     /// When a frame was taken, seconds on the clock that all share as far as it is known; ascending.
     fn time(&self, camera: usize, frame: usize) -> f64;
-    /// A frame's picture: 3 channels in [0, 1]. All frames of a camera are of one size.
+    /// A frame's image: 3 channels in [0, 1]. All frames of a camera are of one size.
     fn load(&self, camera: usize, frame: usize) -> Result<Planes<f32>>;
     /// The focal length in pixels, where it is known roughly (metadata).
     fn focal(&self, _camera: usize) -> Option<f64> {
@@ -42,7 +42,7 @@ pub trait Pictures: Sync {
     }
 }
 
-/// A place in a picture that others may show too.
+/// A place in an image that others may show too.
 #[derive(Clone, Debug)]
 pub struct Feature {
     /// Pixels.
@@ -58,14 +58,14 @@ pub struct Feature {
     pub color: [u8; 3],
 }
 
-/// A camera that is to be placed: all of a fixed one's pictures, or one frame of a moving one.
+/// A camera that is to be placed: all of a fixed one's images, or one frame of a moving one.
 #[derive(Clone, Debug)]
 pub struct Sight {
     /// Its name in messages.
     pub name: String,
-    /// Pixels across and down, of the pictures that features are from.
+    /// Pixels across and down, of the images that features are from.
     pub size: [usize; 2],
-    /// Pixels of the files' pictures for each of those.
+    /// Pixels of the files' images for each of those.
     pub factor: f64,
     /// The focal length in pixels, where it is known roughly.
     pub focal: Option<f64>,
@@ -95,7 +95,7 @@ pub struct Look {
     pub still: usize,
     /// Features of a moment, at most, for each camera.
     pub moving: usize,
-    /// Pictures are halved until they have no more pixels.
+    /// Images are halved until they have no more pixels.
     pub pixels: usize,
 }
 
@@ -121,7 +121,7 @@ const TOO_FAR: f64 = 1.0;
 /// Features that move more slowly than this stand still as far as clocks are concerned, pixels a frame.
 const FASTEST: f64 = 40.0;
 
-/// A picture at the size that is worked with, and how many of the file's pixels are one of its.
+/// An image at the size that is worked with, and how many of the file's pixels are one of its.
 fn load(pictures: &dyn Pictures, camera: usize, frame: usize, most: usize) -> Result<(Planes<f32>, f64)> {
     let mut picture = pictures.load(camera, frame)?;
     if picture.channels != 3 || picture.width.min(picture.height) < 32 {
@@ -146,7 +146,7 @@ fn bytes(picture: &Planes<f32>) -> Vec<u8> {
     picture.data.iter().map(|v| (v * 255.0).round().clamp(0.0, 255.0) as u8).collect()
 }
 
-/// What of a picture counts.
+/// What of an image counts.
 struct Mask {
     mask: Planes<f32>,
     size: [usize; 2],
@@ -159,7 +159,7 @@ impl Mask {
     }
 }
 
-/// The mask for a picture at the size that is worked with.
+/// The mask for an image at the size that is worked with.
 fn mask(pictures: &dyn Pictures, camera: usize, frame: usize, picture: &Planes<f32>) -> Result<Option<Mask>> {
     let size = [picture.width, picture.height];
     Ok(pictures.mask(camera, frame)?.map(|mask| Mask { mask, size }))
@@ -220,7 +220,7 @@ fn frame_length(pictures: &dyn Pictures, camera: usize) -> f64 {
 
 /// Cameras that do not move, one sight each.
 ///
-/// Errors: a camera without frames, pictures that cannot be read or change their size.
+/// Errors: a camera without frames, images that cannot be read or change their size.
 pub fn fixed(pictures: &dyn Pictures, look: &Look, progress: &mut Progress<'_>) -> Result<Vec<Sight>> {
     let count = pictures.cameras();
     for camera in 0..count {
@@ -247,7 +247,7 @@ pub fn fixed(pictures: &dyn Pictures, look: &Look, progress: &mut Progress<'_>) 
         Vec::new()
     };
     let mut out = Vec::with_capacity(count);
-    // A few at a time, so that progress is told and few pictures are in memory.
+    // A few at a time, so that progress is told and few images are in memory.
     const TOGETHER: usize = 4;
     for part in (0..count).collect::<Vec<_>>().chunks(TOGETHER) {
         progress.phase("features", part[0], count);
@@ -307,12 +307,12 @@ impl Sight {
         let Some(known) = pictures.known(camera) else { return self };
         let straight = known.straight(self.size, self.factor);
         self.features.retain_mut(|f| straight.feature(f));
-        // Pictures are as the lens bent them: places of straightened features are not theirs.
+        // Images are as the lens bent them: places of straightened features are not theirs.
         Self { focal: Some(straight.focal()), exact: true, pose: known.pose, shown: Vec::new(), ..self }
     }
 }
 
-/// Part of a picture.
+/// Part of an image.
 struct Window {
     x: usize,
     y: usize,
@@ -348,7 +348,8 @@ impl Window {
     }
 }
 
-/// Features of what moves in a frame, each with its velocity; brought to the time of the moment, which may lie beside the
+/// Features of what moves in a frame, each with its velocity; brought to the time of the moment, which may lie next
+/// to the
 /// frame's. And what they are from.
 fn moving(
     pictures: &dyn Pictures,
@@ -409,7 +410,7 @@ fn moving(
 }
 
 /// Frames of moving cameras, one sight each: at most `most`, evenly chosen. What moves in them contradicts what stands still and
-/// is left out where pictures are compared.
+/// is left out where images are compared.
 ///
 /// Errors: as [`fixed`].
 pub fn walking(

@@ -1,4 +1,4 @@
-//! From made-up features and pictures to cameras.
+//! From synthetic features and images to cameras.
 
 use super::lens::Known;
 use super::lens::Lens;

@@ -1,4 +1,4 @@
-//! Features of many pictures that show one place: matched without any pose, verified two pictures at a time, joined.
+//! Features of many images that show one place: matched without any pose, verified two images at a time, joined.
 
 use super::pictures::{Feature, Sight};
 use super::two_view::{Pair, fundamental, unlike_focal};
@@ -15,11 +15,11 @@ use splat4d_train::vision::triangulate::Transfer;
 const RATIO: f32 = 0.8;
 /// Features nearer than this to each other show one place: no rivals, pixels.
 const SAME: f64 = 1.5;
-/// Pairs of pictures with fewer verified matches say nothing: seven always agree.
+/// Pairs of images with fewer verified matches say nothing: seven always agree.
 const LEAST: usize = 14;
 /// Of the matches the least share that is verified: by chance more agree only among few.
 const LEAST_SHARE: f64 = 0.15;
-/// Epipolar distance of verified matches, pixels of pictures of [`super::mapper::UNIT`] across.
+/// Epipolar distance of verified matches, pixels of images of [`super::mapper::UNIT`] across.
 const TOLERANCE: f64 = 3.0;
 
 /// Two sights and the features that they share.
@@ -29,7 +29,7 @@ pub struct Link {
     pub sights: [usize; 2],
     /// Numbers of the features and how sure: the smaller the ratio of the best to the second best the better.
     pub matches: Vec<([usize; 2], f32)>,
-    /// From pixels (about the middle of the first picture) to lines of the second; zero where poses led to the matches.
+    /// From pixels (about the middle of the first image) to lines of the second; zero where poses led to the matches.
     pub fundamental: [[f64; 3]; 3],
     /// All that look alike, whether they agree with one motion or not; empty where poses led to the matches.
     pub alike: Vec<[usize; 2]>,
@@ -42,7 +42,7 @@ pub struct Track {
     pub seen: Vec<(usize, usize)>,
 }
 
-/// Which pictures are compared.
+/// Which images are compared.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Pairing {
     /// All with all.
@@ -92,7 +92,7 @@ fn rows(features: &[Feature]) -> Vec<Rows> {
 
 /// Rows that are multiplied at once: what they make stays in the cache.
 const BLOCK: usize = 128;
-/// Pairs of pictures that are compared between two reports of progress.
+/// Pairs of images that are compared between two reports of progress.
 const TOGETHER: usize = 16;
 
 /// Mutual best matches of two sets of descriptors whose second best is clearly worse, by the first one's numbers.
@@ -151,7 +151,7 @@ fn mutual(a: &Rows, b: &Rows, from: &[Feature], to: &[Feature]) -> Vec<([usize; 
     out
 }
 
-/// Compares pictures and keeps what agrees with one motion between them, in the order of pairs.
+/// Compares images and keeps what agrees with one motion between them, in the order of pairs.
 pub fn links(sights: &[Sight], pairing: Pairing, seed: u64, progress: &mut Progress<'_>) -> Vec<Link> {
     let all: Vec<Vec<Rows>> = sights.par_iter().map(|s| rows(&s.features)).collect();
     let pairs = pairing.pairs(sights.len());
@@ -182,13 +182,14 @@ pub(crate) struct Known {
 
 /// Second-best matches are looked for along the epipolar line alone, where there are few: they must be farther away.
 const GUIDED_RATIO: f32 = 0.75;
-/// What is alone on its line must be as good as if something quite unlike stood beside it: squared distance of descriptors, an
+/// What is alone on its line must be as good as if something quite unlike stood next to it: squared distance of
+/// descriptors, an
 /// eighth of the largest there is.
 const FAR: f32 = 65_536.0;
 /// Cameras whose axes are farther apart see other sides of things, degrees.
 const WIDEST: f64 = 80.0;
 
-/// Compares placed pictures along epipolar lines, within `tolerance` pixels of [`super::lens::unit`].
+/// Compares placed images along epipolar lines, within `tolerance` pixels of [`super::lens::unit`].
 pub(crate) fn guided(
     sights: &[Sight],
     known: &[Option<Known>],
@@ -282,7 +283,7 @@ fn along(a: &Rows, b: &Rows, lines: &[[f32; 3]], pixels: &[[f64; 2]]) -> Vec<([u
     forth.iter().enumerate().filter_map(mutual).collect()
 }
 
-/// Pixels about the middle of the picture.
+/// Pixels about the middle of the image.
 pub(crate) fn about_middle(sight: &Sight, pixel: [f64; 2]) -> [f64; 2] {
     std::array::from_fn(|k| pixel[k] - 0.5 * sight.size[k] as f64)
 }
@@ -355,7 +356,8 @@ pub fn join(sights: &[Sight], links: &[Link]) -> Vec<Track> {
     members.into_iter().filter(|m| m.len() > 1).map(track).collect()
 }
 
-/// The focal lengths, in units of the pictures' larger side, that all cameras may share, the likeliest first: each link votes for
+/// The focal lengths, in units of the images' larger side, that all cameras may share, the likeliest first: each
+/// link votes for
 /// those with which its fundamental matrix is an essential one.
 pub fn focal_votes(sights: &[Sight], links: &[Link], candidates: &[f64]) -> Vec<f64> {
     /// What a matrix of noisy matches misses, at the right focal length: the vote falls to 1/e.

@@ -1,4 +1,4 @@
-//! What two pictures of one scene say about each other: fundamental and essential matrices, and the motion between their
+//! What two images of one scene say about each other: fundamental and essential matrices, and the motion between their
 //! cameras.
 
 use super::algebra::{
@@ -9,7 +9,7 @@ use splat4d::math::se3::{cross, dot, mat_mul, mat_vec, norm, normalize, transpos
 use splat4d::math::{Rng, Se3};
 use std::sync::LazyLock;
 
-/// A place as the first and the second picture show it.
+/// A place as the first and the second image show it.
 pub type Pair = [[f64; 2]; 2];
 
 /// Samples, at most: enough for seven clean of thirty per cent clean data with a chance of one half, and for five of them
@@ -61,7 +61,7 @@ fn seven(sample: &[Pair]) -> Vec<Mat3> {
         .collect()
 }
 
-/// Pairs in which a fundamental matrix is looked for, about the pictures' middles and in units of their size, so that the
+/// Pairs in which a fundamental matrix is looked for, about the images' middles and in units of their size, so that the
 /// system is well conditioned (Hartley 1997).
 struct Uncalibrated<'a> {
     pairs: &'a [Pair],
@@ -107,7 +107,7 @@ impl Data for Uncalibrated<'_> {
 
 /// The fundamental matrix F that most pairs agree with (b·F·a = 0 within `tolerance` pixels).
 ///
-/// Pixel positions are about the pictures' middles (subtract them before); `size` is the larger side of the pictures. F is
+/// Pixel positions are about the images' middles (subtract them before); `size` is the larger side of the images. F is
 /// for positions in pixels. `None`: fewer than seven pairs, or no model.
 pub(crate) fn fundamental(pairs: &[Pair], size: f64, tolerance: f64, rng: Rng) -> Option<Found<Mat3>> {
     let unit = 0.5 * size;

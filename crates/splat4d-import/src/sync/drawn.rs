@@ -1,4 +1,5 @@
-//! A made-up rig for tests: lights that move before textured walls, as fixed cameras with clocks of their own see them.
+//! A synthetic rig for tests: lights that move before textured walls, as fixed cameras with clocks of their own see
+//! them.
 
 use super::grey::Grey;
 use super::tracks::Track;
@@ -71,7 +72,7 @@ impl Rig {
         [place(0) + wave(10), place(1) + wave(20), place(2) + wave(30)]
     }
 
-    /// A camera's picture at a second of its own clock.
+    /// A camera's image at a second of its own clock.
     pub(super) fn picture(&self, camera: usize, time: f64) -> Rgb8 {
         let t = time + self.offsets[camera];
         let mut data = vec![0.0; WIDTH * HEIGHT];
@@ -98,7 +99,7 @@ impl Rig {
         Rgb8 { width: WIDTH, height: HEIGHT, data: data.iter().flat_map(|&v| [byte(v); 3]).collect() }
     }
 
-    /// The median of some of a camera's pictures.
+    /// The median of some of a camera's images.
     pub(super) fn still(&self, camera: usize, frames: usize) -> Grey {
         let all: Vec<Grey> = (0..7).map(|k| Grey::of(&self.picture(camera, (k * frames / 7) as f64 / FPS))).collect();
         let mut out = all[0].clone();

@@ -1,9 +1,9 @@
-//! Grey pictures in ever smaller sizes.
+//! Grey images in ever smaller sizes.
 
 use splat4d::math::image::box_means;
 use splat4d_train::capture::Rgb8;
 
-/// A grey picture, values from 0 to 1, rows from the top.
+/// A grey image, values from 0 to 1, rows from the top.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Grey {
     /// Pixels across.
@@ -15,7 +15,7 @@ pub struct Grey {
 }
 
 impl Grey {
-    /// The luma of a picture (BT.601's weights).
+    /// The luma of an image (BT.601's weights).
     pub fn of(picture: &Rgb8) -> Self {
         let luma = |p: &[u8]| (0.299 * f32::from(p[0]) + 0.587 * f32::from(p[1]) + 0.114 * f32::from(p[2])) / 255.0;
         Self { width: picture.width, height: picture.height, data: picture.data.chunks_exact(3).map(luma).collect() }
@@ -70,7 +70,7 @@ impl Grey {
     }
 }
 
-/// A picture, half of it, a quarter of it and so on.
+/// An image, half of it, a quarter of it and so on.
 #[derive(Clone, Debug)]
 pub struct Pyramid {
     pub(super) levels: Vec<Grey>,

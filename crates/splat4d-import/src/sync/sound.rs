@@ -28,7 +28,7 @@ const WHITEN_FLOOR: f64 = 1e-3;
 const WINDOWS: usize = 12;
 /// Shortest and longest window, seconds.
 const WINDOW: [f64; 2] = [0.4, 4.0];
-/// A second peak is one farther than this from the first, seconds: nearer ones are echoes of walls beside the camera.
+/// A second peak is one farther than this from the first, seconds: nearer ones are echoes of walls next to the camera.
 const ECHO: f64 = 5e-3;
 /// From this ratio of the first peak to the second on a window is clear.
 const CLEAR: f64 = 1.5;

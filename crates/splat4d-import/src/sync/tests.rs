@@ -1,4 +1,4 @@
-//! Lags and offsets of made-up sound, motion and geometry, where the truth is known.
+//! Lags and offsets of synthetic sound, motion and geometry, where the truth is known.
 
 use super::drawn::{Dance, FPS, Rig};
 use super::epipolar::{self, Range};

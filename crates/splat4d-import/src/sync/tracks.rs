@@ -6,9 +6,9 @@ use splat4d_train::capture::Rgb8;
 
 /// Pixels between corners that are followed.
 pub const APART: f64 = 8.0;
-/// Pictures are halved until they have no more pixels: 640x360 is looked at as it is, and a film's pictures at half size.
+/// Images are halved until they have no more pixels: 640x360 is looked at as it is, and a film's images at half size.
 pub const PIXELS: usize = 700_000;
-/// Sizes of a picture: motion of up to `RADIUS · 2^(LEVELS − 1)` pixels is followed.
+/// Sizes of an image: motion of up to `RADIUS · 2^(LEVELS − 1)` pixels is followed.
 pub const LEVELS: usize = 4;
 /// Half the side of the window that is followed, pixels.
 const RADIUS: usize = 6;
@@ -25,7 +25,7 @@ const QUALITY: f64 = 0.01;
 /// The largest mean absolute difference between a window and where it went, of 1: more, and something else is there.
 const LARGEST_CHANGE: f64 = 0.08;
 
-/// The picture at the size at which corners are followed, and how many of its own pixels are one of that across.
+/// The image at the size at which corners are followed, and how many of its own pixels are one of that across.
 pub fn small(picture: Rgb8) -> (Rgb8, f64) {
     let (mut out, mut factor) = (picture, 1.0);
     while out.width * out.height > PIXELS {
@@ -113,7 +113,7 @@ fn b_spline(u: f64) -> [f64; 4] {
     [v2 * v / 6.0, inner(u, u2), inner(v, v2), u2 * u / 6.0]
 }
 
-/// The corners of a picture where `wanted` allows, the strongest first, at least `apart` pixels from each other and from
+/// The corners of an image where `wanted` allows, the strongest first, at least `apart` pixels from each other and from
 /// `taken` ones.
 pub fn corners(picture: &Grey, wanted: Option<&[bool]>, most: usize, apart: f64, taken: &[[f64; 2]]) -> Vec<[f64; 2]> {
     let (width, height) = (picture.width, picture.height);
@@ -179,7 +179,7 @@ fn smaller_eigenvalue([xx, xy, yy]: [f64; 3]) -> f64 {
     0.5 * (xx + yy) - (0.25 * (xx - yy) * (xx - yy) + xy * xy).sqrt()
 }
 
-/// Where points of picture a are in picture b; None where they are lost: they left, nothing there is like them, or they do
+/// Where points of image a are in image b; None where they are lost: they left, nothing there is like them, or they do
 /// not come back when followed the other way.
 pub fn follow(a: &Pyramid, b: &Pyramid, points: &[[f64; 2]]) -> Vec<Option<[f64; 2]>> {
     let both = |&p: &[f64; 2]| {
@@ -228,7 +228,7 @@ fn at_level(a: &Grey, b: &Grey, [x, y]: [f64; 2], mut moved: [f64; 2], finest: b
     let mean = window.iter().sum::<f64>() / COUNT;
     window.iter_mut().for_each(|v| *v -= mean);
     if smaller_eigenvalue(matrix.map(|m| m / COUNT)) < LEAST_EIGENVALUE {
-        // Small pictures may have lost the corner: the next size will find it.
+        // Small images may have lost the corner: the next size will find it.
         return if finest { None } else { Some(moved) };
     }
     let determinant = matrix[0] * matrix[2] - matrix[1] * matrix[1];
@@ -321,7 +321,7 @@ impl Tracker {
     }
 }
 
-/// The pixels of a picture that differ from the `still` one by more than noise: where something moves.
+/// The pixels of an image that differ from the `still` one by more than noise: where something moves.
 pub fn moving(picture: &Grey, still: &Grey) -> Vec<bool> {
     /// Differences above this, of 1, are no noise of ordinary cameras.
     const MOVED: f32 = 0.05;
@@ -362,7 +362,7 @@ mod tests {
                 |p: &[f64; 2]| (16.0..80.0).contains(&(p[0] + shift[0])) && (16.0..64.0).contains(&(p[1] + shift[1]));
             let both: Vec<_> = found.iter().zip(&moved).filter(|(p, _)| inside(p)).collect();
             let kept: Vec<_> = both.iter().filter_map(|(p, m)| m.map(|m| (p, m))).collect();
-            // Some cannot be told from their neighbours in small pictures when they move far.
+            // Some cannot be told from their neighbours in small images when they move far.
             assert!(kept.len() * 2 >= both.len(), "{shift:?}: {} of {}", kept.len(), both.len());
             for (p, m) in kept {
                 let off = (m[0] - p[0] - shift[0]).hypot(m[1] - p[1] - shift[1]);

@@ -20,7 +20,7 @@ pub(super) struct Cache {
 
 #[derive(Serialize, Deserialize)]
 struct Entry<T> {
-    /// In full, so that two keys of one hash are told apart.
+    /// In full, so that two keys of one hash are distinguished.
     made_of: String,
     value: T,
 }

@@ -1,4 +1,4 @@
-//! Poses of fixed cameras by the COLMAP program, where it is installed: one picture a camera, of what stands still.
+//! Poses of fixed cameras by the COLMAP program, where it is installed: one image a camera, of what stands still.
 
 use super::stored::Stored;
 use crate::calibration::{self, Calibration};
@@ -62,7 +62,8 @@ const STEPS: [Step; 3] = [
     },
 ];
 
-/// Lenses and places of all cameras. The work lies in `import/colmap` of the capture's folder, and is not done again where pictures
+/// Lenses and places of all cameras. The work lies in `import/colmap` of the capture's folder, and is not done again
+/// where images
 /// and masks are the same.
 ///
 /// Errors: no program; it fails; cameras that it could not place; of kind `Interrupted` where `stop` said so.

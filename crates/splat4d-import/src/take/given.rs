@@ -1,4 +1,4 @@
-//! A calibration that was given: whose camera is whose, and what it says of stored pictures.
+//! A calibration that was given: whose camera is whose, and what it says of stored images.
 
 use super::{Camera, Request};
 use crate::calibration::{self, Calibrated, Calibration, Shape, Unit, Video};
@@ -72,11 +72,12 @@ impl Given {
     }
 }
 
-/// Pictures of a camera in which bars are looked for.
+/// Images of a camera in which bars are looked for.
 const LOOKS: usize = 3;
 
-/// What is known of every camera's stored pictures: by calibration, and by the user's own lens, which goes first. Sentences about
-/// calibrations that had to be corrected for them join the pictures' warnings.
+/// What is known of every camera's stored images: by calibration, and by the user's own lens, which goes first.
+/// Sentences about
+/// calibrations that had to be corrected for them join the images' warnings.
 pub(super) fn known(
     given: Option<&Given>,
     corrections: &Corrections,
@@ -107,7 +108,7 @@ pub(super) fn known(
     Ok(out)
 }
 
-/// Some grey pictures of a camera, spread over the take.
+/// Some grey images of a camera, spread over the take.
 fn some(folder: &Path, pictures: &Pictures) -> Result<Vec<Planes<f32>>> {
     let count = pictures.shots.len();
     let look = |k: usize| {

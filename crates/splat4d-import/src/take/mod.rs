@@ -46,23 +46,23 @@ pub enum Rig {
 /// What is to be imported, and how.
 #[derive(Clone, Debug)]
 pub struct Request {
-    /// Videos, folders of pictures, and folders of those.
+    /// Videos, folders of images, and folders of those.
     pub inputs: Vec<PathBuf>,
     /// The capture's folder.
     pub folder: PathBuf,
     /// Which frames, on the clock of the first camera, and how large.
     pub selection: Selection,
-    /// Frames per second of folders of pictures.
+    /// Frames per second of folders of images.
     pub fps: f64,
     /// Whether cameras stand still.
     pub rig: Rig,
     /// Whether sound is used.
     pub sound: bool,
-    /// How pictures are stored.
+    /// How images are stored.
     pub format: Format,
     /// Two cameras and the metres between them.
     pub apart: Option<([String; 2], f64)>,
-    /// Tags that are in the pictures, for lengths and upwards.
+    /// Tags that are in the images, for lengths and upwards.
     pub board: Option<Board>,
     /// A camera and the metres that it stands above the floor.
     pub camera_height: Option<(String, f64)>,
@@ -86,7 +86,8 @@ const PLACED_WARN: f64 = 0.9;
 /// Points below which a reconstruction hangs on too little: a chessboard's.
 const FEW_POINTS: usize = 50;
 
-/// Pixels of 1920 that what a camera shows may lie from where the calibration says: a rig that was pushed or focussed anew is off
+/// Pixels of 1920 that what a camera shows may lie from where the calibration says: a rig that was pushed or
+/// focussed again is off
 /// by more, and rigs that people work with by 1 or 2.
 const CONTRADICTS: f64 = 5.0;
 /// A calibration that is contradicted by more than this part of the cameras that tell is not of this take.
@@ -99,7 +100,7 @@ struct Camera {
 
 /// Makes a capture. `stop` is asked between steps and between frames.
 ///
-/// Errors: inputs that cannot be read, cameras that share no time, pictures that do not show one scene, no space; of kind
+/// Errors: inputs that cannot be read, cameras that share no time, images that do not show one scene, no space; of kind
 /// `Interrupted` where `stop` said so. What was stored until then is kept, and the same request goes on from there.
 pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() -> bool) -> Result<Report> {
     request.selection.check()?;
@@ -192,7 +193,7 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     if request.colmap {
         let bare = stored::Stored::new(folder, &pictures, &[], &masks);
         let found = colmap::calibrate(&bare, progress, stop)?;
-        // It saw the stored pictures.
+        // It saw the stored images.
         let seen: Vec<Video<'_>> = pictures.iter().map(|p| Video { name: &p.name, size: p.size }).collect();
         let found = given::Given::of(&found, &seen, "the COLMAP program")?;
         report.guesses.extend(found.notes.iter().cloned());
@@ -284,7 +285,7 @@ fn check(solved: &poses::Solved, pictures: &[Pictures], report: &mut Report) -> 
     Ok(())
 }
 
-/// Compares what was given with what pictures show, and refuses what they contradict.
+/// Compares what was given with what images show, and refuses what they contradict.
 fn agrees(solved: &poses::Solved, pictures: &[Pictures], report: &mut Report) -> Result<()> {
     let (mut told, mut wrong) = (Vec::new(), 0);
     for (k, p) in pictures.iter().enumerate() {

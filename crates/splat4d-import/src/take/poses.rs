@@ -34,11 +34,11 @@ pub(super) struct Stand {
     pub poses: Vec<Option<Se3>>,
     /// One pose for all frames.
     pub fixed: bool,
-    /// Pixels of the stored pictures.
+    /// Pixels of the stored images.
     pub intrinsics: Intrinsics,
     pub lens: Lens,
     pub sightings: usize,
-    /// Pixels of the stored pictures.
+    /// Pixels of the stored images.
     pub error: f64,
 }
 
@@ -149,7 +149,7 @@ impl Note {
     }
 }
 
-/// What was solved before of the same pictures, clocks and lenses, else what `solve` finds now.
+/// What was solved before of the same images, clocks and lenses, else what `solve` finds now.
 pub(super) fn once(
     cache: &Cache,
     stored: &Stored<'_>,

@@ -1,4 +1,4 @@
-//! The stored pictures as structure from motion asks for them.
+//! The stored images as structure from motion asks for them.
 
 use crate::sfm;
 use crate::sfm::lens::Known;
@@ -11,14 +11,14 @@ use splat4d::scene::Planes;
 use splat4d_train::capture::Rgb8;
 use std::path::Path;
 
-/// All cameras' stored pictures, and the clock of all as far as it is known.
+/// All cameras' stored images, and the clock of all as far as it is known.
 pub(super) struct Stored<'a> {
     pub folder: &'a Path,
     pub pictures: &'a [Pictures],
     pub offsets: Vec<Option<Offset>>,
     /// Lenses, and places, that were given.
     pub known: &'a [Option<Known>],
-    /// What of pictures counts; empty: all of it.
+    /// What of images counts; empty: all of it.
     pub masks: &'a [Masks],
 }
 
@@ -32,7 +32,7 @@ impl<'a> Stored<'a> {
         Self { folder, pictures, offsets: vec![None; pictures.len()], known, masks }
     }
 
-    /// The same pictures on another clock.
+    /// The same images on another clock.
     pub(super) fn on(&self, offsets: &[Option<Offset>]) -> Self {
         Self { offsets: offsets.to_vec(), ..*self }
     }
@@ -47,7 +47,7 @@ impl<'a> Stored<'a> {
         !self.known.is_empty() && self.known.iter().all(|k| k.is_some_and(|k| k.pose.is_some()))
     }
 
-    /// Changes with pictures, masks, and what was given of cameras.
+    /// Changes with images, masks, and what was given of cameras.
     pub(super) fn fingerprint(&self) -> String {
         let prints: Vec<&str> = self.pictures.iter().map(|p| p.fingerprint.as_str()).collect();
         let masks: Vec<u64> = self.masks.iter().map(|m| m.fingerprint).collect();

@@ -71,7 +71,7 @@ struct Placed {
 
 /// Looks for a board's tags, and measures them.
 ///
-/// Errors: pictures that cannot be read; no tags, or none that two cameras see; tags that contradict each other.
+/// Errors: images that cannot be read; no tags, or none that two cameras see; tags that contradict each other.
 pub(super) fn measured(
     board: &Board,
     stored: &Stored<'_>,
@@ -124,7 +124,7 @@ fn stood(stored: &Stored<'_>, solved: &Solved) -> Vec<Look> {
             let off = |k: &usize| (stored.time(camera, *k) - at).abs();
             let nearest = (0..stored.frames(camera)).min_by(|a, b| off(a).total_cmp(&off(b)));
             let interval = stored.pictures[camera].clock.interval;
-            // One picture is of every moment.
+            // One image is of every moment.
             let near = |k: &usize| stored.frames(camera) == 1 || off(k) <= NEAR * interval;
             out.extend(nearest.filter(near).map(|frame| Look { camera, frame, moment }));
         }
@@ -277,7 +277,7 @@ mod tests {
         let tilt = Se3::look_at([0.0; 3], [0.3, 1.0, 0.2], [0.1, 0.2, 1.0]).rotation;
         let world = |p: [f64; 3]| splat4d::math::se3::mat_vec(&tilt, p).map(|v| v / unit);
         let family = board.family;
-        // Seen from above, x to the right and y downwards in the picture: z of the plane points away.
+        // Seen from above, x to the right and y downwards in the image: z of the plane points away.
         let put = |id: usize, x: f64, y: f64, side: f64| Put {
             family,
             id,

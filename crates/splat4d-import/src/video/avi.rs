@@ -235,7 +235,7 @@ mod tests {
         out
     }
 
-    /// An AVI of flat pictures at 25 frames per second; `None` repeats.
+    /// An AVI of flat images at 25 frames per second; `None` repeats.
     fn film(shades: &[Option<u8>]) -> Vec<u8> {
         let mut header = vec![0; 56];
         header[..8].copy_from_slice(b"vidsMJPG");

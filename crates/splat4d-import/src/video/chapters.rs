@@ -239,7 +239,7 @@ mod tests {
         assert!(missing(&paths(&["GX010012.MP4", "GX030012.MP4"])).unwrap().contains("Chapter 2"));
     }
 
-    /// Folders of pictures stand for chapters.
+    /// Folders of images stand for chapters.
     #[test]
     fn chapters_are_one_clock() {
         let dir = tempfile::tempdir().unwrap();

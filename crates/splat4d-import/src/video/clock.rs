@@ -6,16 +6,18 @@ use super::Rgb8;
 const DROPPED: f64 = 1.5;
 /// An interval below so many medians is one that a frame was put in a second time.
 const DOUBLED: f64 = 0.25;
-/// Two pictures whose samples differ by less than this on average (of 255) are one picture: codecs repeat a frame without a
+/// Two images whose samples differ by less than this on average (of 255) are one image: codecs repeat a frame without a
 /// bit of change, sensors never do.
 const SAME_PICTURE: f64 = 0.3;
-/// And by less than this part of what most pictures differ by: where little moves before a fixed camera, compressed pictures
+/// And by less than this part of what most images differ by: where little moves before a fixed camera, compressed
+/// images
 /// that follow each other may differ as little.
 const SAME_PART: f64 = 0.2;
-/// Differences by which most pictures are told (three quarters of them differ by less): of frames doubled one by one, half
+/// Differences by which most images are told (three quarters of them differ by less): of frames doubled one by one,
+/// half
 /// differ by nothing.
 const MOST: f64 = 0.75;
-/// Where most pictures differ by less than this, nothing moves, and nothing is doubled.
+/// Where most images differ by less than this, nothing moves, and nothing is doubled.
 const STILL: f64 = 0.02;
 /// Intervals that differ from the median by more than this part of it vary.
 const VARIES: f64 = 0.1;
@@ -42,7 +44,7 @@ pub struct Clock {
     pub dropped: Vec<Gap>,
     /// Numbers of frames that show the one before again.
     pub doubled: Vec<usize>,
-    /// Whether pictures are like the one before: nothing moves.
+    /// Whether images are like the one before: nothing moves.
     pub still: bool,
 }
 
@@ -94,7 +96,7 @@ impl Clock {
     }
 }
 
-/// The mean absolute difference of two pictures' samples, 0 to 255; 255 where their sizes differ.
+/// The mean absolute difference of two images' samples, 0 to 255; 255 where their sizes differ.
 pub fn mean_difference(a: &Rgb8, b: &Rgb8) -> f64 {
     if (a.width, a.height) != (b.width, b.height) || a.data.is_empty() {
         return 255.0;

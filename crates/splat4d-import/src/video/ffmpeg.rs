@@ -1,4 +1,4 @@
-//! Videos through the ffmpeg program: pictures and their times through two pipes, sound through one.
+//! Videos through the ffmpeg program: images and their times through two pipes, sound through one.
 
 use super::filters::{self, Chain};
 use super::probe::{self, Probe};
@@ -103,7 +103,7 @@ impl Source for Video {
 
     fn sound(&self) -> Result<Option<Vec<f32>>> {
         let Some(stream) = self.probe.sound else { return Ok(None) };
-        // Sound that begins later than the pictures is preceded by silence; gaps are filled with it.
+        // Sound that begins later than the images is preceded by silence; gaps are filled with it.
         let filter = format!("aresample={SOUND_RATE}:async=1:first_pts=0");
         let output = ["-map", &format!("0:{stream}"), "-vn", "-af", &filter, "-ac", "1", "-t", &MAX_SOUND.to_string()];
         let mut output: Vec<String> = output.map(String::from).to_vec();
@@ -124,7 +124,7 @@ impl Source for Video {
             let what = format!("its sound cannot be decoded{}", said.bracketed());
             return Err(Error::input(what).at(self.path.display()).remedy("Synchronise without its sound."));
         }
-        // Damaged files hold what is no number.
+        // Damaged files hold what is not finite.
         samples.iter_mut().filter(|s| !s.is_finite()).for_each(|s| *s = 0.0);
         Ok((!samples.is_empty()).then_some(samples))
     }
@@ -152,7 +152,7 @@ struct Pictures<'a> {
     raw: Vec<u8>,
     warnings: Vec<String>,
     done: bool,
-    /// Whether a time had to be made up.
+    /// Whether a time had to be synthetic.
     guessed: bool,
 }
 

@@ -1,4 +1,4 @@
-//! Folders of pictures, and image sequences: numbers in names are the clock.
+//! Folders of images, and image sequences: numbers in names are the clock.
 
 use super::{Color, Frame, Info, Range, Reader, Rgb8, Selection, Source, Transfer, fingerprint_of_file, fnv1a, stem};
 use image::imageops::{FilterType, resize};
@@ -6,12 +6,12 @@ use splat4d::{Error, Result};
 use std::cmp::Ordering;
 use std::path::{Path, PathBuf};
 
-/// Endings of pictures.
+/// Endings of images.
 pub(crate) const ENDINGS: [&str; 4] = ["jpg", "jpeg", "png", "webp"];
 /// Frames per second that anything was ever filmed at, and slower time lapses.
 const RATES: std::ops::RangeInclusive<f64> = 1e-6..=1e5;
 
-/// The pictures of a folder, in the order of the numbers in their names.
+/// The images of a folder, in the order of the numbers in their names.
 pub struct Folder {
     info: Info,
     /// Files and their times.
@@ -19,10 +19,10 @@ pub struct Folder {
 }
 
 impl Folder {
-    /// Looks what is there; reads the first picture for its size. Pictures are `1/fps` seconds apart, and further where
+    /// Looks what is there; reads the first image for its size. Images are `1/fps` seconds apart, and further where
     /// numbers are missing.
     ///
-    /// Errors: no pictures, a frame rate that is none, a damaged first picture.
+    /// Errors: no images, a frame rate that is none, a damaged first image.
     pub fn open(path: &Path, fps: f64) -> Result<Self> {
         if !RATES.contains(&fps) {
             return Err(Error::input(format!("invalid frame rate {fps}"))
@@ -108,7 +108,7 @@ struct Pictures<'a> {
     folder: &'a Folder,
     selection: Selection,
     next: usize,
-    /// Pictures of the chosen part so far.
+    /// Images of the chosen part so far.
     counted: usize,
     times: Vec<f64>,
 }
@@ -153,7 +153,7 @@ impl Reader for Pictures<'_> {
     }
 }
 
-/// A picture in the size that was asked for.
+/// An image in the size that was asked for.
 pub(super) fn scaled(picture: Rgb8, selection: &Selection) -> Rgb8 {
     let [width, height] = selection.scaled([picture.width, picture.height]);
     if [width, height] == [picture.width, picture.height] {
@@ -161,7 +161,7 @@ pub(super) fn scaled(picture: Rgb8, selection: &Selection) -> Rgb8 {
     }
     let whole = image::RgbImage::from_raw(picture.width as u32, picture.height as u32, picture.data);
     let whole = whole.expect("an image has width·height·3 samples");
-    // The same kind of curve as ffmpeg's; both widen it where pictures get smaller.
+    // The same kind of curve as ffmpeg's; both widen it where images get smaller.
     let data = resize(&whole, width as u32, height as u32, FilterType::CatmullRom).into_raw();
     Rgb8 { width, height, data }
 }
@@ -204,7 +204,8 @@ fn natural(a: &str, b: &str) -> Ordering {
     }
 }
 
-/// How many intervals each picture comes after the first: by the last numbers in the names where they ascend evenly but for
+/// How many intervals each image comes after the first: by the last numbers in the names where they ascend evenly
+/// but for
 /// some that are missing, else by position.
 fn steps(names: &[String]) -> Vec<f64> {
     let by_position = || (0..names.len()).map(|i| i as f64).collect();

@@ -37,7 +37,7 @@ pub struct Selection {
     pub from: Option<f64>,
     /// No frame at or after this second.
     pub to: Option<f64>,
-    /// Pixels of the shorter side; smaller pictures stay as they are.
+    /// Pixels of the shorter side; smaller images stay as they are.
     pub size: Option<usize>,
     /// Whether interlaced videos are taken, and their lines filled in.
     pub deinterlace: bool,
@@ -75,7 +75,7 @@ impl Selection {
         Ok(())
     }
 
-    /// The size that pictures of `size` get: of the same shape, their shorter side as asked for.
+    /// The size that images of `size` get: of the same shape, their shorter side as asked for.
     pub(crate) fn scaled(&self, [width, height]: [usize; 2]) -> [usize; 2] {
         match self.size {
             Some(side) if side < width.min(height) => {
@@ -92,10 +92,10 @@ impl Selection {
     }
 }
 
-/// Shorter side of the smallest pictures that anything can be made of.
+/// Shorter side of the smallest images that anything can be made of.
 const MIN_SIDE: usize = 16;
 
-/// A picture and when it was taken.
+/// An image and when it was taken.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Frame {
     /// Its number among the frames that were passed, chosen or not; an index into [`Reader::times`].
@@ -112,7 +112,7 @@ pub struct Frame {
 pub trait Reader {
     /// The next chosen frame, in the place of the last one; false at the end.
     ///
-    /// Errors: nothing can be decoded at all, a picture is damaged or of another size. What can be decoded in part ends
+    /// Errors: nothing can be decoded at all, an image is damaged or of another size. What can be decoded in part ends
     /// early, and a warning says so.
     fn next(&mut self, frame: &mut Frame) -> Result<bool>;
 
@@ -123,7 +123,7 @@ pub trait Reader {
     fn warnings(&self) -> &[String];
 }
 
-/// What pictures come from.
+/// What images come from.
 pub trait Source: Send + Sync {
     /// What it is.
     fn info(&self) -> &Info;
@@ -139,9 +139,9 @@ pub trait Source: Send + Sync {
     fn fingerprint(&self) -> Result<String>;
 }
 
-/// Opens a video file or a folder of pictures. Pictures of folders are `1/fps` seconds apart.
+/// Opens a video file or a folder of images. Images of folders are `1/fps` seconds apart.
 ///
-/// Errors: no such file; no ffmpeg, and no format that is read without it; no picture stream; damage.
+/// Errors: no such file; no ffmpeg, and no format that is read without it; no image stream; damage.
 pub fn open(path: &Path, fps: f64) -> Result<Box<dyn Source>> {
     open_with(path, fps, Tools::find())
 }
@@ -178,7 +178,7 @@ fn stem(path: &Path) -> String {
 /// Tells two files apart: FNV-1a of length, beginning, middle and end, against mistakes and not against malice.
 fn fingerprint_of_file(path: &Path) -> Result<u64> {
     use std::io::{Read, Seek, SeekFrom};
-    /// Bytes of each of the three places: a video's tables and some of its pictures.
+    /// Bytes of each of the three places: a video's tables and some of its images.
     const PIECE: u64 = 64 << 10;
     let fail = |e| Error::io("cannot be read", e).at(path.display());
     let mut file = splat4d_train::files::open(path)?;

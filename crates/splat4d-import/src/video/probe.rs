@@ -7,10 +7,10 @@ use splat4d::{Error, ErrorKind, Result};
 /// Lines from which on an untagged video is taken for high definition, and its colours for BT.709 (as players do); below
 /// they are BT.601.
 const HD_LINES: usize = 720;
-/// Pixels across from which on it is, for wide pictures of fewer lines.
+/// Pixels across from which on it is, for wide images of fewer lines.
 const HD_COLUMNS: usize = 1280;
 
-/// Which part of the numbers carries the picture.
+/// Which part of the numbers carries the image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Range {
     /// 0 to 255.
@@ -52,7 +52,7 @@ pub struct Info {
     pub size: [usize; 2],
     /// Pixels across and down as they are stored.
     pub stored: [usize; 2],
-    /// Degrees by which stored pictures are turned clockwise.
+    /// Degrees by which stored images are turned clockwise.
     pub rotation: i32,
     /// Frames per second that the file is made for.
     pub nominal_rate: Option<f64>,
@@ -68,7 +68,7 @@ pub struct Info {
     pub codec: String,
     /// The pixel format, as ffmpeg names it.
     pub pixels: String,
-    /// Whether a frame is two half pictures of different times.
+    /// Whether a frame is two half images of different times.
     pub interlaced: bool,
     /// What its numbers mean.
     pub color: Color,
@@ -84,23 +84,23 @@ pub struct Info {
 #[derive(Debug)]
 pub(super) struct Probe {
     pub info: Info,
-    /// Number of the picture stream.
+    /// Number of the image stream.
     pub picture: usize,
     /// Number of the sound stream.
     pub sound: Option<usize>,
-    /// Whether the duration is that of the picture stream, and not of the longest one.
+    /// Whether the duration is that of the image stream, and not of the longest one.
     pub own_duration: bool,
     /// The decoder that gives alpha, where the usual one leaves it out (VP8 and VP9 store it in packets of its own).
     pub alpha_decoder: Option<&'static str>,
 }
 
-/// Understands what ffprobe wrote. Errors: no picture stream, no codec that is known, no size.
+/// Understands what ffprobe wrote. Errors: no image stream, no codec that is known, no size.
 pub(super) fn parse(json: &str, name: String) -> Result<Probe> {
     let top: Value = serde_json::from_str(json)
         .map_err(|e| Error::input(format!("the output of ffprobe cannot be parsed ({e})")).remedy("Update ffmpeg."))?;
     let streams = top["streams"].as_array().map_or(&[][..], Vec::as_slice);
     let of = |kind: &'static str| streams.iter().filter(move |s| s["codec_type"] == kind);
-    // The cover of a song is a stream of one picture.
+    // The cover of a song is a stream of one image.
     let films = || of("video").filter(|s| s["disposition"]["attached_pic"] != 1);
     let film = films().find(|s| s["disposition"]["default"] == 1).or_else(|| films().next());
     let Some(film) = film else {
@@ -132,7 +132,7 @@ pub(super) fn parse(json: &str, name: String) -> Result<Probe> {
     let own = number(&film["duration"]).or_else(|| film["tags"]["DURATION"].as_str().and_then(clock_time));
     let pixels = text("pix_fmt").to_owned();
     let color = color(film, &codec, &pixels, [width, height]);
-    // Matroska's mark for alpha beside the pictures.
+    // Matroska's mark for alpha next to the images.
     let beside = ["alpha_mode", "ALPHA_MODE"].iter().any(|tag| film["tags"][*tag] == "1");
     let alpha_decoder = match codec.as_str() {
         "vp8" if beside => Some("libvpx"),

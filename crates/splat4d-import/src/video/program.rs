@@ -30,7 +30,7 @@ pub struct Tools {
     ffprobe: PathBuf,
     /// Major and minor version; None: not a release.
     version: Option<(u32, u32)>,
-    /// Whether pictures of high dynamic range can be mapped to ordinary ones.
+    /// Whether images of high dynamic range can be mapped to ordinary ones.
     pub(super) tone_mapping: bool,
 }
 
@@ -138,7 +138,7 @@ impl Tools {
                     // Whoever asked may have gone.
                     let _ = send.send((which, time));
                 } else if text.contains(MUXER) {
-                    // It frets over the times of raw pictures, which go nowhere.
+                    // It frets over the times of raw images, which go nowhere.
                 } else if text.contains("[error]") || text.contains("[fatal]") {
                     said.add(plain(&text, &name));
                 }

@@ -1,4 +1,4 @@
-//! `capture.json`: what the pictures are, where they were taken from and when.
+//! `capture.json`: what the images are, where they were taken from and when.
 
 use super::{Masks, Pictures};
 use crate::sync::graph::Offset;
@@ -24,17 +24,17 @@ pub enum Poses {
 /// A camera whose clock, lens and place are known.
 #[derive(Clone, Debug)]
 pub struct Placed {
-    /// Its pictures.
+    /// Its images.
     pub pictures: Pictures,
     /// Its clock.
     pub offset: Offset,
-    /// Pixels of the stored pictures.
+    /// Pixels of the stored images.
     pub intrinsics: Intrinsics,
-    /// Of the stored pictures, which are not undistorted.
+    /// Of the stored images, which are not undistorted.
     pub lens: Lens,
     /// Where it was.
     pub poses: Poses,
-    /// What of its pictures counts.
+    /// What of its images counts.
     pub masks: Option<Masks>,
 }
 
@@ -53,9 +53,9 @@ pub struct Take {
     pub extra: Map<String, Value>,
 }
 
-/// Writes `capture.json` into the folder that holds the pictures; the file.
+/// Writes `capture.json` into the folder that holds the images; the file.
 ///
-/// Errors: no cameras, no pictures of one, poses that are not as many as shots, no space.
+/// Errors: no cameras, no images of one, poses that are not as many as shots, no space.
 pub fn capture(folder: &Path, take: &Take, cameras: &[Placed]) -> Result<PathBuf> {
     if cameras.is_empty() {
         return Err(Error::input("there is no camera whose place is known").remedy("See the report for why."));

@@ -1,4 +1,4 @@
-//! Masks beside pictures: white where the picture counts, stored in the size of the pictures.
+//! Masks next to images: white where the image counts, stored in the size of the images.
 
 use super::Pictures;
 use crate::video::fnv1a;
@@ -11,26 +11,27 @@ use splat4d_train::event::Progress;
 use splat4d_train::run::checkpoint::write_atomically;
 use std::path::{Path, PathBuf};
 
-/// Endings of pictures that masks may have.
+/// Endings of images that masks may have.
 const ENDINGS: [&str; 4] = ["png", "jpg", "jpeg", "webp"];
 
-/// The masks of a camera's stored pictures.
+/// The masks of a camera's stored images.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Masks {
-    /// One file for each picture, from the capture's folder on; all may be the same.
+    /// One file for each image, from the capture's folder on; all may be the same.
     pub files: Vec<PathBuf>,
     /// Changes when the masks do.
     pub fingerprint: u64,
 }
 
-/// Where the pictures of a camera begin in its video.
+/// Where the images of a camera begin in its video.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Begin {
     /// The second that reading began at; none: the first frame.
     pub from: Option<f64>,
 }
 
-/// Stores the masks of all cameras below `folder`, as `masks/NAME/000000.png` and so on. `from` holds for each camera a picture
+/// Stores the masks of all cameras below `folder`, as `masks/NAME/000000.png` and so on. `from` holds for each
+/// camera an image
 /// `NAME.png` for the whole take, or a folder `NAME` with one for each frame of its video, in the order of names.
 ///
 /// Errors: a camera without masks, fewer masks than frames, masks of another shape, no space; of kind `Interrupted` where `stop`
@@ -91,7 +92,7 @@ fn camera(folder: &Path, from: &Path, pictures: &Pictures, begin: Begin) -> Resu
     Ok(Masks { files: (0..numbers.len()).map(|k| to.join(format!("{k:06}.png"))).collect(), fingerprint })
 }
 
-/// The numbers of stored pictures among all frames of the video.
+/// The numbers of stored images among all frames of the video.
 fn numbers(pictures: &Pictures, begin: Begin) -> Result<Vec<usize>> {
     let Some(from) = begin.from.filter(|f| *f > 0.0) else {
         return Ok(pictures.shots.iter().map(|s| s.number).collect());
@@ -106,7 +107,8 @@ fn numbers(pictures: &Pictures, begin: Begin) -> Result<Vec<usize>> {
     Ok(pictures.shots.iter().map(|s| (s.time / pictures.clock.interval).round() as usize).collect())
 }
 
-/// Stores a mask in a size, black and white as it is, and tells what changes with it; a file that is there is of another run and is written anew.
+/// Stores a mask in a size, black and white as it is, and tells what changes with it; a file that is there is of
+/// another run and is written again.
 fn store(from: &Path, to: &Path, [width, height]: [usize; 2]) -> Result<u64> {
     let mask = Rgb8::read(from)?;
     let off = (mask.width * height).abs_diff(mask.height * width);

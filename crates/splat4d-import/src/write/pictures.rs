@@ -1,4 +1,4 @@
-//! Frames of videos as picture files, and a table of their times.
+//! Frames of videos as image files, and a table of their times.
 
 use crate::video::{Clock, Frame, Gap, Rgb8, Selection, Source, fnv1a, mean_difference};
 use image::codecs::jpeg::JpegEncoder;
@@ -12,20 +12,20 @@ use splat4d_train::output::{write_atomically, written};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// Version of the notes; others are made anew.
+/// Version of the notes; others are made again.
 const VERSION: u32 = 1;
-/// Folder of the notes, beside that of the pictures.
+/// Folder of the notes, next to that of the images.
 const NOTES: &str = "import";
-/// Folder of the pictures, in one for each camera.
+/// Folder of the images, in one for each camera.
 const IMAGES: &str = "images";
-/// Pictures that are compressed at a time: eight of 4K are 200 MB.
+/// Images that are compressed at a time: eight of 4K are 200 MB.
 const BATCH: usize = 8;
 /// Least quality of JPEG files: below, blocks are seen that training would learn.
 const MIN_QUALITY: u8 = 95;
 /// Longest name of a camera, characters.
 const MAX_NAME: usize = 60;
 
-/// How pictures are stored.
+/// How images are stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Format {
     /// JPEG of this quality, 95 to 100, colours in full resolution.
@@ -93,7 +93,7 @@ pub struct Shot {
     pub time: f64,
 }
 
-/// The stored pictures of a camera.
+/// The stored images of a camera.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Pictures {
     /// The camera's name.
@@ -108,7 +108,7 @@ pub struct Pictures {
     pub clock: Clock,
     /// What was odd, a sentence or two each.
     pub warnings: Vec<String>,
-    /// Changes with everything that the pictures were made of.
+    /// Changes with everything that the images were made of.
     pub fingerprint: String,
 }
 
@@ -120,11 +120,11 @@ impl Pictures {
     }
 }
 
-/// The notes beside a camera's pictures.
+/// The notes next to a camera's images.
 #[derive(Default, Serialize, Deserialize)]
 struct Note {
     version: u32,
-    /// Of everything that the pictures depend on.
+    /// Of everything that the images depend on.
     fingerprint: String,
     /// Whether all are there.
     complete: bool,
@@ -314,8 +314,10 @@ fn read(path: &Path) -> Option<Note> {
     serde_json::from_slice(&splat4d_train::files::read(path).ok()?).ok()
 }
 
-/// Removes the pictures that were written into a folder of a capture before. `noted`: whether a note tells of such pictures, which
-/// captures without a list of their files go by. Errors: it holds pictures of such names that nobody noted; nothing is removed then.
+/// Removes the images that were written into a folder of a capture before. `noted`: whether a note tells of such
+/// images, which
+/// captures without a list of their files go by. Errors: it holds images of such names that nobody noted; nothing is
+/// removed then.
 fn clear(capture: &Path, folder: &Path, noted: bool) -> Result<()> {
     let Ok(entries) = std::fs::read_dir(folder) else { return Ok(()) };
     let numbered = |path: &PathBuf| {

@@ -13,7 +13,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
-/// Two folders of pictures, of 20 and 11 frames.
+/// Two folders of images, of 20 and 11 frames.
 fn rig() -> (tempfile::TempDir, Vec<Box<dyn Source>>) {
     let folder = tempfile::tempdir().unwrap();
     let mut sources = Vec::new();
@@ -95,7 +95,7 @@ fn derived_values_are_computed_again() {
     let names = contents(out.path());
     assert_eq!(names.keys().filter(|n| n.starts_with("images/cam_0") && n.ends_with("jpg")).count(), 9);
     assert!(names.contains_key("images/cam_0/mine.txt"), "files of others stay");
-    // A picture that was lost comes back.
+    // An image that was lost comes back.
     std::fs::remove_file(out.path().join("images/cam_1/000001.jpg")).unwrap();
     store(out.path(), &clips(&sources, &half), usize::MAX).unwrap();
     assert_eq!(contents(out.path()), names);

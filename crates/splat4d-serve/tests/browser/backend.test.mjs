@@ -12,7 +12,7 @@ import { psnr, render } from './reference.mjs';
 import { sample } from './sample.mjs';
 import { PLAYER, serve } from './server.mjs';
 
-/// The issue's bound for pictures against the CPU renderer, dB, and what is reached here and must not get lost.
+/// The issue's bound for images against the CPU renderer, dB, and what is reached here and must not get lost.
 const BOUND = 35;
 const REACHED = 55;
 /// With sums of 8 bits: each of some 30 splats over one another rounds once.
@@ -68,7 +68,7 @@ async function shown(backend, made, body, { before, policy } = {}) {
   }
 }
 
-/// A picture from the page: RGBA bytes. `canvas`: as the browser shows it, else as `readPixels` gives it.
+/// An image from the page: RGBA bytes. `canvas`: as the browser shows it, else as `readPixels` gives it.
 async function picture(page, params, { canvas = false } = {}) {
   let text = await page.evaluate(async (p) => {
     const { backend, stream } = globalThis.shown;
@@ -178,7 +178,7 @@ for (const backend of ['webgl2', 'webgpu']) {
         await stream.settled(time);
       }, look.time);
       assert.ok((await compare(page, made, look)) >= REACHED, 'the masks came');
-      // Places that are lent anew have forgotten their masks: every page is dropped and comes back without.
+      // Places that are lent again have forgotten their masks: every page is dropped and comes back without.
       await page.evaluate(() => {
         const { file, restart } = globalThis.shown;
         for (const entry of file.pages) entry.mask = -1;
@@ -190,7 +190,7 @@ for (const backend of ['webgl2', 'webgpu']) {
 
   test(`${backend} survives pages that come and go, sizes that change and its own end`, { skip }, () => {
     const made = sample({ seed: 9, masks: 0.3 });
-    // What the fullest moment needs, and no page more: every seek drops pages and lends their rows anew.
+    // What the fullest moment needs, and no page more: every seek drops pages and lends their rows again.
     const most = 700 + 1025 + 511;
     return shown(backend, made, async (page) => {
       await page.evaluate((most) => {

@@ -1,5 +1,5 @@
 // Starts a Chromium for tests: Debian's, through playwright-core, which `.ci/run` installs (PLAYWRIGHT names its folder
-// where it does not lie beside the tests).
+// where it does not lie next to the tests).
 
 import { existsSync } from 'node:fs';
 import { createRequire } from 'node:module';

@@ -182,7 +182,7 @@ test('words, colours, moves by handles, keys on the time line; wrong words are s
   await page.waitForFunction(() => document.querySelector('splat-4d').face.editing.acts.children[0].disabled === false);
   await e.act('Move');
   await page.waitForFunction(() => document.querySelector('splat-4d').face.editing.overlay.place);
-  // The handles: the middle goes along the picture, a ring turns.
+  // The handles: the middle goes along the image, a ring turns.
   const middle = await page.evaluate(() => {
     const o = document.querySelector('splat-4d').face.editing.overlay;
     return o.project([0, 1, 2].map((k) => o.place.about[k] + o.place.shift[k]));

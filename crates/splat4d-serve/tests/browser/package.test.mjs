@@ -1,5 +1,5 @@
 // The player as npm delivers it: packed, installed from the tarball into an empty folder, and used by pages: the element, and
-// the object of three.js, with meshes before and behind it. Needs npm, and three beside playwright-core (`.ci/run`).
+// the object of three.js, with meshes before and behind it. Needs npm, and three next to playwright-core (`.ci/run`).
 
 import assert from 'node:assert/strict';
 import { execFileSync } from 'node:child_process';
@@ -36,7 +36,7 @@ const MAP = { imports: { splat4d: '/splat4d/player/element.js', 'splat4d/three':
 const html = (body) => `<!doctype html><link rel="icon" href="data:,"><style>body{margin:0}</style>
   <script type="importmap">${JSON.stringify(MAP)}</script>${body}`;
 
-/// A page of this body, beside the installed package and a scene.
+/// A page of this body, next to the installed package and a scene.
 async function page(body, t) {
   const folders = { '/splat4d/': installed, '/three/': THREE };
   const server = await serve({ files: { 'page.html': html(body), 'knight.s4d': KNIGHT }, folders });
@@ -137,7 +137,7 @@ test('the object in three.js shows what the element shows, among meshes', needs(
   const [before, within, behind] = [red(await show(0.5, 0.1)), red(await show(0.5, Math.hypot(m[3], m[7], m[11] - 0.8))), red(await show(0.5, 50))];
   t.diagnostic(`red before ${before.toFixed(3)}, within ${within.toFixed(3)}, behind ${behind.toFixed(3)}`);
   assert.ok(before > 0.99 && behind < within && within < before - 0.02, `${before} ${within} ${behind}`);
-  // Moved out of the picture, nothing of it is left.
+  // Moved out of the image, nothing of it is left.
   const away = await show(0.5, 50, [0, 0, 1000]);
   assert.ok(red(away) > 0.99);
   assert.ok((await p.evaluate(() => window.dispose())) === 0, 'its textures are given back');

@@ -1,5 +1,5 @@
-// The product as people get it: the program serves a trained scene, Chromium shows it. Pictures against the CPU renderer,
-// bytes of a first picture and of a seek, broken files, a bare page with the element, one page opened from the disk.
+// The product as people get it: the program serves a trained scene, Chromium shows it. Images against the CPU renderer,
+// bytes of a first image and of a seek, broken files, a bare page with the element, one page opened from the disk.
 // SPLAT4D names the program; without it these tests are skipped.
 
 import assert from 'node:assert/strict';
@@ -13,9 +13,9 @@ import { launch, open } from './browser.mjs';
 import { psnr } from './reference.mjs';
 import { sample } from './sample.mjs';
 
-/// Pictures against the CPU renderer, dB.
+/// Images against the CPU renderer, dB.
 const BOUND = 35;
-/// Of a long take the first picture may read this share.
+/// Of a long take the first image may read this share.
 const FIRST_SHARE = 0.2;
 /// Rounds of the bundled capture: more than 20 seconds.
 const ROUNDS = 21;
@@ -104,7 +104,7 @@ async function seen(page, c, time) {
 
 /// What the CPU renderer makes of a file from its camera `name` at `time`, as RGBA; `picture` names a file to use.
 function rendered(page, scene, name, time, picture) {
-  // A film of one camera at one second is one picture.
+  // A film of one camera at one second is one image.
   run('render', scene, '--device', 'cpu', '--path', `camera=${name}`, '--freeze', String(time), '-o', picture);
   return pixels(page, readFileSync(picture));
 }

@@ -1,4 +1,4 @@
-// A renderer in f64, slow and plain, from CONVENTIONS.md: what the player's pictures are compared with.
+// A renderer in f64, slow and plain, from CONVENTIONS.md: what the player's images are compared with.
 
 const SH = [
   ([, y]) => -0.4886025119029199 * y,
@@ -141,7 +141,7 @@ function hue([x, y], scale) {
   return [0, 2 / 3, 1 / 3].map((o) => value * Math.min(Math.max(Math.abs(((h + o) % 1) * 6 - 3) - 1, 0), 1));
 }
 
-/// PSNR of two RGBA pictures, alpha left out, dB.
+/// PSNR of two RGBA images, alpha left out, dB.
 export function psnr(a, b) {
   let sum = 0;
   for (let i = 0; i < a.length; i++) if (i % 4 < 3) sum += (a[i] - b[i]) ** 2;

@@ -1,4 +1,4 @@
-// For the interface's tests: a server with the player's files, stand-ins for what draws and reads, and made-up live
+// For the interface's tests: a server with the player's files, stand-ins for what draws and reads, and synthetic live
 // events.
 
 import { createServer } from 'node:http';

@@ -1,5 +1,5 @@
 // The player's interface in a real browser: keys, scrubbing, links, the element in a bare page, names for screen
-// readers, errors, narrow windows, live training. Files and pictures are stand-ins (mock/), so that this tests the
+// readers, errors, narrow windows, live training. Files and images are stand-ins (mock/), so that this tests the
 // interface alone. Run: node --test ui.test.mjs (see browser.mjs for what it needs).
 
 import assert from 'node:assert/strict';
@@ -61,7 +61,7 @@ test('the page names every module it will need, so that they come all at once', 
 });
 
 test('the picture shrinks as far as it must and helps, and grows again', () => {
-  /** Plays `seconds` on a made-up machine where a frame takes fixed + pixels·scale² ms, at most 60 frames a second. */
+  /** Plays `seconds` on a synthetic machine where a frame takes fixed + pixels·scale² ms, at most 60 frames a second. */
   const play = (pace, fixed, pixels, seconds = 20) => {
     const scales = [];
     for (let now = 0; now < 1000 * seconds;) {
@@ -494,7 +494,7 @@ test('a path is made, played, exported and read again; bullet time holds the clo
   await ask(e => e.seek(2));
   const from = await ask(e => e.camera.position);
   await page.keyboard.press('b');
-  // A busy machine may draw its first picture late.
+  // A busy machine may draw its first image late.
   const moved = await page.waitForFunction(from => {
     const e = document.querySelector('splat-4d');
     return e.camera.position.some((x, k) => x !== from[k]) && [e.currentTime, !!e.player.film?.frozen];

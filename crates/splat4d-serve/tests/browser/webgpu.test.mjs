@@ -9,7 +9,7 @@ import { psnr, render } from './reference.mjs';
 import { PLAYER, serve } from './server.mjs';
 import * as toy from './toy.mjs';
 
-/// Least agreement of a picture with the reference, dB: 8-bit rounding alone gives 59 or more.
+/// Least agreement of an image with the reference, dB: 8-bit rounding alone gives 59 or more.
 const LEAST_DB = 50;
 /// Depth shows black where alpha is below a half: a pixel whose alpha (of 255) is this close to it may fall either way.
 const NEAR_HALF = 2;

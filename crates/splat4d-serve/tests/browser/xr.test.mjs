@@ -1,4 +1,5 @@
-// A headset's session against a simulated device (npm's iwer, beside playwright-core): it begins, draws both eyes as they are
+// A headset's session against a simulated device (npm's iwer, next to playwright-core): it begins, draws both eyes
+// as they are
 // turned, and gives the player back.
 
 import assert from 'node:assert/strict';
@@ -55,7 +56,7 @@ test('a simulated headset sees the scene with both eyes', options, async (t) => 
     };
     await wait(() => window.device.activeSession?.renderState.baseLayer);
     const session = window.device.activeSession;
-    /// The picture that the session's next frame but one left: bytes of its left and of its right half.
+    /// The image that the session's next frame but one left: bytes of its left and of its right half.
     const halves = () =>
       new Promise((done) => {
         session.requestAnimationFrame(() =>
@@ -111,7 +112,7 @@ test('in a simulated room the scene stands on the floor, and a tap puts it elsew
     await wait(() => window.device.activeSession?.renderState.baseLayer);
     const session = window.device.activeSession;
     await wait(() => player.backend.stats.drawn > 1000);
-    /// Share of pixels that are drawn, and their middle across, 0 to 1, once two pictures are alike.
+    /// Share of pixels that are drawn, and their middle across, 0 to 1, once two images are alike.
     const look = () =>
       new Promise((done) => {
         let left = 8;

@@ -143,7 +143,7 @@ pub(super) fn near(capture: &Capture, share: f64) -> f64 {
     (share * extent).min(farthest).max(Camera::NEAR.min(SMALLEST_NEAR * extent))
 }
 
-/// The pinhole view of the picture as it will be loaded.
+/// The pinhole view of the image as it will be loaded.
 fn finish(raw: RawFrame, downscale: usize) -> Frame {
     let view = Camera { lens: Lens::Pinhole, ..raw.source.downscaled(downscale) };
     Frame {
@@ -273,7 +273,7 @@ fn warn_of_shared(shared: usize, warnings: &mut Vec<String>) {
     }
 }
 
-/// One camera takes one picture at a time. Where the data set names none, one "camera" may stand for several, so that
+/// One camera takes one image at a time. Where the data set names none, one "camera" may stand for several, so that
 /// the pose counts too.
 fn check_duplicates(take: &mut Take, cameras: &[Rig]) -> Result<()> {
     let mut groups: BTreeMap<(usize, u64), Vec<usize>> = BTreeMap::new();
@@ -403,13 +403,14 @@ fn shared_images(take: &mut Take) {
     take.account.add(Aspect::Assumed, Severity::Warning, what);
 }
 
-/// Whether a picture of `size` is, or was resized to, what a camera describes.
+/// Whether an image of `size` is, or was resized to, what a camera describes.
 fn fits(size: (usize, usize), camera: &Camera) -> bool {
     size == (camera.width, camera.height) || picture::is_resized(size, camera)
 }
 
-/// Compares the sizes of the pictures with their intrinsics, and scales those where pictures were resized; returns
-/// whether any picture has an alpha channel, for each whether its EXIF orientation is applied, and those of which sizes do
+/// Compares the sizes of the images with their intrinsics, and scales those where images were resized; returns
+/// whether any image has an alpha channel, for each whether its EXIF orientation is applied, and those of which
+/// sizes do
 /// not say so.
 fn fit_pictures(take: &mut Take, options: &CaptureOptions) -> Result<(bool, Vec<bool>, Vec<usize>)> {
     let mut alpha = false;
@@ -533,7 +534,7 @@ fn check_masks(take: &Take, has_alpha: bool) -> Result<()> {
         match picture::any_foreground(frame.mask.as_deref().unwrap_or(&frame.image), frame.mask.is_none()) {
             Ok(true) => return Ok(()),
             Ok(false) => {}
-            // A broken picture has its own error, with more to say, when it is loaded.
+            // A broken image has its own error, with more to say, when it is loaded.
             Err(_) if frame.mask.is_none() => return Ok(()),
             Err(e) => return Err(e),
         }
@@ -613,7 +614,7 @@ fn find_camera(name: &str, cameras: &[Rig]) -> Result<usize> {
     })
 }
 
-/// People hold cameras upright: minus the mean of the pictures' y axes.
+/// People hold cameras upright: minus the mean of the images' y axes.
 fn estimate_up(frames: &[RawFrame]) -> [f64; 3] {
     let mut sum = [0.0; 3];
     for frame in frames {

@@ -28,14 +28,15 @@ const PIXELS: usize = 30_000_000;
 const FEWEST: usize = 6;
 /// Lenses that are looked at, those with the most images first: it bounds the time.
 const LENSES: usize = 8;
-/// What counts as black, of 255: JPEG's ringing reaches 30 beside bright content.
+/// What counts as black, of 255: JPEG's ringing reaches 30 next to bright content.
 const BLACK: u8 = 40;
 /// Pixels beyond a border that interpolation and JPEG have mixed with it.
 const MIXED: usize = 2;
 /// How far behind a border the content is looked at, pixels.
 const INSIDE: usize = MIXED + 2;
 /// Share of the content behind a border that is not black. Chosen between the two kinds: content is bright in most places,
-/// and the outline of an object on black is dark in nearly all images. Ten real and synthetic captures are told apart
+/// and the outline of an object on black is dark in nearly all images. Ten real and synthetic captures are
+/// distinguished
 /// (studies/records/2026-11-26-real-size.md).
 const BRIGHT: f64 = 0.5;
 /// Share of each of two opposite edges that is black: an undistorted or letterboxed image has both.
@@ -148,7 +149,7 @@ fn recorded(views: &[Frame]) -> Option<Vec<u8>> {
     border(&bright, width, height)
 }
 
-/// Where a picture is not black; `None`: it cannot be read or is transparent in places, so that its colours there mean
+/// Where an image is not black; `None`: it cannot be read or is transparent in places, so that its colours there mean
 /// nothing.
 fn not_black(frame: &Frame) -> Option<Vec<bool>> {
     let raster = picture::decode_as(&frame.image, Some(&panorama::stored(&frame.source)), frame.upright).ok()?;

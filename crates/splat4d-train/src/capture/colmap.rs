@@ -1,7 +1,7 @@
-//! COLMAP reconstructions: `sparse/0/{cameras,images,points3D}.{bin,txt}` and the pictures in `images/`.
+//! COLMAP reconstructions: `sparse/0/{cameras,images,points3D}.{bin,txt}` and the images in `images/`.
 //!
-//! COLMAP knows no time. Picture names `cam/frame` or `cam_frameN` give camera and frame number; where each camera has
-//! only one registered picture, the other pictures of that camera on disk share its pose: the usual way to calibrate a
+//! COLMAP knows no time. Image names `cam/frame` or `cam_frameN` give camera and frame number; where each camera has
+//! only one registered image, the other images of that camera on disk share its pose: the usual way to calibrate a
 //! fixed rig is to reconstruct one instant.
 
 mod multiview;
@@ -35,9 +35,9 @@ pub(super) const COLMAP: &str = "colmap";
 pub(super) const WORKSPACES: [&str; 4] = ["undistorted/sparse", "dense/sparse", "dense/0/sparse", "distorted/sparse"];
 /// A model's points as .ply: 3DGS writes it next to the others, and other programs in place of them.
 const POINTS: &str = "points3D.ply";
-/// Where a model may lie beside poses of another layout: COLMAP's habit and Nerfstudio's.
+/// Where a model may lie next to poses of another layout: COLMAP's habit and Nerfstudio's.
 const BESIDE: [&str; 2] = [SPARSE, NESTED];
-/// Names of folders between a capture's folder and a model's files, besides numbers.
+/// Names of folders between a capture's folder and a model's files, in addition to numbers.
 const MODEL_FOLDERS: [&str; 6] = [SPARSE, MULTIVIEW, COLMAP, "distorted", "undistorted", "dense"];
 /// Mean reprojection error above which poses blur the result, pixels.
 const LARGE_ERROR: f64 = 1.5;
@@ -143,7 +143,7 @@ fn files(lookup: &Lookup, base: &Path, names: &[&str]) -> Result<Vec<PathBuf>> {
         }
     }
     if found.iter().all(Option::is_none) && lookup::is_reduced(base) {
-        // LLFF's reduced copies are numbered anew, in the order of the originals.
+        // LLFF's reduced copies are numbered again, in the order of the originals.
         let images = rig::image_names(base);
         if images.len() == names.len() {
             let mut order: Vec<usize> = (0..names.len()).collect();
@@ -157,10 +157,10 @@ fn files(lookup: &Lookup, base: &Path, names: &[&str]) -> Result<Vec<PathBuf>> {
     Ok(found.into_iter().zip(names).map(place).collect())
 }
 
-/// A picture's name and its camera.
+/// An image's name and its camera.
 pub(super) type Shot = (String, Camera);
 
-/// Name and camera of every registered picture.
+/// Name and camera of every registered image.
 fn sources(folder: &Path, registered: &[Registered], poses: Poses) -> Result<Vec<Shot>> {
     let used = registered.iter().map(|r| r.camera).collect();
     let optics = colmap_files::cameras(folder, &used)?;
@@ -185,7 +185,7 @@ fn sources(folder: &Path, registered: &[Registered], poses: Poses) -> Result<Vec
     Ok(shots)
 }
 
-/// The registered pictures of the largest model in a folder, and its points; no picture is looked at.
+/// The registered images of the largest model in a folder, and its points; no image is looked at.
 pub(super) fn shots(folder: &Path) -> Result<(Vec<Shot>, Option<PointCloud>)> {
     let (folder, registered) = best_model(folder, &mut Vec::new())?;
     Ok((sources(&folder, &registered, Poses::STATED)?, cloud_of(&colmap_files::points(&folder)?, &folder)?))
@@ -209,7 +209,7 @@ fn has_cameras(folder: &Path) -> bool {
     ["cameras.bin", "cameras.txt"].iter().any(|n| rig::spelled(folder, n).is_file())
 }
 
-/// The model folder (`sparse` itself or a numbered one in it) with the most registered pictures.
+/// The model folder (`sparse` itself or a numbered one in it) with the most registered images.
 fn best_model(sparse: &Path, warnings: &mut Vec<String>) -> Result<(PathBuf, Vec<Registered>)> {
     let mut candidates = vec![sparse.to_path_buf()];
     candidates.extend(rig::file_names(sparse).iter().filter(|n| n.parse::<u32>().is_ok()).map(|n| sparse.join(n)));
@@ -254,7 +254,7 @@ fn check_errors(points: &[Point], warnings: &mut Vec<String>) {
     }
 }
 
-/// The points of a COLMAP model that lies beside `marker`, whose frames are `frames`: in their world, if the cameras
+/// The points of a COLMAP model that lies next to `marker`, whose frames are `frames`: in their world, if the cameras
 /// agree. What came of it is told.
 pub(super) fn points_beside(
     root: &Path,

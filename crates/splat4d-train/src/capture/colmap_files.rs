@@ -22,7 +22,7 @@ pub(super) struct Optics {
     pub height: usize,
 }
 
-/// A registered picture.
+/// A registered image.
 #[derive(Clone, Debug)]
 pub(super) struct Registered {
     /// Rotation world to camera as a quaternion wxyz.
@@ -71,7 +71,7 @@ const MODELS: [(&str, usize); 18] = [
 /// Least bytes of one entry in a binary file: camera (id, model, size, 2 parameters), image (id, pose, camera, empty
 /// name, count), point (id, position, colour, error, track length).
 const LEAST: [usize; 3] = [4 + 4 + 16 + 16, 4 + 56 + 4 + 1 + 8, 8 + 24 + 3 + 8 + 8];
-/// Longest picture name.
+/// Longest image name.
 const MAX_NAME: usize = 4096;
 
 fn truncated() -> Error {

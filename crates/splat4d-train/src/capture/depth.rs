@@ -1,5 +1,5 @@
 //! Depth maps on disk: 16-bit grey PNG, `.npy` or OpenEXR; z along the camera's axis in scene units, or known up to a scale
-//! and a shift only, as networks that look at a single picture tell it.
+//! and a shift only, as networks that look at a single image tell it.
 //!
 //! In memory a map is that of the pinhole view, [height, width], and 0 where nothing is known.
 
@@ -24,9 +24,9 @@ const ONE_SURFACE: f32 = 0.05;
 pub enum DepthKind {
     /// z along the camera's axis, scene units.
     Metric,
-    /// a z + b with a and b of each picture's own, a > 0.
+    /// a z + b with a and b of each image's own, a > 0.
     Relative,
-    /// a / z + b with a and b of each picture's own, a > 0: disparity.
+    /// a / z + b with a and b of each image's own, a > 0: disparity.
     Inverse,
 }
 
@@ -47,7 +47,7 @@ pub struct DepthFile {
     pub kind: DepthKind,
 }
 
-/// A frame's depth, [height, width] of its view, 0: not known. Errors: no depth map, of another shape than the picture,
+/// A frame's depth, [height, width] of its view, 0: not known. Errors: no depth map, of another shape than the image,
 /// numbers that are none.
 pub(super) fn read(file: &DepthFile, frame: &Frame, downscale: usize) -> Result<Vec<f32>> {
     let source = &frame.source;
@@ -105,7 +105,7 @@ struct Map {
 }
 
 impl Map {
-    /// `source` is the picture's camera: a file that claims to be far larger is refused before it is decoded.
+    /// `source` is the image's camera: a file that claims to be far larger is refused before it is decoded.
     fn read(file: &DepthFile, source: &Camera) -> Result<Self> {
         let path = &file.path;
         let mut map = match path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase).as_deref() {
@@ -181,7 +181,8 @@ fn check(map: &Map, file: &DepthFile) -> Result<()> {
     Ok(())
 }
 
-/// At the size of the picture's pinhole view, each pixel as the nearest one of the map: means across an edge are nobody's.
+/// At the size of the image's pinhole view, each pixel as the nearest one of the map: means across an edge are
+/// nobody's.
 /// Undistortion keeps rays, and so z.
 fn straighten(map: &Map, camera: &Camera) -> Vec<f32> {
     let (lens, k) = (Distortion::new(camera.lens), &camera.intrinsics);

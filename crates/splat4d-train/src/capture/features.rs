@@ -1,5 +1,5 @@
-//! Pictures of features on disk: `.npy` [height, width, channels], numbers that a network (or anything else) tells of a
-//! picture's pixels, at the picture's size or coarser.
+//! Images of features on disk: `.npy` [height, width, channels], numbers that a network (or anything else) tells of a
+//! image's pixels, at the image's size or coarser.
 //!
 //! A pixel whose channels are all 0 is one that nobody knows.
 
@@ -21,7 +21,7 @@ pub(crate) struct Features {
 
 /// A frame's features; `None`: the frame has none.
 ///
-/// Errors: no such array, of another shape than the picture, too many channels, numbers that are none.
+/// Errors: no such array, of another shape than the image, too many channels, numbers that are none.
 pub(crate) fn read(frame: &Frame, capture: &Capture) -> Result<Option<Features>> {
     let Some(path) = &frame.features else { return Ok(None) };
     let place = |e: Error| {

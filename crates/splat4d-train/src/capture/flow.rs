@@ -1,4 +1,4 @@
-//! Known optical flow on disk: 16-bit RGB pictures as in KITTI 2012 (Geiger et al.): red is 64 u + 32768, green is
+//! Known optical flow on disk: 16-bit RGB images as in KITTI 2012 (Geiger et al.): red is 64 u + 32768, green is
 //! 64 v + 32768, u right and v down in pixels, and blue is not zero where they are known; `.flo` (Baker et al. 2007,
 //! Middlebury) and `.npy`, as networks write them.
 //!
@@ -28,15 +28,15 @@ type Code = [u16; 3];
 /// The flow of a frame: its file, and where it leads.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct FlowFile {
-    /// The picture.
+    /// The image.
     pub path: PathBuf,
     /// The number, in `Capture::frames`, of the frame at which the pixels arrive: the next one of the same camera.
     pub to: usize,
-    /// Whether it is flow of the view, from this program, and not of the picture as it is stored.
+    /// Whether it is flow of the view, from this program, and not of the image as it is stored.
     pub of_view: bool,
 }
 
-/// A frame's flow in code, [3, height, width] of its view. Errors: the file is none, or of another size than the picture.
+/// A frame's flow in code, [3, height, width] of its view. Errors: the file is none, or of another size than the image.
 pub(super) fn read(file: &FlowFile, frame: &Frame, capture: &Capture) -> Result<Vec<u16>> {
     let (source, k) = (&frame.source, capture.downscale);
     if file.of_view {
@@ -50,7 +50,7 @@ pub(super) fn read(file: &FlowFile, frame: &Frame, capture: &Capture) -> Result<
     for p in 0..width * height {
         let first = (p / width * k) * source.width + p % width * k;
         let box_ = (0..k * k).map(|i| codes[first + i / k * source.width + i % k]);
-        // The means of k×k boxes, as pictures are reduced, in pixels that are k times as large.
+        // The means of k×k boxes, as images are reduced, in pixels that are k times as large.
         let mean = |c: usize| box_.clone().map(|code| f64::from(code[c]) - ZERO).sum::<f64>() / (k * k * k) as f64;
         if box_.clone().all(|code| code[2] != 0) {
             (0..2).for_each(|c| out[c * width * height + p] = (mean(c) + ZERO).round() as u16);
@@ -62,7 +62,7 @@ pub(super) fn read(file: &FlowFile, frame: &Frame, capture: &Capture) -> Result<
 
 /// The flow of a frame alone, [3, height, width] of its view: u, v and 1 where they are known; `None`: it has none.
 ///
-/// Errors: the file is none, or of another size than the picture.
+/// Errors: the file is none, or of another size than the image.
 pub(crate) fn vectors(frame: &Frame, capture: &Capture) -> Result<Option<Planes<f32>>> {
     let Some(file) = &frame.flow else { return Ok(None) };
     let camera = &capture.cameras[frame.camera].name;
@@ -91,7 +91,7 @@ fn decode(path: &Path, camera: &Camera) -> Result<Vec<Code>> {
     }
 }
 
-/// Vectors as code. What is too far for code is not known. Errors: vectors that are no numbers.
+/// Vectors as code. What is too far for code is not known. Errors: vectors that are not finite.
 fn encode(path: &Path, width: usize, vectors: impl Iterator<Item = [f32; 3]>) -> Result<Vec<Code>> {
     let code = |(p, [u, v, known]): (usize, [f32; 3])| {
         if u.is_nan() || v.is_nan() {
@@ -151,7 +151,7 @@ fn decode_npy(path: &Path, camera: &Camera) -> Result<Vec<Code>> {
     encode(path, width, (0..n).map(|p| [at(p, 0), at(p, 1), if channels == 3 { at(p, 2) } else { 1.0 }]))
 }
 
-/// A 16-bit RGB picture in KITTI's code of flow and where it is known, [3, height, width].
+/// A 16-bit RGB image in KITTI's code of flow and where it is known, [3, height, width].
 pub(crate) fn to_picture(flow: &Planes<f32>) -> image::ImageBuffer<image::Rgb<u16>, Vec<u16>> {
     let (w, n) = (flow.width, flow.pixels());
     image::ImageBuffer::from_fn(w as u32, flow.height as u32, |x, y| {
@@ -176,7 +176,7 @@ fn decode_picture(path: &Path, camera: &Camera) -> Result<Vec<Code>> {
     }
 }
 
-/// From the distorted pictures of both frames to their pinhole views. The vector is that of the nearest pixel: means of
+/// From the distorted images of both frames to their pinhole views. The vector is that of the nearest pixel: means of
 /// vectors across an edge are nobody's.
 fn straighten(codes: Vec<Code>, from: &Camera, to: &Camera) -> Vec<Code> {
     let lenses = [from, to].map(|c| Distortion::new(c.lens));

@@ -52,7 +52,7 @@ struct Shot {
     depth: Option<DepthFile>,
 }
 
-/// What an export says besides its shots.
+/// What an export says in addition to its shots.
 struct Said {
     kind: CaptureKind,
     /// What its poses are, as its program writes them.
@@ -106,7 +106,7 @@ fn take(root: &Path, mut shots: Vec<Shot>, said: Said, options: &CaptureOptions)
     })
 }
 
-/// How folders begin whose images are not the photos, besides those of masks: depth, reduced copies.
+/// How folders begin whose images are not the photos, in addition to those of masks: depth, reduced copies.
 const OTHERS: [&str; 3] = ["depth", "images_", "."];
 
 /// Images by their names without endings, however these are spelled; from a folder, and folders down to two levels below.

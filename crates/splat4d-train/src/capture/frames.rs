@@ -1,4 +1,4 @@
-//! Posed pictures by number, the input of initialisation and training. Captures on disk and made-up ones in tests both
+//! Posed images by number, the input of initialisation and training. Captures on disk and synthetic ones in tests both
 //! serve.
 
 use super::depth::{self, DepthKind};
@@ -7,7 +7,7 @@ use super::tracks::Tracks;
 use crate::Result;
 use splat4d::scene::{Camera, Planes, Time};
 
-/// One picture, loaded.
+/// One image, loaded.
 #[derive(Clone, Debug, Default)]
 pub struct Picture {
     /// 3 channels in [0, 1].
@@ -22,7 +22,7 @@ pub struct Picture {
     pub flow: Option<Flow>,
 }
 
-/// Known depth of a picture, as a loss sees it.
+/// Known depth of an image, as a loss sees it.
 #[derive(Clone, Copy, Debug)]
 pub struct DepthTruth<'a, F = f32> {
     /// [1, h, w]; 0: not known.
@@ -31,7 +31,7 @@ pub struct DepthTruth<'a, F = f32> {
     pub kind: DepthKind,
 }
 
-/// Known depth of a picture.
+/// Known depth of an image.
 #[derive(Clone, Debug)]
 pub struct Depth {
     /// [1, h, w]; 0: not known.
@@ -54,7 +54,7 @@ impl Depth {
     }
 }
 
-/// Known optical flow of a picture, as a loss sees it.
+/// Known optical flow of an image, as a loss sees it.
 #[derive(Clone, Copy, Debug)]
 pub struct FlowTruth<'a, F = f32> {
     /// When the pixels arrive.
@@ -72,11 +72,11 @@ pub struct Tracked<'a> {
     pub tracks: &'a Tracks,
     /// The frame's number in the take.
     pub frame: usize,
-    /// The camera of the picture file, in whose pixels they are.
+    /// The camera of the image file, in whose pixels they are.
     pub source: &'a Camera,
 }
 
-/// Known optical flow of a picture.
+/// Known optical flow of an image.
 #[derive(Clone, Debug)]
 pub struct Flow {
     /// When the pixels arrive.
@@ -113,7 +113,7 @@ impl Picture {
     }
 }
 
-/// The pictures a scene is trained on.
+/// The images a scene is trained on.
 pub trait Frames: Send + Sync {
     /// How many.
     fn len(&self) -> usize;
@@ -151,7 +151,7 @@ pub trait Frames: Send + Sync {
     fn prefetch(&self, _frames: &[usize]) {}
 }
 
-/// Half the time between two pictures of a camera, seconds: the median over the frames (camera, time); 0 where no camera
+/// Half the time between two images of a camera, seconds: the median over the frames (camera, time); 0 where no camera
 /// has two.
 pub(crate) fn half_frame(frames: impl Iterator<Item = (usize, f64)>) -> f64 {
     let mut all: Vec<(usize, f64)> = frames.collect();

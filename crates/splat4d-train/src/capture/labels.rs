@@ -1,4 +1,4 @@
-//! Label masks on disk: grey pictures of 8 or 16 bits whose values number the capture's labels.
+//! Label masks on disk: grey images of 8 or 16 bits whose values number the capture's labels.
 //!
 //! The largest value of the depth (255 or 65535) stands for what nobody labelled.
 
@@ -16,7 +16,7 @@ const _: () = assert!(MOST_LABELS <= UNKNOWN as usize);
 
 /// A frame's labels, [height, width] of its view, [`UNKNOWN`] where there is none; `None`: the frame has no mask of labels.
 ///
-/// Errors: the mask is no picture, of another size than the frame's picture, in colour, or has a value without a name.
+/// Errors: the mask is no image, of another size than the frame's image, in colour, or has a value without a name.
 pub(crate) fn read(frame: &Frame, capture: &Capture) -> Result<Option<Vec<u8>>> {
     let Some(path) = &frame.labels else { return Ok(None) };
     let place = |e: Error| {
@@ -68,7 +68,7 @@ fn decode(path: &Path, camera: &Camera, count: usize) -> Result<Vec<u8>> {
     Ok(values.into_iter().map(|v| if v == unknown { UNKNOWN } else { v as u8 }).collect())
 }
 
-/// From the distorted picture to the pinhole view: the label of the nearest pixel.
+/// From the distorted image to the pinhole view: the label of the nearest pixel.
 fn straighten(labels: Vec<u8>, camera: &Camera) -> Vec<u8> {
     let lens = Distortion::new(camera.lens);
     if lens.is_pinhole() {

@@ -1,4 +1,5 @@
-//! Which layout a folder has: markers in a stated order, what lies beside the one that is taken, and what to do where there
+//! Which layout a folder has: markers in a stated order, what lies next to the one that is taken, and what to do
+//! where there
 //! is none.
 
 use super::{CaptureOptions, Take, colmap, foreign, llff, n3dv, nerfies, own, panoptic, rig, stray, transforms};
@@ -158,7 +159,7 @@ fn is_capture(folder: &Path) -> bool {
 
 /// Says which of several layouts was read, why, and how to choose another.
 fn remark(take: &mut Take, path: &Path, marker: &str, others: &[&str]) {
-    // Files of one family tell of the same pictures, and a model beside poses was asked for its points.
+    // Files of one family tell of the same images, and a model next to poses was asked for its points.
     let family = [transforms::TRAIN, transforms::ALL];
     let (same, foreign): (Vec<&str>, Vec<&str>) = others
         .iter()

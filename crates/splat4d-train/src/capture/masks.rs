@@ -1,4 +1,4 @@
-//! Masks that lie beside the images of any layout: found by the usual names, and those that fit nothing are counted.
+//! Masks that lie next to the images of any layout: found by the usual names, and those that fit nothing are counted.
 //!
 //! For the image `cam0/a.jpg` these are, in `masks/` or `mask/`: `cam0/a.jpg.png` (COLMAP), `cam0/a.png`, `cam0/a_mask.png`,
 //! `cam0/mask_a.png` and `cam0/a.mask.png` (Metashape), with any ending of images.
@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 
 /// Folders of masks, in any letter case.
 const FOLDERS: [&str; 2] = ["masks", "mask"];
-/// What names of masks have besides those of their images.
+/// What names of masks have in addition to those of their images.
 const SUFFIXES: [&str; 4] = ["_mask", "-mask", ".mask", "_seg"];
 const PREFIXES: [&str; 2] = ["mask_", "mask-"];
 /// How deep folders of masks are looked through.

@@ -98,7 +98,7 @@ pub enum CaptureKind {
     N3dv,
     /// LLFF: `poses_bounds.npy` and one folder of images.
     Llff,
-    /// Nerfies and HyperNeRF: `dataset.json`, `metadata.json` and a camera file a picture.
+    /// Nerfies and HyperNeRF: `dataset.json`, `metadata.json` and a camera file an image.
     Nerfies,
     /// Agisoft Metashape's cameras as XML.
     Metashape,
@@ -110,21 +110,21 @@ pub enum CaptureKind {
     Record3d,
 }
 
-/// One picture of the take.
+/// One image of the take.
 #[derive(Clone, Debug)]
 pub struct Frame {
     /// Index into [`Capture::cameras`].
     pub camera: usize,
-    /// The camera of the picture that [`ImageStore::load`] returns: a pinhole, undistorted and downscaled.
+    /// The camera of the image that [`ImageStore::load`] returns: a pinhole, undistorted and downscaled.
     pub view: Camera,
-    /// The camera of the picture file: full size, with its lens.
+    /// The camera of the image file: full size, with its lens.
     pub source: Camera,
     /// Seconds on the scene clock.
     pub time: Time,
     /// Frame number in the take, from 0; frames of several cameras with one number belong to one instant unless the
     /// cameras have time offsets.
     pub index: usize,
-    /// The picture file.
+    /// The image file.
     pub image: PathBuf,
     /// Whether its EXIF orientation is applied; else its camera describes the pixels as stored.
     pub upright: bool,
@@ -136,11 +136,11 @@ pub struct Frame {
     pub flow: Option<FlowFile>,
     /// The mask of labels: its values number [`Capture::labels`].
     pub labels: Option<PathBuf>,
-    /// The picture of features: numbers of its pixels.
+    /// The image of features: numbers of its pixels.
     pub features: Option<PathBuf>,
     /// The tracks of its camera.
     pub tracks: Option<Arc<Tracks>>,
-    /// [height · width] of the picture file: 1 where its lens recorded something, 0 in black borders; `None`: no borders.
+    /// [height · width] of the image file: 1 where its lens recorded something, 0 in black borders; `None`: no borders.
     pub recorded: Option<Arc<Vec<u8>>>,
 }
 
@@ -178,12 +178,12 @@ pub enum Split {
 pub struct Extent {
     /// The first frame number, and the one after the last.
     pub frames: Range<usize>,
-    /// Pictures of all cameras.
+    /// Images of all cameras.
     pub pictures: usize,
 }
 
 impl Extent {
-    /// With one picture more for each of these frame numbers.
+    /// With one image more for each of these frame numbers.
     fn add(&mut self, frames: Range<usize>) {
         let both = self.frames.start.min(frames.start)..self.frames.end.max(frames.end);
         self.pictures += frames.len();
@@ -191,7 +191,7 @@ impl Extent {
     }
 }
 
-/// A posed, timed set of pictures on disk.
+/// A posed, timed set of images on disk.
 #[derive(Clone, Debug)]
 pub struct Capture {
     /// A short name: what the capture calls itself, else the folder's.
@@ -204,10 +204,11 @@ pub struct Capture {
     pub kind: CaptureKind,
     /// The cameras; a moving camera is one entry that is not `fixed`.
     pub cameras: Vec<Rig>,
-    /// Whether the data set, or the names of its pictures (`cam07`), tell cameras apart; else an entry is one camera's photo of a
+    /// Whether the data set, or the names of its images (`cam07`), tell cameras apart; else an entry is one camera's
+    /// photo of a
     /// moment, or stands for many.
     pub named: bool,
-    /// All pictures, or those that were asked for ([`CaptureOptions::frames`]).
+    /// All images, or those that were asked for ([`CaptureOptions::frames`]).
     pub frames: Vec<Frame>,
     /// The whole take, whatever of it is listed.
     pub take: Extent,
@@ -225,7 +226,7 @@ pub struct Capture {
     pub fps: f64,
     /// The initial cloud, in the scene's units, already thinned to [`CaptureOptions::max_points`].
     pub points: Option<PointCloud>,
-    /// The background of transparent pixels, sRGB from 0 to 1; `None`: the pictures have no alpha.
+    /// The background of transparent pixels, sRGB from 0 to 1; `None`: the images have no alpha.
     pub background: Option<[f32; 3]>,
     /// What was subtracted from the world coordinates of poses and points, because f32 resolves them badly; zero near the
     /// origin ([`splat4d::scene::offset`]).
@@ -256,7 +257,7 @@ struct Take {
     root: PathBuf,
     kind: CaptureKind,
     cameras: Vec<String>,
-    /// Whether the data set tells cameras apart; else one entry may stand for many.
+    /// Whether the data set distinguishes cameras; else one entry may stand for many.
     named: bool,
     timing: Timing,
     frames: Vec<RawFrame>,
@@ -347,7 +348,7 @@ impl RawFrame {
 impl Capture {
     /// Opens the capture in a folder, or that of a marker file.
     ///
-    /// Reads poses, times and the headers of one picture per camera; checks that every picture exists. Errors name the
+    /// Reads poses, times and the headers of one image per camera; checks that every image exists. Errors name the
     /// file, frame or camera and what to do.
     pub fn open(path: &Path, options: &CaptureOptions) -> Result<Self> {
         options.check()?;

@@ -17,7 +17,7 @@ use std::path::{Path, PathBuf};
 
 /// Values of a row: a 3x5 matrix [down | right | back | centre | height, width, focal], then near and far (LLFF).
 const ROW: usize = 17;
-/// How far the pictures' shape may differ from the stated one before the poses are taken to be of other pictures.
+/// How far the images' shape may differ from the stated one before the poses are taken to be of other images.
 const MAX_ASPECT_CHANGE: f64 = 0.01;
 /// Names under which prepared data sets keep their cloud.
 const POINTS: &[&str] = &["points.ply", "points3D.ply", "points3D_downsample2.ply"];
@@ -27,7 +27,7 @@ const NOTES: &str = "import";
 /// Rates are stated in steps of this, frames a second: intervals in files are rounded.
 const WHOLE_RATE: f64 = 0.01;
 
-/// A folder of frames: its camera's name and the pictures.
+/// A folder of frames: its camera's name and the images.
 struct Folder {
     name: String,
     images: Vec<PathBuf>,
@@ -51,7 +51,7 @@ pub(super) fn rows(marker: &Path) -> Result<Vec<Vec<f64>>> {
     }
 }
 
-/// The cloud that prepared data sets keep beside the poses.
+/// The cloud that prepared data sets keep next to the poses.
 pub(super) fn points(root: &Path) -> Result<Option<PointCloud>> {
     POINTS.iter().map(|name| root.join(name)).find(|p| p.is_file()).map(|p| read_ply(&p)).transpose()
 }

@@ -1,9 +1,10 @@
-//! Nerfies and HyperNeRF captures (Park et al. 2021): `dataset.json`, `metadata.json`, a camera a picture in `camera/`,
-//! `scene.json`, `points.npy`, and pictures in `rgb/1x` or smaller.
+//! Nerfies and HyperNeRF captures (Park et al. 2021): `dataset.json`, `metadata.json`, a camera an image in `camera/`,
+//! `scene.json`, `points.npy`, and images in `rgb/1x` or smaller.
 //!
 //! A camera file holds `orientation` (world to camera, OpenCV axes), `position` (its centre), `focal_length`,
 //! `pixel_aspect_ratio`, `principal_point`, `radial_distortion`, `tangential_distortion` and `image_size` [width, height] of
-//! the pictures at 1x. `scene.json` brings the world to about a unit: x becomes (x − center)·scale, cameras and points alike.
+//! the images at 1x. `scene.json` brings the world to about a unit: x becomes (x − center)·scale, cameras and points
+//! alike.
 
 use super::account::Severity;
 use super::account::{Account, Aspect, first_names};
@@ -22,11 +23,11 @@ use std::path::{Path, PathBuf};
 /// Marker of the layout, and the file without which it is another's.
 pub(super) const MARKER: &str = "dataset.json";
 const METADATA: &str = "metadata.json";
-/// By how much the pictures of each folder are reduced, finest first.
+/// By how much the images of each folder are reduced, finest first.
 const SCALES: [usize; 5] = [1, 2, 4, 8, 16];
 /// DyCheck's folder of split lists.
 const SPLITS: &str = "splits";
-/// Skew above this bends pictures visibly, and is not modelled, pixels.
+/// Skew above this bends images visibly, and is not modelled, pixels.
 const MOST_SKEW: f64 = 0.5;
 /// Colour of points, which the layout gives none.
 const GREY: f32 = 0.5;
@@ -62,7 +63,7 @@ impl Framing {
     }
 }
 
-/// The lists of a capture's pictures: all of them, those to train on, those to hold out.
+/// The lists of a capture's images: all of them, those to train on, those to hold out.
 struct Lists {
     ids: Vec<String>,
     train: Vec<String>,
@@ -192,7 +193,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     })
 }
 
-/// The finest folder of pictures, and by how much they are reduced. Errors: there is none.
+/// The finest folder of images, and by how much they are reduced. Errors: there is none.
 fn pictures(root: &Path, options: &CaptureOptions) -> Result<(PathBuf, usize)> {
     if let Some(name) = &options.images {
         let smaller = Path::new(name).file_name().and_then(|n| n.to_str()?.strip_suffix('x')?.parse().ok());

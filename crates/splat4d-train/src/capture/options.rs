@@ -1,4 +1,4 @@
-//! Options of a capture besides where it lies.
+//! Options of a capture in addition to where it lies.
 
 use super::borders::Lenses;
 use super::convention::Poses;
@@ -74,7 +74,7 @@ impl Value for Option<HoldOut> {
 const NEAR: f64 = 0.2;
 
 choices! {
-    /// What pictures are that state no times.
+    /// What images are that state no times.
     pub enum Sequence {
         /// As their names tell: a film where they are numbered like its frames, else photos.
         Auto = "auto",
@@ -134,11 +134,11 @@ choices! {
 }
 
 choices! {
-    /// Where the optical flow of pictures is from.
+    /// Where the optical flow of images is from.
     pub enum FlowSource {
         /// The capture's files; where it brings none there is none.
         Files = "files",
-        /// The capture's files, and where it brings none, followed from picture to picture by this program.
+        /// The capture's files, and where it brings none, followed from image to image by this program.
         Own = "own",
     }
 }
@@ -191,13 +191,13 @@ settings! {
 /// How a capture is read. `CaptureOptions::default()` follows the data set's own conventions.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CaptureOptions {
-    /// Pictures become means of k×k boxes; 1 leaves them as they are. Rows and columns that fill no box are cut off.
+    /// Images become means of k×k boxes; 1 leaves them as they are. Rows and columns that fill no box are cut off.
     pub downscale: usize,
     /// Held-out frames; `None` follows the data set's convention.
     pub hold_out: Option<HoldOut>,
     /// Frames per second; `None` takes what the capture states, else 30. Scales the clock of D-NeRF captures too.
     pub fps: Option<f64>,
-    /// What pictures are that state no times.
+    /// What images are that state no times.
     pub sequence: Sequence,
     /// The background of transparent pixels, sRGB from 0 to 1; `None` takes the capture's own, else white.
     pub background: Option<[f32; 3]>,
@@ -223,7 +223,8 @@ pub struct CaptureOptions {
     pub unregistered: Unregistered,
     /// Share of the images that may be missing.
     pub max_missing: f64,
-    /// Only pictures with these frame numbers are listed, so that memory does not grow with the take; empty: all. What they
+    /// Only images with these frame numbers are listed, so that memory does not grow with the take; empty: all. What
+    /// they
     /// are for (training, held out) is what it is in the whole take.
     pub frames: Vec<Range<usize>>,
     /// What is known of the lenses already, from another part of the take; else images are looked at.
@@ -275,7 +276,7 @@ impl Default for CaptureOptions {
 }
 
 impl CaptureOptions {
-    /// Whether a picture with this frame number is to be listed.
+    /// Whether an image with this frame number is to be listed.
     pub(super) fn lists(&self, index: usize) -> bool {
         self.frames.is_empty() || self.frames.iter().any(|f| f.contains(&index))
     }

@@ -96,7 +96,7 @@ fn read_meta(
     Ok(())
 }
 
-/// The cloud: the one .ply beside the metadata, else [`ARCHIVE`].
+/// The cloud: the one .ply next to the metadata, else [`ARCHIVE`].
 fn read_points(root: &Path, warnings: &mut Vec<String>) -> Result<Option<PointCloud>> {
     let names = rig::file_names(root);
     let plys: Vec<&str> =

@@ -1,4 +1,4 @@
-//! Picture files: headers without pixels, and upright pixels in planes. JPEG, PNG and WebP; EXIF orientation honoured.
+//! Image files: headers without pixels, and upright pixels in planes. JPEG, PNG and WebP; EXIF orientation honoured.
 
 use super::{json, pose};
 use crate::files;
@@ -12,7 +12,7 @@ use zune_core::colorspace::ColorSpace;
 use zune_core::options::DecoderOptions;
 use zune_jpeg::JpegDecoder;
 
-/// Contents of a picture's header.
+/// Contents of an image's header.
 pub(super) struct Header {
     /// Pixels across and down, as stored.
     pub stored: (usize, usize),
@@ -44,7 +44,7 @@ pub(super) enum Samples {
     Sixteen(Vec<u16>),
 }
 
-/// An upright decoded picture.
+/// An upright decoded image.
 pub(super) struct Raster {
     /// Pixels across.
     pub width: usize,
@@ -169,7 +169,7 @@ pub(super) fn header(path: &Path) -> Result<Header> {
 /// Bytes at the end of a file in which its end mark is, unless something else follows.
 const TAIL: u64 = 4096;
 
-/// An error if a picture's file is cut short, by its end mark; decodes a picture that has none near its end.
+/// An error if an image's file is cut short, by its end mark; decodes an image that has none near its end.
 pub(super) fn check_end(path: &Path) -> Result<()> {
     let fail = |e| Error::io("cannot be read", e).at(path.display()).remedy("Check that you may read the file.");
     let mut file = files::open(path)?;
@@ -201,13 +201,13 @@ fn open<'a>(source: impl BufRead + Seek + 'a, path: &Path) -> Result<impl ImageD
     reader.into_decoder().map_err(|e| broken(path, e))
 }
 
-/// How far the shape of a resized picture may be from the one that its intrinsics are for; more was cropped or padded.
+/// How far the shape of a resized image may be from the one that its intrinsics are for; more was cropped or padded.
 const MAX_ASPECT_CHANGE: f64 = 0.01;
 
 /// By how much reduced copies of images are reduced at most (`images_8`), with room.
 const MAX_REDUCTION: usize = 16;
 
-/// Whether a picture of `size` is one of the camera's size that was made smaller or larger: of the same shape, but for
+/// Whether an image of `size` is one of the camera's size that was made smaller or larger: of the same shape, but for
 /// the rounding of its shorter side; or reduced by a whole number.
 pub(super) fn is_resized(size: (usize, usize), camera: &Camera) -> bool {
     let whole = |side: usize, of: usize, k: usize| side == of / k || side == of.div_ceil(k);
@@ -220,7 +220,7 @@ pub(super) fn is_resized(size: (usize, usize), camera: &Camera) -> bool {
     (width / height - 1.0).abs() <= rounding.min(MAX_ASPECT_CHANGE)
 }
 
-/// An error unless a picture of `size` is what its camera describes.
+/// An error unless an image of `size` is what its camera describes.
 pub(super) fn check_size(path: &Path, size: (usize, usize), camera: &Camera) -> Result<()> {
     if size == (camera.width, camera.height) {
         return Ok(());
@@ -235,7 +235,7 @@ pub(super) fn check_size(path: &Path, size: (usize, usize), camera: &Camera) -> 
     ))
 }
 
-/// An error unless what lies beside a picture, `what` in words, is of that picture's size.
+/// An error unless what lies next to an image, `what` in words, is of that image's size.
 pub(super) fn check_beside(path: &Path, what: &str, size: (usize, usize), camera: &Camera) -> Result<()> {
     if size == (camera.width, camera.height) {
         return Ok(());
@@ -245,10 +245,10 @@ pub(super) fn check_beside(path: &Path, what: &str, size: (usize, usize), camera
         .remedy("Write it in the size of the stored image"))
 }
 
-/// How many times as long as its picture's the sides of a map may be; a larger one is a mistake, or a trap for memory.
+/// How many times as long as its image's the sides of a map may be; a larger one is a mistake, or a trap for memory.
 const MOST_TIMES: usize = 8;
 
-/// An error where what lies beside a picture, `what` in words, is far larger than that picture.
+/// An error where what lies next to an image, `what` in words, is far larger than that image.
 pub(super) fn check_not_larger(what: &str, size: (usize, usize), camera: &Camera) -> Result<()> {
     if size.0 <= MOST_TIMES * camera.width && size.1 <= MOST_TIMES * camera.height {
         return Ok(());
@@ -257,15 +257,16 @@ pub(super) fn check_not_larger(what: &str, size: (usize, usize), camera: &Camera
     Err(Error::input(what).remedy(format!("Write it in the size of the image; at most {MOST_TIMES} times its sides.")))
 }
 
-/// Decodes what lies beside a picture, `what` in words. Errors before its pixels are read where its size is not that of the
-/// stored picture.
+/// Decodes what lies next to an image, `what` in words. Errors before its pixels are read where its size is not that
+/// of the
+/// stored image.
 pub(super) fn decode_beside(path: &Path, what: &str, camera: &Camera) -> Result<Raster> {
     let header = header(path)?;
     check_beside(path, what, header.upright(), camera)?;
     decode(path, None)
 }
 
-/// Decodes a picture, upright. Fails before any large allocation if its size is impossible or, where given, not
+/// Decodes an image, upright. Fails before any large allocation if its size is impossible or, where given, not
 /// `expected`.
 pub(super) fn decode(path: &Path, expected: Option<&Camera>) -> Result<Raster> {
     decode_as(path, expected, true)
@@ -388,7 +389,7 @@ pub(super) fn mask_values(raster: &Raster, use_alpha: bool) -> Vec<f32> {
     (0..n).map(|p| scale * raster.get(p, channel)).collect()
 }
 
-/// Whether a mask (or, with `use_alpha`, a picture's alpha channel) shows anything. Pictures without alpha do.
+/// Whether a mask (or, with `use_alpha`, an image's alpha channel) shows anything. Images without alpha do.
 pub(super) fn any_foreground(path: &Path, use_alpha: bool) -> Result<bool> {
     let raster = decode(path, None)?;
     if use_alpha && raster.alpha().is_none() {

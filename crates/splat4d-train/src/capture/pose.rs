@@ -13,7 +13,7 @@ pub(super) const SAME_POSE: f64 = 1e-9;
 const MAX_SHEAR: f64 = 0.02;
 /// Newton-Schulz steps that make an accepted matrix a rotation: the error squares with each, 0.02 → 1e-15 in three.
 const POLAR_STEPS: usize = 4;
-/// Longest side of a picture, pixels: twice the largest sensors in use.
+/// Longest side of an image, pixels: twice the largest sensors in use.
 pub(super) const MAX_SIDE: usize = 1 << 15;
 /// Farthest coordinate of a camera or a point that is accepted, scene units: sums of squares and cubes of it still fit 32-bit
 /// floats. Metres of a map are a hundred thousand times smaller.
@@ -23,7 +23,7 @@ pub(super) const FARTHEST: f64 = 1e12;
 const FOCAL: std::ops::RangeInclusive<f64> = 1e-3..=1e9;
 /// Latest time of an image that is accepted, seconds (thirty thousand years): frames of it are still told apart.
 pub(super) const LATEST: f64 = 1e12;
-/// Most pixels of a picture (134 million): decoding one takes below 1 GiB.
+/// Most pixels of an image (134 million): decoding one takes below 1 GiB.
 pub(super) const MAX_PIXELS: usize = 1 << 27;
 
 /// Checks that `pose` is a rigid motion and removes rounding from its rotation.
@@ -81,7 +81,7 @@ pub(super) fn short(x: f64) -> String {
     if x == 0.0 || (1e-3..1e9).contains(&x.abs()) { x.to_string() } else { format!("{x:e}") }
 }
 
-/// Checks that a picture of this size can be handled at all.
+/// Checks that an image of this size can be handled at all.
 pub(super) fn check_size(width: usize, height: usize) -> Result<()> {
     let fits = (1..=MAX_SIDE).contains(&width) && (1..=MAX_SIDE).contains(&height) && width * height <= MAX_PIXELS;
     if fits {

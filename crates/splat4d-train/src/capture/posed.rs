@@ -1,4 +1,4 @@
-//! Cameras of a reconstruction without its pictures: for whoever has other pictures of the same rig.
+//! Cameras of a reconstruction without its images: for whoever has other images of the same rig.
 
 use super::json::{self, Node};
 use super::transforms::posed_frames;
@@ -8,10 +8,10 @@ use splat4d::scene::{Camera, Intrinsics};
 use splat4d::{Error, Result};
 use std::path::Path;
 
-/// A named camera with its pose, intrinsics, lens and picture size.
+/// A named camera with its pose, intrinsics, lens and image size.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PosedCamera {
-    /// The folder of its pictures, or the name of its only one without the ending.
+    /// The folder of its images, or the name of its only one without the ending.
     pub name: String,
     /// The camera.
     pub camera: Camera,
@@ -33,7 +33,7 @@ pub fn is_colmap(folder: &Path) -> bool {
     colmap::is_model(folder)
 }
 
-/// The cameras of a `transforms.json` (Nerfstudio, instant-ngp, Blender), whose pictures need not be there.
+/// The cameras of a `transforms.json` (Nerfstudio, instant-ngp, Blender), whose images need not be there.
 ///
 /// Errors: no such file, keys that are missing or wrong, a camera in several places.
 pub fn transforms_cameras(path: &Path) -> Result<Vec<PosedCamera>> {

@@ -1,10 +1,10 @@
-//! Pictures of bytes, as they are shown: what comes from a file before anything is done with it.
+//! Images of bytes, as they are shown: what comes from a file before anything is done with it.
 
 use super::picture::{self, Raster, Samples};
 use splat4d::Result;
 use std::path::Path;
 
-/// An upright picture of 8-bit samples, rows from the top.
+/// An upright image of 8-bit samples, rows from the top.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Rgb8 {
     /// Pixels across.
@@ -16,7 +16,7 @@ pub struct Rgb8 {
 }
 
 impl Rgb8 {
-    /// The picture in a JPEG, PNG or WebP file, upright; 16 bits are rounded to 8, alpha is left out.
+    /// The image in a JPEG, PNG or WebP file, upright; 16 bits are rounded to 8, alpha is left out.
     ///
     /// Errors: no such file, a damaged one or one of another kind.
     pub fn read(path: &Path) -> Result<Self> {
@@ -31,7 +31,7 @@ impl Rgb8 {
         Ok((Self::of(&raster), alpha))
     }
 
-    /// The picture that the bytes of a JPEG, PNG or WebP file hold, as [`read`](Self::read). Errors name `place`.
+    /// The image that the bytes of a JPEG, PNG or WebP file hold, as [`read`](Self::read). Errors name `place`.
     pub fn decode(bytes: &[u8], place: &Path) -> Result<Self> {
         Ok(Self::of(&picture::decode_bytes(bytes, place, None)?))
     }

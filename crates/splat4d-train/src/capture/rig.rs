@@ -1,9 +1,9 @@
-//! Names and files: which pictures lie in a folder, and what a picture's name says about camera and frame number.
+//! Names and files: which images lie in a folder, and what an image's name says about camera and frame number.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-/// Endings of pictures that can be decoded.
+/// Endings of images that can be decoded.
 pub(super) const IMAGE_ENDINGS: &[&str] = &["png", "jpg", "jpeg", "webp"];
 
 /// What macOS puts next to every file on foreign disks, under its name after this.
@@ -36,13 +36,13 @@ pub(super) fn spelled(folder: &Path, name: &str) -> PathBuf {
     at
 }
 
-/// Whether a name ends like a picture.
+/// Whether a name ends like an image.
 pub(super) fn is_image(name: &str) -> bool {
     let ending = Path::new(name).extension();
     !name.starts_with('.') && ending.is_some_and(|e| IMAGE_ENDINGS.iter().any(|v| e.eq_ignore_ascii_case(v)))
 }
 
-/// Sorted names of the pictures directly in `folder`.
+/// Sorted names of the images directly in `folder`.
 pub(super) fn image_names(folder: &Path) -> Vec<String> {
     file_names(folder).into_iter().filter(|n| is_image(n)).collect()
 }
@@ -54,24 +54,24 @@ pub(super) fn trailing_number(name: &str) -> Option<usize> {
     stem[stem.len() - digits..].parse().ok()
 }
 
-/// The cameras and frames that the names of all pictures give together.
+/// The cameras and frames that the names of all images give together.
 pub(super) struct Naming {
     /// Camera names, sorted.
     pub cameras: Vec<String>,
-    /// For each picture its camera and its frame number, counted from the smallest.
+    /// For each image its camera and its frame number, counted from the smallest.
     pub frames: Vec<(usize, usize)>,
     /// Whether the names tell cameras apart (`cam/frame`, `cam_frameN`), or all belong to one.
     pub told: bool,
-    /// The place of each picture among those of its camera, where no camera's numbers reach into those of another.
+    /// The place of each image among those of its camera, where no camera's numbers reach into those of another.
     pub ranks: Option<Vec<usize>>,
 }
 
 /// Widest range of numbers that are frame numbers, not time stamps: nine hours at 30 frames per second.
 pub(super) const MAX_SPAN: usize = 1_000_000;
-/// Folders that hold pictures but name no camera.
+/// Folders that hold images but name no camera.
 const PLAIN_FOLDERS: &[&str] = &["images", "image", "frames", "rgb", "input", "train", "test", "val", "."];
 
-/// Whether a folder holds pictures but names no camera.
+/// Whether a folder holds images but names no camera.
 pub(super) fn is_plain(folder: &str) -> bool {
     // ns-process-data writes reduced copies to images_2, images_4, images_8.
     let reduced = folder.strip_prefix("images_").is_some_and(|n| n.parse::<usize>().is_ok());
@@ -90,7 +90,7 @@ fn camera_of(name: &str) -> Option<&str> {
     (!camera.is_empty() && !number.is_empty() && number.bytes().all(|b| b.is_ascii_digit())).then_some(camera)
 }
 
-/// Finds cameras and frame numbers in picture names. Where names carry no usable numbers, their order counts.
+/// Finds cameras and frame numbers in image names. Where names carry no usable numbers, their order counts.
 pub(super) fn naming(names: &[&str]) -> Naming {
     let told = !names.is_empty() && names.iter().all(|n| camera_of(n).is_some());
     let camera = |n: &str| if told { camera_of(n).unwrap_or_default().to_string() } else { "moving".to_string() };

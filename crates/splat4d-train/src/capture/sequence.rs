@@ -1,4 +1,4 @@
-//! Cameras and frame numbers of pictures that say nothing of time: one moment, or the frames of films, by their names.
+//! Cameras and frame numbers of images that say nothing of time: one moment, or the frames of films, by their names.
 
 use super::{Sequence, rig};
 use splat4d::math::Se3;
@@ -10,19 +10,19 @@ use std::collections::{BTreeMap, BTreeSet};
 pub enum Timing {
     /// The capture states them.
     Told,
-    /// It states none; the numbers in picture names count frames.
+    /// It states none; the numbers in image names count frames.
     Numbers,
-    /// It states none; all pictures show one moment.
+    /// It states none; all images show one moment.
     Moment,
 }
 
-/// Who took every picture, and when.
+/// Who took every image, and when.
 pub(super) struct Order {
     /// Camera names.
     pub cameras: Vec<String>,
-    /// For each picture its camera, its frame number and its time in seconds.
+    /// For each image its camera, its frame number and its time in seconds.
     pub frames: Vec<(usize, usize, f64)>,
-    /// Whether the data set tells cameras apart; else one entry may stand for many.
+    /// Whether the data set distinguishes cameras; else one entry may stand for many.
     pub named: bool,
     /// Where the times are from.
     pub timing: Timing,
@@ -38,11 +38,11 @@ const PHOTO_WORD: &str = "IMG";
 const RENAMED: (&str, usize) = ("frame_", 5);
 /// Words before the number in the names of a rig's cameras.
 const CAMERA_WORDS: [&str; 2] = ["cam", "camera"];
-/// Part of the steps from number to number that are alike where a film was cut into frames; some pictures may not have
+/// Part of the steps from number to number that are alike where a film was cut into frames; some images may not have
 /// been registered.
 const EVEN: f64 = 0.5;
 
-/// Finds cameras and frame numbers of pictures without times. What was assumed and how to say otherwise is told.
+/// Finds cameras and frame numbers of images without times. What was assumed and how to say otherwise is told.
 pub(super) fn order(
     names: &[&str],
     poses: &[Se3],
@@ -104,7 +104,7 @@ pub(super) fn order(
     }
 }
 
-/// One moment: every picture has a place of its own, and is its own camera.
+/// One moment: every image has a place of its own, and is its own camera.
 pub(super) fn moment(names: &[&str]) -> Order {
     let stem = |name: &str| name.rsplit_once('.').map_or(name, |(stem, _)| stem).to_owned();
     let short = |name: &str| stem(name.rsplit_once('/').map_or(name, |(_, file)| file));
@@ -117,7 +117,7 @@ pub(super) fn moment(names: &[&str]) -> Order {
     Order { cameras, frames, named: false, timing: Timing::Moment }
 }
 
-/// Whether the pictures are frames of one camera's film: it never moves, or they are numbered evenly as films are.
+/// Whether the images are frames of one camera's film: it never moves, or they are numbered evenly as films are.
 fn is_film(group: &[usize], names: &[&str], poses: &[Se3]) -> bool {
     let words: BTreeSet<Option<&str>> = group.iter().map(|&i| film_word(names[i])).collect();
     let numbers: BTreeSet<usize> = group.iter().filter_map(|&i| rig::trailing_number(names[i])).collect();
@@ -132,7 +132,7 @@ fn still(group: &[usize], poses: &[Se3]) -> bool {
     group.len() > 1 && group.iter().all(|&i| poses[i] == poses[group[0]])
 }
 
-/// The word before the number of a picture's name, if it is one that frames have.
+/// The word before the number of an image's name, if it is one that frames have.
 fn film_word(name: &str) -> Option<&str> {
     let file = name.rsplit_once('/').map_or(name, |(_, file)| file);
     let word = word_before_number(file.rsplit_once('.').map_or(file, |(stem, _)| stem))?;
@@ -147,7 +147,7 @@ fn is_renamed(name: &str) -> bool {
     number.is_some_and(|n| n.len() == RENAMED.1 && n.bytes().all(|b| b.is_ascii_digit()))
 }
 
-/// Whether pictures are called by the cameras of a rig (`cam07`).
+/// Whether images are called by the cameras of a rig (`cam07`).
 pub(super) fn are_cameras(stems: &[String]) -> bool {
     let known = |word: &str| CAMERA_WORDS.contains(&word.to_ascii_lowercase().as_str());
     stems.iter().all(|stem| word_before_number(stem).is_some_and(known))

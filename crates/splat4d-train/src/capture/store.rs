@@ -1,7 +1,7 @@
-//! Pictures on demand: decoded, composited, undistorted and downscaled, in a byte budget shared by all threads.
+//! Images on demand: decoded, composited, undistorted and downscaled, in a byte budget shared by all threads.
 //!
-//! A picture is a pure function of its files and the capture's options, so neither the order of loads nor the prefetch
-//! thread nor eviction can change a result. Plain 8-bit pictures stay 8 bits a sample, exactly as in the file; whatever
+//! An image is a pure function of its files and the capture's options, so neither the order of loads nor the prefetch
+//! thread nor eviction can change a result. Plain 8-bit images stay 8 bits a sample, exactly as in the file; whatever
 //! was composited, resampled or averaged is kept in 16 bits, whose rounding (1/131070) is far below the half 8-bit step
 //! (1/510) that an 8-bit copy would lose, at half the memory of f32.
 
@@ -18,14 +18,14 @@ use std::path::Path;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard};
 use std::thread::JoinHandle;
 
-/// A loaded picture in floating point.
+/// A loaded image in floating point.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Picture {
     /// [3, height, width] sRGB values from 0 to 1, composited on the capture's background.
     pub color: Planes<f32>,
-    /// [1, height, width] foreground weight from 0 to 1, from the mask file, else from the picture's alpha.
+    /// [1, height, width] foreground weight from 0 to 1, from the mask file, else from the image's alpha.
     pub mask: Option<Planes<f32>>,
-    /// [1, height, width] part of the pixel that the original picture covers, where undistortion left borders. Colour
+    /// [1, height, width] part of the pixel that the original image covers, where undistortion left borders. Colour
     /// there is meaningless; losses and measurements must leave those pixels out.
     pub valid: Option<Planes<f32>>,
     /// [1, height, width] the depth of what pixels show, 0 where it is not known, and what kind of depth it is.
@@ -35,7 +35,7 @@ pub struct Picture {
     pub flow: Option<Planes<f32>>,
 }
 
-/// A loaded picture as it is kept: planes of 8 or 16 bits.
+/// A loaded image as it is kept: planes of 8 or 16 bits.
 #[derive(PartialEq)]
 pub struct StoredPicture {
     width: usize,
@@ -159,10 +159,10 @@ impl std::fmt::Debug for StoredPicture {
     }
 }
 
-/// A cache of decoded pictures that never exceeds its byte budget.
+/// A cache of decoded images that never exceeds its byte budget.
 ///
-/// The least recently used picture goes first. Pictures in use by callers (their `Arc`s) and the one being decoded are
-/// not counted; a picture larger than the whole budget is handed out without being kept.
+/// The least recently used image goes first. Images in use by callers (their `Arc`s) and the one being decoded are
+/// not counted; an image larger than the whole budget is handed out without being kept.
 pub struct ImageStore {
     shared: Arc<Shared>,
     worker: Mutex<Option<JoinHandle<()>>>,
@@ -194,19 +194,19 @@ struct Kept {
 }
 
 impl ImageStore {
-    /// A store for the pictures of `capture` that keeps at most `budget_bytes` of them decoded.
+    /// A store for the images of `capture` that keeps at most `budget_bytes` of them decoded.
     pub fn new(capture: Arc<Capture>, budget_bytes: usize) -> Self {
         let state = Mutex::new(State::default());
         let shared = Shared { capture, budget: budget_bytes, state, changed: Condvar::new() };
         Self { shared: Arc::new(shared), worker: Mutex::new(None) }
     }
 
-    /// The capture whose pictures these are.
+    /// The capture whose images these are.
     pub fn capture(&self) -> &Arc<Capture> {
         &self.shared.capture
     }
 
-    /// The picture of a frame; decodes it unless it is kept. Errors name the file. Panics: `frame` out of range.
+    /// The image of a frame; decodes it unless it is kept. Errors name the file. Panics: `frame` out of range.
     pub fn load(&self, frame: usize) -> Result<Arc<StoredPicture>> {
         assert!(frame < self.shared.capture.frames.len(), "frame {frame} must be one of the capture's frames");
         self.shared.load(frame)
@@ -231,24 +231,24 @@ impl ImageStore {
         let mut worker = self.worker.lock().unwrap_or_else(|e| e.into_inner());
         if worker.is_none() {
             let shared = Arc::clone(&self.shared);
-            // Without a thread (a process limit, say) pictures are simply decoded when they are asked for.
+            // Without a thread (a process limit, say) images are simply decoded when they are asked for.
             *worker = std::thread::Builder::new().name("prefetch".into()).spawn(move || shared.work()).ok();
         }
     }
 
-    /// Bytes of the pictures kept now.
+    /// Bytes of the images kept now.
     #[cfg(test)]
     pub(crate) fn bytes(&self) -> usize {
         self.shared.lock().bytes
     }
 
-    /// Most bytes of pictures kept at any time so far; at most the budget.
+    /// Most bytes of images kept at any time so far; at most the budget.
     #[cfg(test)]
     pub(crate) fn peak_bytes(&self) -> usize {
         self.shared.lock().peak
     }
 
-    /// How many pictures were decoded so far.
+    /// How many images were decoded so far.
     #[cfg(test)]
     pub(crate) fn decoded(&self) -> usize {
         self.shared.lock().loads
@@ -301,7 +301,8 @@ impl Shared {
         }
         drop(state);
         let _loading = Loading(self, frame);
-        // On this thread alone: one that shared the work with others could be given a job that waits for this very picture.
+        // On this thread alone: one that shared the work with others could be given a job that waits for this very
+        // image.
         let picture = Arc::new(prepare(&self.capture.frames[frame], &self.capture)?);
         self.keep(frame, &picture);
         Ok(picture)
@@ -355,10 +356,10 @@ impl Shared {
     }
 }
 
-/// White: stands in where a picture has alpha although the capture's first pictures had none.
+/// White: stands in where an image has alpha although the capture's first images had none.
 const WHITE: [f32; 3] = [1.0; 3];
 
-/// Decodes a frame's picture, mask, depth and flow and brings them to the frame's view.
+/// Decodes a frame's image, mask, depth and flow and brings them to the frame's view.
 fn prepare(frame: &Frame, capture: &Capture) -> Result<StoredPicture> {
     let place = |e: splat4d::Error| {
         let camera = &capture.cameras[frame.camera].name;
@@ -389,7 +390,7 @@ fn prepare(frame: &Frame, capture: &Capture) -> Result<StoredPicture> {
         let map = UndistortMap::new(&lens, &frame.source);
         let undistort = |plane: &Vec<f32>| map.apply(plane, stored_width, stored_height);
         planes = planes.iter().map(undistort).collect();
-        // Outside of the picture it is 0 as well.
+        // Outside of the image it is 0 as well.
         valid = valid.as_ref().map(undistort).or_else(|| map.valid());
     }
     let (k, width, height) = (capture.downscale, frame.source.width, frame.source.height);
@@ -406,7 +407,7 @@ fn to_byte(v: f32) -> u8 {
     (v.clamp(0.0, 1.0) * 255.0).round() as u8
 }
 
-/// A mask's values in the size of its picture; one of another size, but the same shape, is resampled (nearest pixel).
+/// A mask's values in the size of its image; one of another size, but the same shape, is resampled (nearest pixel).
 fn read_mask(path: &Path, camera: &Camera, upright: bool) -> Result<Vec<f32>> {
     let (width, height) = (camera.width, camera.height);
     let raster = picture::decode_as(path, None, upright)?;
@@ -433,7 +434,7 @@ fn planar(samples: &[u8], channels: usize) -> Vec<u8> {
     out
 }
 
-/// Three planes of colour·α + background·(1 − α), in the picture's own (sRGB) values as the papers do.
+/// Three planes of colour·α + background·(1 − α), in the image's own (sRGB) values as the papers do.
 fn composite(raster: &Raster, background: [f32; 3]) -> Vec<Vec<f32>> {
     let n = raster.width * raster.height;
     (0..3)
@@ -451,9 +452,9 @@ fn composite(raster: &Raster, background: [f32; 3]) -> Vec<Vec<f32>> {
         .collect()
 }
 
-/// For every pixel of the pinhole picture, where it is in the distorted one.
+/// For every pixel of the pinhole image, where it is in the distorted one.
 struct UndistortMap {
-    /// Pixel positions minus one half (so that whole numbers are pixel centres); NaN where the picture does not reach.
+    /// Pixel positions minus one half (so that whole numbers are pixel centres); NaN where the image does not reach.
     positions: Vec<[f32; 2]>,
 }
 
@@ -476,13 +477,13 @@ impl UndistortMap {
         Self { positions: (0..camera.width * camera.height).map(at).collect() }
     }
 
-    /// 1 where the original picture reaches, else 0; `None` if it reaches everywhere.
+    /// 1 where the original image reaches, else 0; `None` if it reaches everywhere.
     fn valid(&self) -> Option<Vec<f32>> {
         let reaches: Vec<f32> = self.positions.iter().map(|p| if p[0].is_nan() { 0.0 } else { 1.0 }).collect();
         reaches.contains(&0.0).then_some(reaches)
     }
 
-    /// Bilinear samples; 0 where the picture does not reach.
+    /// Bilinear samples; 0 where the image does not reach.
     fn apply(&self, plane: &[f32], width: usize, height: usize) -> Vec<f32> {
         let sample = |&[x, y]: &[f32; 2]| {
             if x.is_nan() {

@@ -1,4 +1,4 @@
-//! Every reader on a made-up sample that the test writes; bad input; mutated files.
+//! Every reader on a synthetic sample that the test writes; bad input; mutated files.
 
 mod bad_input;
 mod depth;

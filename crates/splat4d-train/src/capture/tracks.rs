@@ -1,4 +1,5 @@
-//! Point tracks on disk: where single points are in the pictures of a camera, frame by frame. CSV with the columns `point`,
+//! Point tracks on disk: where single points are in the images of a camera, frame by frame. CSV with the columns
+//! `point`,
 //! `frame`, `x`, `y` and, if there is one, `visible`; or `.npz` with `tracks` [frames, points, 2] and `visibility`
 //! [frames, points], as trackers write them.
 
@@ -18,9 +19,10 @@ const COLUMNS: [&str; 4] = ["point", "frame", "x", "y"];
 pub struct Tracks {
     /// The file.
     pub path: PathBuf,
-    /// Size of the pictures that places are pixels of.
+    /// Size of the images that places are pixels of.
     size: [usize; 2],
-    /// By frame number, the points that are seen in it: their numbers, ascending, and places, pixels of the stored picture.
+    /// By frame number, the points that are seen in it: their numbers, ascending, and places, pixels of the stored
+    /// image.
     seen: BTreeMap<usize, Vec<(usize, [f32; 2])>>,
 }
 
@@ -68,7 +70,7 @@ impl Tracks {
         frame != other && self.pairs(frame, other).next().is_some()
     }
 
-    /// Places in two frames of the points that are seen in both, pixels of the stored picture.
+    /// Places in two frames of the points that are seen in both, pixels of the stored image.
     pub(crate) fn pairs(&self, from: usize, to: usize) -> impl Iterator<Item = [[f32; 2]; 2]> + '_ {
         let of = |frame: usize| self.seen.get(&frame).map_or(&[][..], Vec::as_slice);
         let then = of(to);

@@ -27,7 +27,8 @@ pub struct Trial {
 }
 
 /// The gentlest settings whose file has at most `most` bytes: first `Level::Tuned` if `free` (the user asked for nothing
-/// else), then `base` without pruning, then `base` with as little pruning as possible, at last without spherical harmonics.
+/// else), then `base` without pruning, then `base` with as little pruning as possible, finally without spherical
+/// harmonics.
 ///
 /// `besides` are bytes that the file holds beyond its Gaussians (poster, cameras). Sizes are measured by writing, not
 /// estimated. Errors: not even the hardest settings fit; what cannot be baked.

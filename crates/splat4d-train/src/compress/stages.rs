@@ -25,7 +25,7 @@ const REST: f64 = 0.1;
 /// Rates of fine-tuning through the file, of those with which training ended.
 const FILE_RATES: f64 = 0.5;
 
-/// All that hooks need beside the scene; they outlive the call that makes them.
+/// All that hooks need next to the scene; they outlive the call that makes them.
 #[derive(Clone)]
 pub(super) struct Prepared {
     pub frames: Arc<dyn Frames>,

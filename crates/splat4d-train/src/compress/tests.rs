@@ -1,4 +1,4 @@
-//! A whole compression on a made-up capture: rounds, the file, sizes.
+//! A whole compression on a synthetic capture: rounds, the file, sizes.
 
 use super::*;
 use crate::run::tests::{Place, recipe};

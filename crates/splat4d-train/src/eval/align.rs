@@ -41,7 +41,7 @@ impl Align {
         wanted.then(|| Self { settings, scale: scale(&plan(capture, recipe)) })
     }
 
-    /// The capture with these frames where the scene shows them best, and by how much they moved. Errors: pictures that
+    /// The capture with these frames where the scene shows them best, and by how much they moved. Errors: images that
     /// cannot be read.
     pub(super) fn fit(
         &self,

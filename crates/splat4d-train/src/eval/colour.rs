@@ -1,7 +1,7 @@
 //! How much of an error is a camera's colour alone: an affine colour matrix fitted a camera, render to truth.
 //!
 //! A view is a handful of sums (the normal equations of the fit), whatever its size; the squared error after any such
-//! matrix is a quadratic form of them. So no picture is looked at twice, and a camera of a thousand views costs some 200
+//! matrix is a quadratic form of them. So no image is looked at twice, and a camera of a thousand views costs some 200
 //! bytes each. What the matrix makes of a render is not clamped again, which sums could not do: the true error is never
 //! above the one told, since the truth lies in `[0,1]`.
 
@@ -36,7 +36,7 @@ pub(crate) struct ColourSums {
 }
 
 impl ColourSums {
-    /// The sums of one view, both pictures clamped to `[0,1]`; pixels in row-major order, in f64. Where a pixel is known
+    /// The sums of one view, both images clamped to `[0,1]`; pixels in row-major order, in f64. Where a pixel is known
     /// by a share v only, its weight is v²: so much of its error counts in a plain PSNR.
     ///
     /// Shapes: `[3,H,W]` both, `known` `[1,H,W]` or `None` where all of it is. Panics: shapes differ.
@@ -79,7 +79,7 @@ impl ColourSums {
         self.values += other.values;
     }
 
-    /// The matrix with the least squared error; `None` where the colours do not tell one (a grey picture, a single
+    /// The matrix with the least squared error; `None` where the colours do not tell one (a grey image, a single
     /// colour, NaN).
     ///
     /// Source: FreeTimeGS++ 2026 measures renders with an affine colour correction a camera, to tell colour from shape.
@@ -157,7 +157,7 @@ mod tests {
         for (found, cast) in found.iter().flatten().zip(CAST.iter().flatten()) {
             assert!((found - cast).abs() < 2e-3, "{found} for {cast}");
         }
-        // The error of a view as it is defined: on the corrected picture itself.
+        // The error of a view as it is defined: on the corrected image itself.
         for ((view, truth), sums) in views.iter().zip(&truths).zip(&sums) {
             let (told, drawn) = (sums.psnr(&found).unwrap(), psnr(&cast(view, &found), truth).unwrap());
             assert!((told - drawn).abs() < 1e-3, "{told} told, {drawn} drawn");

@@ -1,4 +1,4 @@
-//! Floaters: Gaussians that hang before few cameras. They are told by what their removal does to every picture.
+//! Floaters: Gaussians that hang before few cameras. They are told by what their removal does to every image.
 //!
 //! With L = Σ over pixels and channels of (I − T)² between render I and truth T, and r_i the part of the render that is lost
 //! without Gaussian i, removing it alone changes L by
@@ -7,14 +7,14 @@
 //!
 //! because r_i is linear in the opacity o_i: two numbers that the renderer knows. A training camera *supports* a Gaussian that
 //! it would miss. A floater is seen, supported by a small share of the cameras that see it, not missed by held-out cameras, and
-//! all pictures together are better without it. That much holds for some Gaussians of every scene, whose pictures are never
+//! all images together are better without it. That much holds for some Gaussians of every scene, whose images are never
 //! quite right, so that it must also matter to a camera. What removing the Gaussian gains there is −Δ; what removing as much as
 //! is best of what it shows would gain, were there more of it, is
 //!
 //! > max_a Σ (I − T)² − Σ (I − T − a r)² = (Σ r (I − T))² / Σ r² = (Σ r² − Δ)² / (4 Σ r²),
 //!
 //! which is large for all Gaussians of a veil, also those that others hide. The geometric mean of both, as a share of the squared
-//! error of the median camera, tells veils from the rest.
+//! error of the median camera, distinguishes veils from the rest.
 
 use crate::capture::frames::{Frames, Picture};
 use splat4d::edit::Selected;
@@ -25,14 +25,15 @@ use splat4d::scene::{Planes, Table};
 use splat4d::{Error, Result};
 use std::collections::BTreeMap;
 
-/// Pictures of a camera that are looked at, at most.
+/// Images of a camera that are looked at, at most.
 const PICTURES: usize = 4;
-/// Pictures that are looked at, at most: minutes, not hours.
+/// Images that are looked at, at most: minutes, not hours.
 const MOST: usize = 400;
-/// A camera sees a Gaussian whose removal changes its pictures by this, colours of 0 to 1 squared and summed over pixels and
-/// channels: a pixel by 4 %. Less is lost in what any picture differs from any scene.
+/// A camera sees a Gaussian whose removal changes its images by this, colours of 0 to 1 squared and summed over
+/// pixels and
+/// channels: a pixel by 4 %. Less is lost in what any image differs from any scene.
 const SEEN: f64 = 0.005;
-/// A camera misses a Gaussian whose removal makes its pictures worse by this share of what the removal changes: less is
+/// A camera misses a Gaussian whose removal makes its images worse by this share of what the removal changes: less is
 /// chance.
 const MISSED: f64 = 0.2;
 /// Largest share of the cameras that see a Gaussian which may support it, at strength 1.
@@ -42,26 +43,26 @@ const SHARE: f64 = 0.5;
 /// rest less than 3 in a thousand; at 0.005 four times as many of the rest.
 const MATTERS: f64 = 0.005;
 
-/// What pictures say of one Gaussian.
+/// What images say of one Gaussian.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Support {
-    /// Training cameras whose pictures it changes.
+    /// Training cameras whose images it changes.
     pub seen: u32,
     /// Training cameras that would miss it.
     pub missed: u32,
     /// How much it matters to the training camera that sees it to which it matters most, in squared error; zero where
     /// no camera is better without it.
     pub matters: f64,
-    /// Σ Δ over held-out pictures; below zero they are better without it.
+    /// Σ Δ over held-out images; below zero they are better without it.
     pub held: f64,
-    /// Σ Δ over all pictures.
+    /// Σ Δ over all images.
     pub delta: f64,
-    /// Σ r² over all pictures.
+    /// Σ r² over all images.
     pub change: f64,
 }
 
 impl Support {
-    /// Whether it is a floater at a strength from 0 (nothing is) to 1. What alone makes a picture wrong has Δ = −Σ r².
+    /// Whether it is a floater at a strength from 0 (nothing is) to 1. What alone makes an image wrong has Δ = −Σ r².
     /// `error`: the squared error of the median camera.
     pub fn floats(&self, strength: f64, error: f64) -> bool {
         let matters = self.matters * strength >= MATTERS * error;
@@ -71,12 +72,12 @@ impl Support {
     }
 }
 
-/// What pictures say of a scene.
+/// What images say of a scene.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Judged {
     /// By layer and Gaussian.
     pub support: Vec<Vec<Support>>,
-    /// Σ (I − T)² over the pictures of the median training camera.
+    /// Σ (I − T)² over the images of the median training camera.
     pub error: f64,
 }
 
@@ -87,10 +88,11 @@ impl Judged {
     }
 }
 
-/// Of every Gaussian what the pictures say of it: those of `train`, which is a list of numbers of `frames`, and those that
-/// were held out. `told`: pictures done, and all.
+/// Of every Gaussian what the images say of it: those of `train`, which is a list of numbers of `frames`, and those
+/// that
+/// were held out. `told`: images done, and all.
 ///
-/// Errors: a picture that cannot be read; no held-out pictures; a scene with a pixel head.
+/// Errors: an image that cannot be read; no held-out images; a scene with a pixel head.
 pub fn support(
     scene: &Scene<f32>,
     frames: &dyn Frames,
@@ -110,7 +112,7 @@ pub fn support(
     let total = train.iter().chain(&held).map(Vec::len).sum();
     let (mut done, mut errors) = (0, Vec::new());
     for (own, is_held) in train.iter().map(|f| (f, false)).chain(held.iter().map(|f| (f, true))) {
-        // A camera is one voice: its pictures are summed.
+        // A camera is one voice: its images are summed.
         let mut sums: Vec<Vec<[f64; 2]>> = out.iter().map(|l| vec![[0.0; 2]; l.len()]).collect();
         let mut error = 0.0;
         for &frame in own {
@@ -137,11 +139,11 @@ pub fn support(
     Ok(Judged { support: out, error: errors.get(errors.len() / 2).copied().unwrap_or(0.0) })
 }
 
-/// Pictures of every camera, spread over its time, within the bounds.
+/// Images of every camera, spread over its time, within the bounds.
 fn by_camera(frames: &dyn Frames, among: &[usize]) -> Vec<Vec<usize>> {
     let mut cameras: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
     among.iter().for_each(|&f| cameras.entry(frames.rig(f)).or_default().push(f));
-    // A camera that moves is another one in every picture.
+    // A camera that moves is another one in every image.
     if cameras.len() == 1 {
         let step = among.len().div_ceil(MOST / 2).max(1);
         return among.iter().step_by(step).map(|&f| vec![f]).collect();
@@ -181,7 +183,7 @@ impl<'a> Judge<'a> {
         }
     }
 
-    /// Adds Δ and Σ r² of one picture to `sums`, by layer and row. Returns Σ (I − T)².
+    /// Adds Δ and Σ r² of one image to `sums`, by layer and row. Returns Σ (I − T)².
     fn add(&mut self, frames: &dyn Frames, frame: usize, sums: &mut [Vec<[f64; 2]>]) -> Result<f64> {
         frames.load(frame, &mut self.picture)?;
         let truth = &self.picture;
@@ -190,7 +192,7 @@ impl<'a> Judge<'a> {
         let shot = Shot::new(&splats, frames.camera(frame), self.scene.background);
         self.importance.removals(&shot, &mut self.removals);
         self.renderer.render(&shot, &mut self.image);
-        // ∂L/∂I = 2 (I − T), nothing where the lens left no picture.
+        // ∂L/∂I = 2 (I − T), nothing where the lens left no image.
         let mut d_color = Planes { data: vec![0.0; truth.color.data.len()], ..truth.color.clone() };
         let valid = |pixel: usize| truth.weight.as_ref().map_or(1.0, |v| v.data[pixel]);
         let pixels = d_color.pixels();
@@ -290,7 +292,7 @@ mod tests {
     fn rig() -> Rig {
         let cameras: Vec<Camera> = (0..12).map(camera).collect();
         let truth = scene(false);
-        // What no Gaussian shows: pictures are never quite the scene.
+        // What no Gaussian shows: images are never quite the scene.
         let noisy = |(i, camera): (usize, &Camera)| {
             let mut picture = splat4d::draw(&truth, camera, Time(0.0)).unwrap().color;
             let noise = Rng::new(8, "noise", i as u64);

@@ -19,9 +19,9 @@ pub const WITHIN: [f64; 3] = [1.0, 3.0, 5.0];
 /// How well drawn flow agrees with known flow.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FlowError {
-    /// Pictures that were measured.
+    /// Images that were measured.
     pub pictures: usize,
-    /// Whether they were held out; else no held-out picture knows its flow, and those of training stand in.
+    /// Whether they were held out; else no held-out image knows its flow, and those of training stand in.
     pub held: bool,
     /// Mean end-point error, pixels.
     pub mean: f64,
@@ -98,7 +98,7 @@ mod tests {
 
     const SIDE: usize = 24;
 
-    /// A camera at z = 4 looks at a wall at z = 0 that fills its picture; its flow is 2 pixels a frame to the right.
+    /// A camera at z = 4 looks at a wall at z = 0 that fills its image; its flow is 2 pixels a frame to the right.
     fn capture(folder: &std::path::Path) -> Capture {
         let plain = image::RgbImage::from_pixel(SIDE as u32, SIDE as u32, image::Rgb([90, 90, 90]));
         let code = |v: f64| (v * 64.0 + 32768.0).round() as u16;

@@ -1,8 +1,10 @@
-//! Localisation: from where and when a picture was taken, told by a scene that stays as it is.
+//! Localisation: from where and when an image was taken, told by a scene that stays as it is.
 //!
-//! The best of some starts, at some moments, are found in small pictures. Each is then moved to where the scene differs least
-//! from the picture, by Gauss and Newton's method with damping (Levenberg and Marquardt) and a robust loss, in larger and
-//! larger pictures: there are six unknowns of the pose, one of the time where the scene moves, and one of the focal length where
+//! The best of some starts, at some moments, are found in small images. Each is then moved to where the scene
+//! differs least
+//! from the image, by Gauss and Newton's method with damping (Levenberg and Marquardt) and a robust loss, in larger and
+//! larger images: there are six unknowns of the pose, one of the time where the scene moves, and one of the focal
+//! length where
 //! it is asked for, so that derivatives are differences of renders. A gain and an offset of each colour are free, since another camera
 //! has another exposure. What does not fit the scene much better than one plain colour would is refused ([`Located::is_sure`]).
 
@@ -14,13 +16,13 @@ use splat4d::math::cholesky::Cholesky;
 use splat4d::render::{Antialias, Backend, Image, RenderConfig, Shot};
 use splat4d::scene::{Camera, Planes, Time};
 
-/// Longer sides of pictures, small to large, and starts that are still followed in each.
+/// Longer sides of images, small to large, and starts that are still followed in each.
 const LEVELS: [(usize, usize); 4] = [(48, 6), (96, 3), (192, 1), (384, 1)];
 /// Moments of the clip at which a start is tried.
 const MOMENTS: usize = 12;
 /// Starts that are tried, evenly chosen.
 const MOST_STARTS: usize = 128;
-/// Steps of Newton's method in pictures of a size, at most.
+/// Steps of Newton's method in images of a size, at most.
 const STEPS: usize = 15;
 /// Pixels by which what is seen moves when a derivative is taken, and the movement that is no longer worth a step.
 const DIFFERENCE: f64 = 0.5;
@@ -39,8 +41,10 @@ const SOLID: f32 = 0.5;
 const UNKNOWN: usize = 8;
 const TIME: usize = 6;
 const FOCAL: usize = 7;
-/// A picture is found where it differs from the scene by at most this share of its difference from one plain colour. Of a
-/// scene with 31 dB, held-out pictures reached 0.10, pictures of other scenes and mirror images 0.78 and more (docs/refine.md).
+/// An image is found where it differs from the scene by at most this share of its difference from one plain colour.
+/// Of a
+/// scene with 31 dB, held-out images reached 0.10, images of other scenes and mirror images 0.78 and more
+/// (docs/refine.md).
 pub const SURE: f64 = 1.0 / 3.0;
 
 /// What is asked.
@@ -52,14 +56,14 @@ pub struct Question {
     pub lens: bool,
 }
 
-/// Where a picture was taken, as far as the scene tells.
+/// Where an image was taken, as far as the scene tells.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Located {
-    /// From where, with the picture's size.
+    /// From where, with the image's size.
     pub camera: Camera,
     /// When; the beginning of the clip where nothing moves.
     pub time: Time,
-    /// Mean absolute difference of the picture from the scene, colours from 0 to 1, in the largest pictures looked at.
+    /// Mean absolute difference of the image from the scene, colours from 0 to 1, in the largest images looked at.
     pub residual: f64,
     /// The same from the plain colour that is its mean: what a scene that has nothing to do with it may reach.
     pub chance: f64,
@@ -73,7 +77,7 @@ impl Located {
         if self.chance > 0.0 { self.residual / self.chance } else { f64::INFINITY }
     }
 
-    /// Whether the scene explains the picture.
+    /// Whether the scene explains the image.
     pub fn is_sure(&self) -> bool {
         self.share() <= SURE
     }
@@ -97,10 +101,11 @@ struct Search<'a> {
     lens: bool,
 }
 
-/// Finds a picture ([3, h, w]) in a scene, from the nearest of some cameras of the picture's size. `told`: candidates that were
+/// Finds an image ([3, h, w]) in a scene, from the nearest of some cameras of the image's size. `told`: candidates
+/// that were
 /// followed, and all.
 ///
-/// Errors: those of drawing. Panics: no starts; a start of another size than the picture's.
+/// Errors: those of drawing. Panics: no starts; a start of another size than the image's.
 pub fn localise(
     scene: &Scene<f32>,
     picture: &Planes<f32>,
@@ -135,7 +140,7 @@ pub fn localise(
 }
 
 impl Search<'_> {
-    /// The starts at their best moments, in the smallest pictures; the best starts first.
+    /// The starts at their best moments, in the smallest images; the best starts first.
     fn tried(&mut self, picture: &Planes<f32>, starts: &[Camera]) -> Result<Vec<Candidate>> {
         let [first, last] = self.scene.clip;
         let moment = |k: usize| first + (k as f64 + 0.5) * (last - first) / MOMENTS as f64;
@@ -158,7 +163,7 @@ impl Search<'_> {
         Ok(out)
     }
 
-    /// Draws what a candidate sees, in a picture so many times smaller.
+    /// Draws what a candidate sees, in an image so many times smaller.
     fn draw(&mut self, candidate: &Candidate, times: usize, depth: bool) -> Result<&Image<f32>> {
         self.scene.at(Time(candidate.time), &mut self.instant);
         let splats = self.scene.splats(&self.instant);
@@ -172,7 +177,7 @@ impl Search<'_> {
         Ok(Compared::of(&self.draw(candidate, times, false)?.color, picture))
     }
 
-    /// Moves a candidate to where it sees what the picture shows.
+    /// Moves a candidate to where it sees what the image shows.
     fn follow(&mut self, candidate: &mut Candidate, picture: &Planes<f32>, times: usize) -> Result<()> {
         let sizes = self.sizes(candidate, times)?;
         let asked: Vec<usize> = (0..UNKNOWN).filter(|&k| sizes[k] > 0.0).collect();
@@ -265,9 +270,9 @@ impl Search<'_> {
     }
 }
 
-/// A render beside the picture.
+/// A render next to the image.
 struct Compared {
-    /// Render with its colours corrected, less the picture.
+    /// Render with its colours corrected, less the image.
     residuals: Vec<f32>,
     gains: Vec<f32>,
     cost: f64,
@@ -316,7 +321,7 @@ fn soft(r: f64) -> f64 {
     (r * r + SOFT * SOFT).sqrt()
 }
 
-/// Gain and offset that bring one colour of a render nearest to the picture's.
+/// Gain and offset that bring one colour of a render nearest to the image's.
 fn response(x: &[f32], y: &[f32]) -> (f32, f32) {
     let n = x.len() as f64;
     let mean = |v: &[f32]| v.iter().map(|&v| f64::from(v)).sum::<f64>() / n;
@@ -331,7 +336,7 @@ fn response(x: &[f32], y: &[f32]) -> (f32, f32) {
     (gain as f32, (my - gain * mx) as f32)
 }
 
-/// The picture halved until its longer side is at most so long, and how many times smaller it is.
+/// The image halved until its longer side is at most so long, and how many times smaller it is.
 fn shrunk(picture: &Planes<f32>, side: usize) -> (Planes<f32>, usize) {
     let (mut out, mut times) = (picture.clone(), 1);
     while out.width.max(out.height) > side && out.width.min(out.height) > 1 {
@@ -341,7 +346,7 @@ fn shrunk(picture: &Planes<f32>, side: usize) -> (Planes<f32>, usize) {
     (out, times)
 }
 
-/// Mean absolute difference of a picture from its mean colour.
+/// Mean absolute difference of an image from its mean colour.
 fn plainness(picture: &Planes<f32>) -> f64 {
     let plain = Planes::new(picture.channels, picture.height, picture.width);
     Compared::of(&plain, picture).difference

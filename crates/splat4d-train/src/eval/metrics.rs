@@ -1,7 +1,7 @@
 //! Image metrics that need no learnt weights.
 //!
 //! Every metric sees values clamped to `[0,1]` and not rounded to 8 bits; a metric that is not defined for an image is
-//! `None`, never a made-up number. All sums run in a fixed order in f64.
+//! `None`, never a synthetic number. All sums run in a fixed order in f64.
 
 use crate::loss::Photometric;
 use rayon::prelude::*;
@@ -247,7 +247,7 @@ impl Flicker {
 const RAMP: [[f32; 3]; 5] =
     [[0.0, 0.0, 0.02], [0.26, 0.06, 0.42], [0.71, 0.20, 0.36], [0.98, 0.57, 0.16], [1.0, 1.0, 0.78]];
 
-/// The mean |render − truth| over channels as a colour picture `[3,H,W]`; errors from `full` on are the last colour.
+/// The mean |render − truth| over channels as a colour image `[3,H,W]`; errors from `full` on are the last colour.
 ///
 /// Panics: shapes differ, or `full` is not above 0.
 pub fn error_map(render: &Planes<f32>, truth: &Planes<f32>, full: f32) -> Planes<f32> {

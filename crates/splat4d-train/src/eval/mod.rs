@@ -24,7 +24,7 @@ pub use report::{CameraScores, Conditions, Report, Score, Split, View};
 
 use splat4d::scene::Planes;
 
-/// The context of a view besides its two images.
+/// The context of a view in addition to its two images.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct ViewContext<'a> {
     /// The pixels `[H·W]` that a mask calls foreground; `None` where the capture has no masks.

@@ -1,10 +1,11 @@
-//! End-point errors of followed points against known ones, in the world and in pictures: every true point at the first
+//! End-point errors of followed points against known ones, in the world and in images: every true point at the first
 //! frame is a query that [`splat4d::flow::query`] follows through the clip.
 //!
-//! In the world distances are compared with shares of the height of all points together, in pictures with pixels, as in
-//! TAP-Vid (Doersch et al. 2022) but for the pictures' own size, over the points that are truly seen. Where a capture brings
+//! In the world distances are compared with shares of the height of all points together, in images with pixels, as in
+//! TAP-Vid (Doersch et al. 2022) but for the images' own size, over the points that are truly seen. Where a capture
+//! brings
 //! `truth/tracks_visible.npy`, uint8 [cameras, frames, points], that says who is seen, and the drawn visibility is compared
-//! with it; else every point in the picture counts.
+//! with it; else every point in the image counts.
 
 use crate::capture::Capture;
 use crate::eval::tracks::Truth;
@@ -39,11 +40,11 @@ pub struct PointErrors {
     /// Slope of ln(root mean square distance) over ln(frames since the first): ½ a random walk, 1 a constant bias; `None`:
     /// too few frames, or no error.
     pub slope: Option<f64>,
-    /// The same in pictures.
+    /// The same in images.
     pub pictures: Option<PixelErrors>,
 }
 
-/// How well points are followed in pictures.
+/// How well points are followed in images.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PixelErrors {
     /// Cameras that looked.

@@ -64,7 +64,7 @@ pub struct CameraScores {
     /// Its views, by their place in [`Split::views`].
     pub places: Vec<usize>,
     /// The affine map of colours, render to truth, with the least squared error over all these views; `None` where they
-    /// tell none (grey pictures), and the identity stands for it.
+    /// tell none (grey images), and the identity stands for it.
     pub colour: Option<ColourMatrix>,
 }
 
@@ -163,12 +163,12 @@ fn add_notes(to: &mut Map<String, Value>, notes: Map<String, Value>) {
     }
 }
 
-/// What figures hold for, beside the steps of training: without it they do not compare.
+/// What figures hold for, next to the steps of training: without it they do not compare.
 #[derive(Clone, Debug, Default, PartialEq, serde::Serialize)]
 pub struct Conditions {
     /// `test`, `val` or `train`.
     pub split: &'static str,
-    /// What transparent pixels are composited on, sRGB from 0 to 1, in renders and truth; null: pictures have no alpha.
+    /// What transparent pixels are composited on, sRGB from 0 to 1, in renders and truth; null: images have no alpha.
     pub background: Option<[f32; 3]>,
     /// Instructions of the kernels: `scalar`, `avx2`, `avx512` or `neon`. Levels round differently.
     pub simd: &'static str,

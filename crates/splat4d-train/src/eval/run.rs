@@ -1,19 +1,22 @@
-//! Evaluation of a scene on a capture: every held-out view is drawn and compared with its picture, a few training views
-//! too; scores, pictures and a summary are written as 3DGS users know them.
+//! Evaluation of a scene on a capture: every held-out view is drawn and compared with its image, a few training views
+//! too; scores, images and a summary are written as 3DGS users know them.
 //!
 //! | file | content |
 //! |---|---|
-//! | `results.json` | [`Report::results`], with `dynamic-share` and `conditions` (split, background, step, instructions, device) besides; other entries are kept |
-//! | `per_view.json` | `Report::per_view`, with `camera` and `time` of every picture besides |
+//! | `results.json` | [`Report::results`], with `dynamic-share` and `conditions` (split, background, step,
+//! instructions, device) in addition; other entries are kept |
+//! | `per_view.json` | `Report::per_view`, with `camera` and `time` of every image in addition |
 //! | `test/ours_N/{renders,gt,errors}/00000.png` | held-out views, in the capture's order |
 //!
-//! Other views or another background than the run's own ([`EvalOptions::place`]) stand beside: in both files under an
-//! entry of that name, as `train` does, and their pictures in a folder of that name.
+//! Other views or another background than the run's own ([`EvalOptions::place`]) stand next to: in both files under an
+//! entry of that name, as `train` does, and their images in a folder of that name.
 //!
-//! PSNR is clamped to `[0,1]`, not rounded, per picture, then the mean. `PSNR-cc` is the same after the affine colour matrix
-//! that suits all measured views of the picture's camera best: what remains is not a matter of white balance. It is
-//! told beside the plain one and never in its place, for it has seen the truth. The dynamic region (pixels that leave their
-//! camera's temporal mean) and flicker are defined for fixed cameras only. Where a picture was undistorted, pixels
+//! PSNR is clamped to `[0,1]`, not rounded, per image, then the mean. `PSNR-cc` is the same after the affine colour
+//! matrix
+//! that suits all measured views of the image's camera best: what remains is not a matter of white balance. It is
+//! told next to the plain one and never in its place, for it has seen the truth. The dynamic region (pixels that
+//! leave their
+//! camera's temporal mean) and flicker are defined for fixed cameras only. Where an image was undistorted, pixels
 //! without an original take the truth's colour, so that they count as right in every metric.
 
 use super::align::Align;
@@ -39,7 +42,7 @@ use std::sync::Arc;
 
 /// Training views that are measured: their mean moves by less than 0.1 dB beyond that.
 const TRAIN_VIEWS: usize = 24;
-/// A mean difference of the channels as large as this is the last colour of an error picture.
+/// A mean difference of the channels as large as this is the last colour of an error image.
 const ERROR_FULL: f32 = 0.25;
 /// What draws: figures are the CPU renderer's, which defines what others draw.
 const DEVICE: &str = "CPU";
@@ -87,13 +90,13 @@ pub struct EvalOptions {
     pub antialias: bool,
     /// Weights of LPIPS (safetensors); `None`: not computed.
     pub lpips_weights: Option<PathBuf>,
-    /// Whether pictures are written.
+    /// Whether images are written.
     pub pictures: bool,
-    /// Most training views measured beside the held-out ones.
+    /// Most training views measured next to the held-out ones.
     pub train_views: usize,
     /// The views that are measured.
     pub measured: Measured,
-    /// Where results and pictures go in their files: `None` for the held-out views on the run's own background, which are
+    /// Where results and images go in their files: `None` for the held-out views on the run's own background, which are
     /// what a run is judged by; otherwise the name of an entry, such as `val` or `test-black`.
     pub place: Option<String>,
     /// How held-out views are aligned, to be measured a second time (`PSNR-aligned`); `None`: not.
@@ -153,10 +156,10 @@ fn mean(split: &Split, metric: &str) -> Option<f64> {
     }
 }
 
-/// The purpose of a list's pictures.
+/// The purpose of a list's images.
 #[derive(Clone, Copy, Debug)]
 enum Views<'a> {
-    /// All of a split, of which pictures may be written here.
+    /// All of a split, of which images may be written here.
     Whole(Option<&'a Path>),
     /// Some that were trained on.
     Train,
@@ -164,7 +167,7 @@ enum Views<'a> {
 
 /// Draws and measures the held-out views of `capture` (and a few training views), and writes the files above.
 ///
-/// Errors: a picture that cannot be read, weights that do not fit, a folder that cannot be written.
+/// Errors: an image that cannot be read, weights that do not fit, a folder that cannot be written.
 pub fn evaluate(
     scene: &Scene<f32>,
     capture: &Capture,
@@ -193,7 +196,7 @@ pub fn evaluate(
     Ok(evaluation)
 }
 
-/// The same without the two JSON files; pictures only if the options ask for them.
+/// The same without the two JSON files; images only if the options ask for them.
 ///
 /// Errors: those of [`evaluate`].
 pub fn assess(
@@ -447,7 +450,7 @@ fn cameras(capture: &Capture, frames: &[usize]) -> Vec<CameraFrames> {
     out
 }
 
-/// Pixels that the original picture does not cover take the truth's colour.
+/// Pixels that the original image does not cover take the truth's colour.
 fn hide_unknown(render: &mut Planes<f32>, truth: &Planes<f32>, known: &Planes<f32>) {
     for c in 0..render.channels {
         for ((r, t), v) in render.plane_mut(c).iter_mut().zip(truth.plane(c)).zip(&known.data) {
@@ -491,7 +494,7 @@ fn png(picture: &Planes<f32>) -> Vec<u8> {
     bytes
 }
 
-/// One value a picture, by its file name.
+/// One value an image, by its file name.
 fn by_file(frames: &[usize], value: impl Fn(usize) -> Value) -> Value {
     frames.iter().enumerate().map(|(place, &frame)| (file_name(place), value(frame))).collect()
 }
@@ -504,7 +507,7 @@ pub(super) fn merge(path: &Path, entries: Value) -> Result<()> {
     if let (Value::Object(all), Value::Object(entries)) = (&mut all, entries) {
         for (name, entry) in entries {
             match (all.get_mut(&name), entry) {
-                // Entries beside the run's own hold one for each step, of which the others stay.
+                // Entries next to the run's own hold one for each step, of which the others stay.
                 (Some(Value::Object(old)), Value::Object(new)) if !name.starts_with(METHOD) => old.extend(new),
                 (_, entry) => drop(all.insert(name, entry)),
             }

@@ -2,7 +2,8 @@
 //!
 //! `truth/tracks.npy` holds float32 [frames, points, 3], world positions. Every point at the first frame is a question, as
 //! in benchmarks of point tracking: the few Gaussians nearest to it then carry it on by their mean displacement, and the
-//! error is its distance to the truth at all later frames. Beside it stands the error of the nearest Gaussian itself, its
+//! error is its distance to the truth at all later frames. Next to it stands the error of the nearest Gaussian
+//! itself, its
 //! distance at the first frame included (the median trajectory error of Luiten et al. 2024). Moments at which none of a
 //! point's Gaussians is alive are not counted, but the share that is counted is reported.
 
@@ -173,7 +174,7 @@ mod tests {
         let motion = Arc::new(model);
         let layer = Layer::new("a", params, motion, LifeKind::Infinite);
         let scene = Scene { layers: vec![layer], clip: [0.0, 0.2], fps: 10.0, up: [1.0, 0.0, 0.0], ..Scene::default() };
-        // Two points that rise by 0.5 a frame, 0 and 0.1 beside Gaussians.
+        // Two points that rise by 0.5 a frame, 0 and 0.1 next to Gaussians.
         let data: Vec<f32> =
             (0..3).flat_map(|k| [[0.0, 0.5 * k as f32, 0.0], [1.1, 0.5 * k as f32, 0.0]].concat()).collect();
         let mut bytes = Vec::new();

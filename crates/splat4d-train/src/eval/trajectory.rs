@@ -15,7 +15,7 @@ const FEWEST: usize = 3;
 /// How far the cameras of a capture are from their truth.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TrajectoryError {
-    /// The names of the poses: camera, and the number of the picture where the camera moves.
+    /// The names of the poses: camera, and the number of the image where the camera moves.
     pub names: Vec<(String, Option<usize>)>,
     /// Their errors, once a similarity is taken away.
     pub poses: Trajectory,
@@ -50,7 +50,7 @@ impl TrajectoryError {
 }
 
 /// Compares the training cameras of a capture, as they were found, with those of the same names in another, which knows.
-/// Fixed cameras have one pose, of moving ones every picture has its own. Neighbours for the relative error are pictures of
+/// Fixed cameras have one pose, of moving ones every image has its own. Neighbours for the relative error are images of
 /// one moving camera, and fixed cameras in the capture's order.
 ///
 /// Errors: fewer than three cameras have a truth, or stand in different places.
@@ -81,7 +81,7 @@ pub fn trajectory_error(found: &Capture, truth: &Capture) -> Result<TrajectoryEr
         truths.push(true_frame.view.cam_from_world);
         rigs.push((camera.fixed, frame.camera, frame.time.0));
     }
-    // Pictures of one camera in time; fixed cameras one after the other.
+    // Images of one camera in time; fixed cameras one after the other.
     let mut order: Vec<usize> = (0..names.len()).collect();
     order.sort_by(|&a, &b| (rigs[a].0, rigs[a].1).cmp(&(rigs[b].0, rigs[b].1)).then(rigs[a].2.total_cmp(&rigs[b].2)));
     for w in order.windows(2) {

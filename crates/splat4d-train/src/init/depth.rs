@@ -1,4 +1,4 @@
-//! Points that depth maps show: pixels of training pictures, unprojected. A point through which a picture of another time
+//! Points that depth maps show: pixels of training images, unprojected. A point through which an image of another time
 //! sees what is farther away belongs to something that moves: it lives about its moment, and begins with the velocity that
 //! optical flow and the depth at both of its ends tell ([`super::scene_flow`]). All others stand still.
 
@@ -10,11 +10,11 @@ use rayon::prelude::*;
 use splat4d::math::Rng;
 use std::f64::consts::TAU;
 
-/// Pictures that points are taken from and held against, at most, evenly chosen.
+/// Images that points are taken from and held against, at most, evenly chosen.
 const VIEWS: usize = 100;
 /// Points a wanted one that stand still.
 const CANDIDATES: usize = 4;
-/// Pixels of a picture of which is asked whether they move, at most.
+/// Pixels of an image of which is asked whether they move, at most.
 const ASKED: usize = 20_000;
 /// As a share of the wanted points, those on what moves that are alive at a moment: lives are as wide as that takes, within
 /// bounds in times between moments. Shorter ones leave holes between moments; over longer ones velocities change.
@@ -32,7 +32,7 @@ struct Candidate {
 }
 
 /// About `count` points of metric depth maps that stand still; none where there are no such maps. With `moving`, up to as
-/// many again on what moves: few pixels show it, and at every moment others. They are taken from every picture that is
+/// many again on what moves: few pixels show it, and at every moment others. They are taken from every image that is
 /// looked at.
 pub(crate) fn points(frames: &dyn Frames, count: usize, moving: bool, rng: Rng) -> Result<Seeds> {
     let step = frames.len().div_ceil(VIEWS).max(1);
@@ -109,7 +109,7 @@ mod tests {
     use splat4d::scene::Time;
     use splat4d::scene::{Camera, Planes};
 
-    /// The made-up ball with its depth, before a wall.
+    /// The synthetic ball with its depth, before a wall.
     struct Deep(Made);
 
     const WALL: f64 = 9.0;

@@ -2,7 +2,7 @@
 //!
 //! Structure from motion finds points where there is texture. Gaussians that have to spread from there over plain walls
 //! settle wherever the training cameras cannot tell, as haze in front of views that nobody trained on. Here every
-//! training camera's picture is covered by a lattice; the inverse depth of a lattice pixel is that of the plane through
+//! training camera's image is covered by a lattice; the inverse depth of a lattice pixel is that of the plane through
 //! the points seen around it (1/z of a plane is affine in pixels).
 
 use super::Seeds;
@@ -21,7 +21,7 @@ const ROUNDS: usize = 4;
 const OUTLIER: f64 = 0.03;
 /// Holds slopes back where points lie in a line.
 const RIDGE: f64 = 0.05;
-/// Points a little outside of the picture help at its edges, of its size.
+/// Points a little outside of the image help at its edges, of its size.
 const BORDER: f64 = 0.15;
 /// Views that are covered, at most, evenly chosen.
 const VIEWS: usize = 100;
@@ -69,7 +69,7 @@ pub(crate) fn between(frames: &dyn Frames, known: &[[f64; 3]], count: usize) -> 
     Ok(out)
 }
 
-/// One picture of every fixed camera, and of every place of moving ones.
+/// One image of every fixed camera, and of every place of moving ones.
 fn views(frames: &dyn Frames) -> Vec<usize> {
     let mut places = HashSet::new();
     let new = |&i: &usize| {
@@ -81,7 +81,7 @@ fn views(frames: &dyn Frames) -> Vec<usize> {
     (0..count).map(|k| all[k * all.len() / count]).collect()
 }
 
-/// A point in a picture: pixel and inverse depth.
+/// A point in an image: pixel and inverse depth.
 struct Mark {
     pixel: [f64; 2],
     inverse: f64,

@@ -28,11 +28,12 @@ const MOVING_SHARE: f64 = 0.3;
 const GROWN: usize = 1;
 /// Cameras that must see something move for its hull to be more than a cone: of four the hull was worse than nothing.
 const MOVING_CAMERAS: usize = 5;
-/// A camera in which more of the picture differs (an exposure that was changed, a camera that was pushed) shows no silhouette.
+/// A camera in which more of the image differs (an exposure that was changed, a camera that was pushed) shows no
+/// silhouette.
 const MOVING_PICTURE: f64 = 0.5;
-/// A point must be seen by at least so many pictures.
+/// A point must be seen by at least so many images.
 const MIN_VIEWS: usize = 2;
-/// One moving camera: pictures of so many moments around stand in for other cameras.
+/// One moving camera: images of so many moments around stand in for other cameras.
 const MONOCULAR_PICTURES: usize = 60;
 
 /// About `count` points over all `times`. For a still scene (`moving` false) masks of the first time stand for all.
@@ -202,7 +203,7 @@ fn carve_moment(silhouettes: &Silhouettes<'_>, volume: &Volume, wanted: usize, r
     Ok(out)
 }
 
-/// The pictures' votes so far on one point.
+/// The images' votes so far on one point.
 #[derive(Clone, Default)]
 struct Votes {
     views: usize,
@@ -210,7 +211,8 @@ struct Votes {
     colors: Vec<[f32; 3]>,
 }
 
-/// The points that lie in (almost) all silhouettes that see them, with their median colour. One picture at a time is held.
+/// The points that lie in (almost) all silhouettes that see them, with their median colour. One image at a time is
+/// held.
 fn vote(silhouettes: &Silhouettes<'_>, points: &[[f64; 3]]) -> Result<Seeds> {
     let allowed = silhouettes.misses * silhouettes.count as f64;
     let mut votes = vec![Votes::default(); points.len()];

@@ -5,14 +5,14 @@ use crate::capture::DepthKind;
 use crate::capture::frames::{Frames, Picture};
 use splat4d::scene::{Camera, Planes};
 
-/// A picture sees through a point if what it shows there is farther away by more than this share: beyond the noise of
+/// An image sees through a point if what it shows there is farther away by more than this share: beyond the noise of
 /// sensors and the slant of surfaces within a pixel.
 const THROUGH: f64 = 0.05;
-/// Pictures whose longer side exceeds this many pixels are halved until it does not: they have more pixels than there are
+/// Images whose longer side exceeds this many pixels are halved until it does not: they have more pixels than there are
 /// seeds, and a hundred maps of that size fit into any memory.
 const LONGEST_SIDE: usize = 640;
 
-/// A picture's map.
+/// An image's map.
 pub(super) struct Map {
     pub frame: usize,
     pub camera: Camera,
@@ -22,7 +22,7 @@ pub(super) struct Map {
 }
 
 impl Map {
-    /// The frame's metric map, its picture made small in `picture`; nothing where it has none.
+    /// The frame's metric map, its image made small in `picture`; nothing where it has none.
     pub(super) fn load(frames: &dyn Frames, frame: usize, picture: &mut Picture) -> Result<Option<Self>> {
         frames.load(frame, picture)?;
         if picture.depth.as_ref().is_none_or(|d| d.kind != DepthKind::Metric) {

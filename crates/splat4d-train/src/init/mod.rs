@@ -123,11 +123,12 @@ pub(crate) const COUNT: usize = 10_000;
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Source {
     /// The capture's points and those of its depth maps; without maps, where points are few or leave out a part of what cameras
-    /// see, those that its pictures show, and more between them; the hull of masks, or of what moves before fixed cameras; else at random.
+    /// see, those that its images show, and more between them; the hull of masks, or of what moves before fixed
+    /// cameras; else at random.
     Auto,
     /// The capture's points.
     Points,
-    /// Points that the pictures show, whatever the capture brings, and more between them.
+    /// Points that the images show, whatever the capture brings, and more between them.
     Pictures,
     /// The visual hull of masks.
     Hull,

@@ -1,4 +1,5 @@
-//! How fast what a depth map shows moves: optical flow to the pictures before and after, and the depth at both of its ends.
+//! How fast what a depth map shows moves: optical flow to the images before and after, and the depth at both of its
+//! ends.
 
 use super::map::Map;
 use crate::Result;
@@ -14,7 +15,7 @@ const ONE_SURFACE: f64 = 0.05;
 /// A velocity is the median, axis by axis, of so many known ones nearest to it: flow errs where patches straddle an edge.
 const NEAREST: usize = 9;
 
-/// Velocities of pixels of a picture, scene units a second, axes of the world; zero where no neighbour of the picture
+/// Velocities of pixels of an image, scene units a second, axes of the world; zero where no neighbour of the image
 /// tells any. A pixel that flow does not know takes those of the nearest that it does.
 pub(super) fn velocities(frames: &dyn Frames, map: &Map, pixels: &[usize]) -> Result<Vec<[f64; 3]>> {
     let mut picture = Picture::default();
@@ -113,7 +114,7 @@ mod tests {
     struct Wall {
         cameras: Vec<Camera>,
         blobs: Vec<[f64; 3]>,
-        /// Whether pictures bring flow, and then this much of it, of the true one.
+        /// Whether images bring flow, and then this much of it, of the true one.
         brings: Option<f32>,
     }
 
@@ -191,7 +192,7 @@ mod tests {
         }
     }
 
-    /// Velocities of every seventh pixel of a frame, without the picture's edges.
+    /// Velocities of every seventh pixel of a frame, without the image's edges.
     fn of(wall: &Wall, frame: usize) -> Vec<[f64; 3]> {
         let map = Map::load(wall, frame, &mut Picture::default()).unwrap().unwrap();
         let (w, h) = (map.camera.width, map.camera.height);

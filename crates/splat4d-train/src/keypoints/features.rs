@@ -17,7 +17,7 @@ const DIRECTIONS: usize = 8;
 /// A place that other cameras may find again.
 #[derive(Clone, Debug)]
 pub struct Feature {
-    /// Pixel position in the picture.
+    /// Pixel position in the image.
     pub pixel: [f64; 2],
     /// How much it differs from what is around it.
     pub contrast: f32,
@@ -35,29 +35,30 @@ impl Feature {
 
 /// Scales between two octaves (Lowe 2004).
 const INTERVALS: usize = 3;
-/// Blur of an octave's first picture, pixels (Lowe 2004).
+/// Blur of an octave's first image, pixels (Lowe 2004).
 const SIGMA: f64 = 1.6;
-/// Blur of a camera's picture before anything is done to it, pixels (Lowe 2004).
+/// Blur of a camera's image before anything is done to it, pixels (Lowe 2004).
 const CAMERA_BLUR: f64 = 0.5;
-/// Least contrast of an extremum where nothing else is said; Lowe's 0.04 / [`INTERVALS`], halved for pictures that are dark.
+/// Least contrast of an extremum where nothing else is said; Lowe's 0.04 / [`INTERVALS`], halved for images that are
+/// dark.
 const CONTRAST: f64 = 0.02 / INTERVALS as f64;
 /// An extremum along an edge has one curvature this many times the other (Lowe 2004).
 const EDGE: f64 = 10.0;
-/// Octaves end at pictures smaller than this, pixels.
+/// Octaves end at images smaller than this, pixels.
 const SMALLEST: usize = 16;
 /// Pixels from the border within which nothing is looked for.
 const BORDER: usize = 5;
 /// Times that an extremum may move to the next pixel while it is refined.
 const MOVES: usize = 5;
-/// Pictures of fewer pixels are doubled first: their finest detail makes the best features (Lowe 2004).
+/// Images of fewer pixels are doubled first: their finest detail makes the best features (Lowe 2004).
 const DOUBLED_BELOW: usize = 500_000;
-/// Features of a picture where nothing else is said, at most: those of highest contrast.
+/// Features of an image where nothing else is said, at most: those of highest contrast.
 const MOST: usize = 3000;
 
 /// How many features are looked for.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Limits {
-    /// Least contrast of an extremum, of a picture in [0, 1].
+    /// Least contrast of an extremum, of an image in [0, 1].
     pub contrast: f64,
     /// At most so many, those of highest contrast.
     pub most: usize,
@@ -69,12 +70,12 @@ impl Default for Limits {
     }
 }
 
-/// The features of a grey picture at pixels (column, row) that are `wanted`, in the order of falling contrast.
+/// The features of a grey image at pixels (column, row) that are `wanted`, in the order of falling contrast.
 ///
 /// A place with two main directions is two features, one behind the other, of exactly the same pixel position.
 pub fn find(grey: &Planes<f32>, limits: Limits, wanted: &dyn Fn(usize, usize) -> bool) -> Vec<Feature> {
     let double = grey.pixels() < DOUBLED_BELOW;
-    // Pixels of the picture per pixel of the first octave.
+    // Pixels of the image per pixel of the first octave.
     let mut pixel = if double { 0.5 } else { 1.0 };
     let had = CAMERA_BLUR / pixel;
     let start = if double { doubled(grey) } else { grey.clone() };
@@ -107,17 +108,17 @@ pub fn find(grey: &Planes<f32>, limits: Limits, wanted: &dyn Fn(usize, usize) ->
 
 /// An extremum, refined.
 struct Point {
-    /// Place in the octave's pictures, the first pixel's centre at 0.
+    /// Place in the octave's images, the first pixel's centre at 0.
     x: f64,
     y: f64,
-    /// The blurred picture that it was found in.
+    /// The blurred image that it was found in.
     layer: usize,
     /// Its scale in pixels of the octave.
     sigma: f64,
     contrast: f64,
 }
 
-/// A picture at growing blur, and the differences of neighbours.
+/// An image at growing blur, and the differences of neighbours.
 struct Octave {
     blurred: Vec<Planes<f32>>,
     differences: Vec<Planes<f32>>,
@@ -212,7 +213,7 @@ impl Octave {
         None
     }
 
-    /// Length and direction of the gradient at a pixel of a blurred picture; nothing at its border.
+    /// Length and direction of the gradient at a pixel of a blurred image; nothing at its border.
     fn gradient(&self, layer: usize, x: isize, y: isize) -> Option<(f64, f64)> {
         let (w, h) = self.size();
         let inside = x > 0 && y > 0 && x < w as isize - 1 && y < h as isize - 1;

@@ -1,4 +1,4 @@
-//! Grey pictures: halving, blurring, reading between pixels.
+//! Grey images: halving, blurring, reading between pixels.
 
 use splat4d::scene::Planes;
 

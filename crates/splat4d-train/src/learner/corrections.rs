@@ -1,7 +1,8 @@
 //! [`Corrections`]: what training learns of where cameras stand and when they looked.
 //!
 //! A correction of a pose is a twist ξ = (ρ, θ) in the camera's axes, `exp(ξ)·cam_from_world`; all frames of a fixed camera
-//! share one. A correction of a focal length is a share of it, of a camera. A correction of a clock is a shift of all times of a camera. Pictures say nothing of where the scene as a whole
+//! share one. A correction of a focal length is a share of it, of a camera. A correction of a clock is a shift of
+//! all times of a camera. Images say nothing of where the scene as a whole
 //! stands, how large it is and when it begins: the cameras' mean motion, their mean growth and the median of their clocks
 //! stay. The median, since of a rig with one clock that is wrong the others are right.
 
@@ -64,7 +65,7 @@ const TERMS: usize = 16;
 /// hardly different each has its own.
 const APART: f64 = 1e-6;
 
-/// Share by which a correction of a focal length falls back in every step: what pictures do not ask for goes away. Our
+/// Share by which a correction of a focal length falls back in every step: what images do not ask for goes away. Our
 /// choice, not swept.
 const PULL: f64 = 1e-4;
 /// Largest correction of a focal length, a share of it.
@@ -225,7 +226,8 @@ impl Corrections {
         self.poses.as_ref().map(|p| p.read::<POSE>(row, 0).map(f64::from))
     }
 
-    /// The gradients to what is learnt, of those of some frames to their cameras, focal lengths and times: the way back of
+    /// The gradients to what is learnt, of those of some frames to their cameras, focal lengths and times: the
+    /// backward pass of
     /// [`camera`](Self::camera) and [`time`](Self::time).
     pub(crate) fn gradients(&self, frames: &[usize], report: &StepGrads<'_>) -> Gradients {
         let mut out = Gradients::default();
@@ -360,7 +362,7 @@ impl Corrections {
         }
     }
 
-    /// What was learnt, a row for every camera (or picture of a moving one), as plain data. `name` tells of a frame: its
+    /// What was learnt, a row for every camera (or image of a moving one), as plain data. `name` tells of a frame: its
     /// camera's name, and its number where that camera moves.
     pub(crate) fn report(&self, name: &dyn Fn(usize) -> (String, Option<usize>)) -> Value {
         let row = |(row, (_, frame)): (usize, &(Se3, usize))| {

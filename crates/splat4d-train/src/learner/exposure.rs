@@ -38,7 +38,7 @@ fn shown_backward<F: Real>(row: &[F; COLUMNS], x: [F; 3], d: [F; 3]) -> ([F; 3],
     (d_x, d_row)
 }
 
-/// The three channels of a picture, by pieces of their pixels.
+/// The three channels of an image, by pieces of their pixels.
 fn pieces(picture: &mut Planes<f32>) -> impl IndexedParallelIterator<Item = [&mut [f32]; 3]> {
     assert_eq!(picture.channels, 3, "cameras show three colours");
     let pixels = picture.pixels();

@@ -366,7 +366,7 @@ fn inside(width: usize, x0: usize, halo: usize, count: usize) -> [usize; 2] {
     [halo.saturating_sub(x0), count.min(width + halo - x0)]
 }
 
-/// Zeroes what is beside these columns.
+/// Zeroes what is next to these columns.
 fn clear<F: Real, const MAPS: usize>(rows: &mut [[[F; STRIDE]; MAPS]], [start, end]: [usize; 2]) {
     for part in rows.as_flattened_mut() {
         part[..start].fill(F::ZERO);

@@ -13,7 +13,8 @@ const SEARCH_INTERVAL: usize = 200;
 /// The epoch of the last search of a layer, and its result.
 type Found = (usize, Vec<u32>);
 
-/// The nearest neighbours of the rows of every layer, by raw means, searched anew every 200 steps and after every edit of
+/// The nearest neighbours of the rows of every layer, by raw means, searched again every 200 steps and after every
+/// edit of
 /// rows.
 #[derive(Debug, Default)]
 pub(crate) struct Near(Mutex<Vec<Found>>);
@@ -57,7 +58,7 @@ impl Near {
         self.lock().iter().flat_map(layer).collect()
     }
 
-    /// Takes back what [`state`](Self::state) gave; what cannot be neighbours is searched anew.
+    /// Takes back what [`state`](Self::state) gave; what cannot be neighbours is searched again.
     pub(crate) fn restore(&self, state: &[u32]) {
         let mut found = self.lock();
         found.clear();

@@ -54,7 +54,7 @@ impl MotionWeights {
 /// Rigidity, rotation, isometry, ARAP, elasticity, velocity, jerk, acceleration and least motion of the Gaussians of every layer that moves, over
 /// random neighbourhoods of those alive at the view's time.
 ///
-/// Neighbours are those of the raw means, searched anew every 200 steps and after every edit of rows; an edge counts
+/// Neighbours are those of the raw means, searched again every 200 steps and after every edit of rows; an edge counts
 /// only where both of its ends are alive. Which neighbourhoods a step looks at is a function of seed and step.
 pub(crate) struct Neighbourhood<F> {
     weights: MotionWeights,

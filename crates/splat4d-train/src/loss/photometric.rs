@@ -1,4 +1,4 @@
-//! The picture loss of 3DGS, (1 − λ)·L1 + λ·(1 − SSIM), and its gradient, in one pass over the image.
+//! The image loss of 3DGS, (1 − λ)·L1 + λ·(1 − SSIM), and its gradient, in one pass over the image.
 
 use super::image::{ImageTerm, LossValue, PictureGrads, Shown, View};
 use super::kernel::{self, Scratch, Strip};
@@ -11,7 +11,7 @@ use splat4d::simd::{Simd, dispatch_pass};
 use std::sync::Mutex;
 
 /// Most rows of a strip, the unit of parallel work: strips are of even size, and that depends on the image alone, so that
-/// sums do not depend on the number of threads. Every strip works on a window's halo of ten rows besides.
+/// sums do not depend on the number of threads. Every strip works on a window's halo of ten rows in addition.
 const STRIP_ROWS: usize = 128;
 /// Strips are whole groups of rows of the kernel.
 const GROUP_ROWS: usize = 4;

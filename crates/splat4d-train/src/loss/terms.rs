@@ -1,5 +1,5 @@
-//! The contracts of losses that do not look at a picture: on splats at several times, and on raw parameters; and of what
-//! may stand between parameters and pictures, a [`Codec`].
+//! The contracts of losses that do not look at an image: on splats at several times, and on raw parameters; and of what
+//! may stand between parameters and images, a [`Codec`].
 
 use crate::Result;
 use splat4d::layers::Scene;
@@ -84,8 +84,8 @@ pub trait ParamLoss<F: Real>: Send + Sync {
     fn restore(&self, _state: &[u32]) {}
 }
 
-/// A codec between the parameters that learn and the pictures they are judged by: a file that will hold them
-/// coarsely. Pictures are drawn from what its reader would see, and the gradient goes to the parameters as if there were
+/// A codec between the parameters that learn and the images they are judged by: a file that will hold them
+/// coarsely. Images are drawn from what its reader would see, and the gradient goes to the parameters as if there were
 /// no difference (the straight-through estimator: Bengio et al. 2013).
 pub trait Codec<F: Real>: Send + Sync {
     /// Its name, in messages.

@@ -99,7 +99,7 @@ impl<F: Real> Tracking<F> {
         Tied { of: self.clone(), frame }
     }
 
-    /// The foreground and its graph of neighbours, made anew where nothing was cached.
+    /// The foreground and its graph of neighbours, made again where nothing was cached.
     pub(crate) fn frame0(&self, layer: &Layer<F>) -> Arc<Frame0<F>> {
         let mut memory = self.lock();
         memory.frame0.get_or_insert_with(|| Arc::new(Frame0::new(layer, &self.ties))).clone()

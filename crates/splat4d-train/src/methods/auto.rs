@@ -19,7 +19,7 @@ const LONG: usize = 600;
 pub struct Seen {
     /// Moments.
     pub times: usize,
-    /// Training pictures a moment.
+    /// Training images a moment.
     pub cameras: f64,
     /// Share of the pixels of fixed cameras that change from one of their frames to the next; none where that cannot be
     /// told.
@@ -27,11 +27,11 @@ pub struct Seen {
     /// How far matches of frames of a moving camera agree with a static scene; none where cameras are fixed, or too little
     /// matches.
     pub agreement: Option<Agreement>,
-    /// Fewest pictures of fixed cameras at a moment.
+    /// Fewest images of fixed cameras at a moment.
     pub fewest: usize,
-    /// Pictures have masks.
+    /// Images have masks.
     pub masks: bool,
-    /// Pictures have metric depth maps, which are read.
+    /// Images have metric depth maps, which are read.
     pub depth: bool,
     /// The end of the take is kept from training, to be predicted.
     pub predicted: bool,
@@ -126,7 +126,7 @@ mod tests {
     use splat4d::math::Se3;
     use splat4d::scene::{Camera, Time};
 
-    /// Grey pictures with a bright square that moves, or does not.
+    /// Grey images with a bright square that moves, or does not.
     struct Made {
         cameras: usize,
         times: usize,

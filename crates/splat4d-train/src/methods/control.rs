@@ -1,5 +1,5 @@
 //! `control`: one joint stage. SC-GS learns for 80,000 steps in stages (a still cloud, then the nodes as Gaussians of their
-//! own, then Gaussians on nodes); in a run of minutes the half-size pictures of the first steps do what those stages are
+//! own, then Gaussians on nodes); in a run of minutes the half-size images of the first steps do what those stages are
 //! for, and nodes start at farthest points of the initial cloud.
 
 pub(crate) mod losses;
@@ -163,7 +163,7 @@ pub(crate) fn skin(control: &ControlSettings) -> SkinSpec {
     SkinSpec { nodes: control.nodes, neighbours: control.neighbours, hyper: control.hyper, mask: control.mask }
 }
 
-/// Adds the parts that every model of control nodes shares: groups of the skin, losses on nodes, upkeep.
+/// Adds the parts that every model of control nodes shares: groups of the skin, losses on nodes, maintenance.
 pub(crate) fn add_nodes(stage: &mut Stage, plan: &Plan, control: &ControlSettings, nodes: NodeSettings) {
     let c = &plan.common;
     let positions = c.rates.falling(control.node_lr * plan.extent);

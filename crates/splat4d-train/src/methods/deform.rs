@@ -1,4 +1,4 @@
-//! `deform-mlp`: a static warm-up, then the network learns beside geometry and colour.
+//! `deform-mlp`: a static warm-up, then the network learns next to geometry and colour.
 
 use super::auto::Seen;
 use super::{Group, Plan, Program, Rate, Stage, TimeNoise, still};
@@ -16,7 +16,7 @@ const LARGE_X_LEVELS: usize = 10;
 /// Grids learn so much faster than networks: an entry is met by few Gaussians.
 const GRID_SPEEDUP: f64 = 50.0;
 /// Canonical positions start so much slower than the recipe's, which suit Gaussians that live for a moment: a cloud that
-/// is seen at every moment has to settle. Chosen beside other settings in runs of 400 steps; not measured alone.
+/// is seen at every moment has to settle. Chosen next to other settings in runs of 400 steps; not measured alone.
 const CANONICAL_SLOWDOWN: f64 = 4.0;
 /// Share of the iterations until the noise on time is zero: 20,000 of 40,000 (Yang et al. 2024).
 const NOISE_STEPS: f64 = 0.5;

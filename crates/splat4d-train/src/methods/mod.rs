@@ -68,11 +68,11 @@ pub struct Plan {
     pub fps: f64,
     /// Distinct times in the capture; of a rig of fixed cameras whose shutters do not open at once, its moments.
     pub times: usize,
-    /// Cameras with training pictures that do not move.
+    /// Cameras with training images that do not move.
     pub fixed_cameras: usize,
-    /// Distinct times, seconds, ascending, and how many fixed cameras have a training picture at each.
+    /// Distinct times, seconds, ascending, and how many fixed cameras have a training image at each.
     pub moments: Vec<(f64, usize)>,
-    /// Whether training pictures have masks.
+    /// Whether training images have masks.
     pub masks: bool,
 }
 
@@ -183,7 +183,7 @@ pub struct Stage {
     pub probes: Vec<Box<dyn ProbeLoss<f32>>>,
     /// Losses on raw parameters.
     pub params: Vec<Box<dyn ParamLoss<f32>>>,
-    /// Upkeep between steps, in any order: it runs in that of [`Order`](crate::upkeep::Order).
+    /// Maintenance between steps, in any order: it runs in that of [`Order`](crate::maintenance::Order).
     pub upkeep: Vec<Box<dyn Upkeep>>,
     /// Noise on positions after every step; none: positions only learn.
     pub noise: Option<Noise>,
@@ -191,17 +191,17 @@ pub struct Stage {
     pub sh_interval: usize,
     /// Steps of earlier stages that count for it.
     pub sh_from: usize,
-    /// The first so many steps see pictures at half size: coarse things first, and four times faster.
+    /// The first so many steps see images at half size: coarse things first, and four times faster.
     pub half_size_steps: usize,
     /// Lower bound of log life widths, by layer; learnt values are lifted to it.
     pub min_log_life: Option<f64>,
     /// Noise on the times of the step's views.
     pub time_noise: TimeNoise,
-    /// Losses on pictures, after the run's own.
+    /// Losses on images, after the run's own.
     pub pictures: Vec<Box<dyn ImageTerm>>,
     /// Whether the cameras' exposures stay as they are.
     pub freeze_exposure: bool,
-    /// The codec between the parameters and the pictures; none: nothing.
+    /// The codec between the parameters and the images; none: nothing.
     pub codec: Option<Arc<dyn Codec<f32>>>,
     /// The phase in which it puts the models of all layers; none: as they are.
     pub phase: Option<Phase>,
@@ -238,12 +238,13 @@ impl Stage {
         }
     }
 
-    /// Adds an operation of upkeep.
+    /// Adds an operation of maintenance.
     pub fn keep(&mut self, operation: impl Upkeep + 'static) {
         self.upkeep.push(Box::new(operation));
     }
 
-    /// The steps `from..to` as a stage of its own: rates, densification, degrees of SH and pictures at half size are as they
+    /// The steps `from..to` as a stage of its own: rates, densification, degrees of SH and images at half size are
+    /// as they
     /// would have been then.
     #[must_use]
     pub(crate) fn part(mut self, from: usize, to: usize) -> Self {

@@ -1,4 +1,4 @@
-//! `native4d`: one stage; both quaternions, scales and times learn beside geometry and colour.
+//! `native4d`: one stage; both quaternions, scales and times learn next to geometry and colour.
 //!
 //! Rates follow those of `spacetime`, since the two are charts of the same Gaussians: a step of both quaternions changes
 //! the velocity by twice its size in extents a clip, which is the unit of the rotation (`Native4dSpec::speed`).

@@ -1,5 +1,5 @@
 //! `spacetime`: one stage; velocities, lives, rotation rates and, where the recipe has them, features and their head learn
-//! beside geometry and colour.
+//! next to geometry and colour.
 
 use super::auto::Seen;
 use super::still;
@@ -16,7 +16,7 @@ use splat4d::scene::{LifeKind, Params};
 const MANY_CAMERAS: f64 = 3.0;
 
 choices! {
-    /// Features of Gaussians beside their base colour.
+    /// Features of Gaussians next to their base colour.
     pub enum Features {
         /// None.
         None = "none",

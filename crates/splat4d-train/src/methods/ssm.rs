@@ -1,5 +1,6 @@
-//! `ssm`: how it is learnt. One joint stage, as of `control`, whose nodes, losses on nodes and upkeep it shares; before it,
-//! if the recipe says so, a still warm-up, after which nodes are placed anew on what became of the cloud.
+//! `ssm`: how it is learnt. One joint stage, as of `control`, whose nodes, losses on nodes and maintenance it
+//! shares; before it,
+//! if the recipe says so, a still warm-up, after which nodes are placed again on what became of the cloud.
 
 use super::{ControlSettings, Group, Hook, Plan, Program, Rate, Stage, control, still};
 use crate::settings::{Choice, settings};

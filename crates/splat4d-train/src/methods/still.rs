@@ -101,7 +101,7 @@ fn motion_weights(loss: &LossSettings) -> MotionWeights {
     }
 }
 
-/// A stage with the upkeep and the regularisers that every motion model has.
+/// A stage with the maintenance and the regularisers that every motion model has.
 pub fn stage(name: &str, plan: &Plan) -> Stage {
     let c = &plan.common;
     let mut params: Vec<Box<dyn ParamLoss<f32>>> = Vec::new();

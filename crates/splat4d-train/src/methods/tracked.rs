@@ -153,7 +153,7 @@ impl Program for TrackedProgram {
         (rows * pages * POSE * size_of::<f32>()) as u64
     }
 
-    /// Every frame's page beside what all frames share; who is foreground is settled.
+    /// Every frame's page next to what all frames share; who is foreground is settled.
     fn tuning(&self, plan: &Plan) -> Stage {
         let tracked = &self.tracked;
         let mut stage = still::stage("tracked", plan);

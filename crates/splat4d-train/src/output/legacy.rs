@@ -25,11 +25,11 @@ const FILES: [&str; 15] = [
 /// Files of `predict/`.
 const PREDICTED: [&str; 5] =
     ["report.html", "predict.json", "dynamics.safetensors", "scene.safetensors", "scene.splat4d"];
-/// Folders of pictures and results by split, perhaps with a background's name behind.
+/// Folders of images and results by split, perhaps with a background's name behind.
 const SPLITS: [&str; 3] = ["test", "val", "train"];
 /// Runs within a run.
 const INNER: [&str; 2] = ["baseline", "unpruned"];
-/// Start of the comment that points found in pictures have.
+/// Start of the comment that points found in images have.
 const FOUND_POINTS: &[u8] = b"comment of ";
 /// Bytes of such a file in which it is looked for.
 const HEAD: usize = 512;

@@ -7,7 +7,7 @@ use crate::{Error, Result};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-/// A file under a temporary name beside its place; [`keep`](Self::keep) renames it, dropping it removes it.
+/// A file under a temporary name next to its place; [`keep`](Self::keep) renames it, dropping it removes it.
 #[derive(Debug)]
 pub struct Staged {
     temporary: Option<PathBuf>,

@@ -1,4 +1,5 @@
-//! Names of knobs without a table: those of before recipes had tables, which old files, documents and fingerprints have.
+//! Names of settings without a table: those of before recipes had tables, which old files, documents and
+//! fingerprints have.
 
 /// Each with the key that it has now, in the order of then.
 pub(super) const FLAT: [(&str, &str); 205] = [

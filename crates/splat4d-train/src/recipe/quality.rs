@@ -3,10 +3,10 @@
 use super::Recipe;
 use crate::{Error, Result};
 
-/// A quality: steps, Gaussians and size of pictures at once.
+/// A quality: steps, Gaussians and size of images at once.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Quality {
-    /// A look at whether a capture works: pictures of half the size, few steps, half as many Gaussians.
+    /// A look at whether a capture works: images of half the size, few steps, half as many Gaussians.
     Draft,
     /// The default recipe.
     Standard,
@@ -14,12 +14,12 @@ pub enum Quality {
     Best,
 }
 
-/// Steps of a draft: at half the size of its pictures a kitchen has 31.2 dB after 2,500 steps where 7,000 have 31.0
+/// Steps of a draft: at half the size of its images a kitchen has 31.2 dB after 2,500 steps where 7,000 have 31.0
 /// (docs/suite.md).
 const DRAFT_STEPS: usize = 2500;
 /// Factor on the number of Gaussians of a draft.
 const DRAFT_COUNT: f64 = 0.5;
-/// Times that a draft's pictures are reduced, besides what the recipe does.
+/// Times that a draft's images are reduced, in addition to what the recipe does.
 const DRAFT_DOWNSCALE: usize = 2;
 /// Steps and the factor on the number of Gaussians of the best: basketball gains 1.5 dB by 20,000 and 60,000 over 8,000 and
 /// 30,000 (docs/benchmarks.md).

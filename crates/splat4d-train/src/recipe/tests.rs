@@ -4,7 +4,7 @@ use crate::step::replans::Replan;
 
 /// A recipe from before there were tables: all defaults, in order.
 const FLAT_DEFAULTS: &str = include_str!("tests/flat-defaults.toml");
-/// A resolved one with many knobs changed.
+/// A resolved one with many settings changed.
 const FLAT_CHANGED: &str = include_str!("tests/flat-changed.toml");
 
 /// The default recipe of then: its number of Gaussians did not follow from the capture, nor anything else from that.

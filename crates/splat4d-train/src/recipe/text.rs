@@ -16,7 +16,7 @@ impl Recipe {
         let mut recipe = Self::default();
         for (key, value) in &file {
             match value {
-                // `life` is a table now and was a knob before.
+                // `life` is a table now and was a setting before.
                 toml::Value::Table(table) if recipe.table_mut(key).is_some() => {
                     table.iter().try_for_each(|(field, value)| recipe.put(&recipe.inside(key, field), value))?;
                 }
@@ -63,7 +63,7 @@ impl Recipe {
         self.put(key.trim(), &value)
     }
 
-    /// Every knob, table by table.
+    /// Every setting, table by table.
     pub fn knobs() -> Vec<Knob> {
         Self::default().tables().into_iter().flat_map(|(name, table)| table.knobs(name)).collect()
     }
@@ -73,24 +73,24 @@ impl Recipe {
         Self::default().tables().into_iter().find(|(name, _)| *name == table).map_or("", |(_, t)| t.about())
     }
 
-    /// The condition under which a table's knobs have an effect; `None`: always.
+    /// The condition under which a table's settings have an effect; `None`: always.
     pub fn needs(table: &str) -> Option<String> {
         let when = Self::default().tables().into_iter().find(|(name, _)| *name == table)?.1.when();
         (when != When::Always).then(|| when.to_string())
     }
 
-    /// The name that the knob `table.field` has without its table, if recipes knew it before they had tables.
+    /// The name that the setting `table.field` has without its table, if recipes knew it before they had tables.
     pub fn flat_name(key: &str) -> Option<&'static str> {
         FLAT.iter().find(|(_, k)| *k == key).map(|(flat, _)| *flat)
     }
 
-    /// The value of the knob `table.field`.
+    /// The value of the setting `table.field`.
     pub fn get(&self, key: &str) -> Option<toml::Value> {
         let (name, field) = key.split_once('.')?;
         self.tables().into_iter().find(|(n, _)| *n == name)?.1.get(field)
     }
 
-    /// Knobs that were chosen, with their values: neither at their default nor as they follow from others.
+    /// Settings that were chosen, with their values: neither at their default nor as they follow from others.
     pub fn choices(&self) -> Vec<(String, toml::Value)> {
         let defaults = Self::default();
         let follows = Self::default().with(|r| r.run.iterations = self.run.iterations).resolve();
@@ -105,7 +105,7 @@ impl Recipe {
         out
     }
 
-    /// Knobs that were chosen and do nothing in this recipe.
+    /// Settings that were chosen and do nothing in this recipe.
     pub fn without_effect(&self) -> Vec<Idle> {
         let get = |key: &str| self.get(key).expect("conditions name settings");
         let chosen: Vec<String> = self.choices().into_iter().map(|(key, _)| key).collect();
@@ -124,7 +124,8 @@ impl Recipe {
         out
     }
 
-    /// Errors: one of these knobs, by either of its names, does nothing in this recipe. Where it says that something is not
+    /// Errors: one of these settings, by either of its names, does nothing in this recipe. Where it says that
+    /// something is not
     /// to be, training warns.
     pub fn refuse_idle<'a>(&self, set: impl Iterator<Item = &'a str>) -> Result<()> {
         let set: Vec<&str> = set.map(|name| Self::key_of(name.trim())).collect();
@@ -134,12 +135,12 @@ impl Recipe {
         }
     }
 
-    /// The key of a knob by either of its names, `table.field` or without a table.
+    /// The key of a setting by either of its names, `table.field` or without a table.
     pub fn key_of(name: &str) -> &str {
         FLAT.iter().find(|(flat, _)| *flat == name).map_or(name, |(_, key)| key)
     }
 
-    /// Ranges. Errors name the knob.
+    /// Ranges. Errors name the setting.
     pub fn check(&self) -> Result<()> {
         for (name, table) in self.tables() {
             table.check().map_err(|(field, need)| {
@@ -152,7 +153,7 @@ impl Recipe {
     }
 
     /// The recipe in the names and the order of before it had tables, byte for byte: what checkpoints know it by, so that
-    /// runs of then go on. Knobs that came later count where they are not at their default.
+    /// runs of then go on. Settings that came later count where they are not at their default.
     pub fn flat_toml(&self) -> String {
         let mut text: String =
             FLAT.iter().map(|(flat, key)| line(flat, &self.get(key).expect("FLAT names settings"))).collect();
@@ -165,7 +166,7 @@ impl Recipe {
         text
     }
 
-    /// The key of what stands in a table: its field, or a knob of it by its name without a table.
+    /// The key of what stands in a table: its field, or a setting of it by its name without a table.
     fn inside(&self, table: &str, field: &str) -> String {
         let home = FLAT.iter().find(|(flat, key)| *flat == field && key.split('.').next() == Some(table));
         let key = format!("{table}.{field}");
@@ -175,7 +176,7 @@ impl Recipe {
         }
     }
 
-    /// Sets the knob `table.field`, or one by its name without a table.
+    /// Sets the setting `table.field`, or one by its name without a table.
     fn put(&mut self, name: &str, value: &toml::Value) -> Result<()> {
         let key = Self::key_of(name);
         if self.get(key).is_none() {
@@ -187,7 +188,7 @@ impl Recipe {
     }
 }
 
-/// A knob that was chosen and has no effect.
+/// A setting that was chosen and has no effect.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Idle {
     /// `table.field`.

@@ -1,5 +1,5 @@
 //! [`Budget`]: a run that is to end on time. Before the first step its length follows from steps that were timed; while it
-//! goes, the machine may turn out to be slower or faster than then, and what is left is planned anew.
+//! goes, the machine may turn out to be slower or faster than then, and what is left is planned again.
 //!
 //! A new plan is one row of `run.replans` and depends on the clock; all else follows from the rows
 //! ([`Pace`](crate::step::pace::Pace)), so that a run that repeats or goes on with them gives the same bits.
@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 /// Looks at the clock in a whole run. A change of speed is seen within one of them and taken for lasting after some: what
 /// the last ones miss is less than a tenth of the time ([`tests`] holds it on machines that turn slower and faster).
 const LOOKS: f64 = 32.0;
-/// Of the time, what the end may be off before a run is planned anew.
+/// Of the time, what the end may be off before a run is planned again.
 const TOLERANCE: f64 = 0.015;
 /// Weight of what was measured since the last look in the machine's speed: one busy moment is not taken for the rest.
 const NEWEST: f64 = 0.5;
@@ -95,7 +95,7 @@ pub(super) struct Planner {
     taken: [f64; 2],
     /// The machine's slowness: seconds for one as timed before the run.
     slowness: Option<f64>,
-    /// The step of the last plan: before it nothing is planned anew.
+    /// The step of the last plan: before it nothing is planned again.
     last: usize,
 }
 
@@ -162,7 +162,7 @@ mod tests {
     use crate::upkeep;
     use splat4d::math::Rng;
 
-    /// Steps, Gaussians and seconds of a made-up machine.
+    /// Steps, Gaussians and seconds of a synthetic machine.
     const STEPS: usize = 6000;
     const START: usize = 5000;
     const CAP: usize = 30_000;

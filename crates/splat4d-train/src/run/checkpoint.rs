@@ -1,5 +1,5 @@
 //! Checkpoints hold everything: scene, moments, statistics, exposure, corrections of cameras, the memory of
-//! losses, codecs and upkeep, how far the run is. Random
+//! losses, codecs and maintenance, how far the run is. Random
 //! numbers and samplers are functions of the step and need no saving. A resumed run is bit for bit the unbroken one.
 //!
 //! The file is a scene file with more arrays (`moments.L.TABLE`, `stats.L`, `exposure…`), so that every reader of scenes
@@ -183,7 +183,7 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
         iteration: count("iteration")?,
         stage: count("stage")?,
         stage_step: count("stage_step")?,
-        // Files from before runs were planned anew do not say: there a step is one of the schedule.
+        // Files from before runs were planned again do not say: there a step is one of the schedule.
         taken: if meta["taken"].is_null() { count("stage_step")? } else { count("taken")? },
         rests: meta["rests"].as_bool().unwrap_or(false),
         rate_scale: number(&meta["rate_scale"], "rate_scale")?,
@@ -221,7 +221,7 @@ fn probe_name(stage: usize, loss: usize) -> String {
     format!("memory.{stage}.probe.{loss}")
 }
 
-/// The array that holds what a stage's operation of upkeep remembers.
+/// The array that holds what a stage's operation of maintenance remembers.
 fn upkeep_name(stage: usize, operation: &str) -> String {
     format!("upkeep.{stage}.{operation}")
 }

@@ -44,7 +44,7 @@ pub fn read(run: &Path) -> Result<Option<Value>> {
 /// A row of the list.
 struct Correction<'a> {
     camera: &'a str,
-    /// Number of its picture, of a camera that moves.
+    /// Number of its image, of a camera that moves.
     picture: Option<u64>,
     twist: [f64; 6],
     seconds: f64,
@@ -64,7 +64,8 @@ fn correction(row: &Value) -> Option<Correction<'_>> {
     })
 }
 
-/// Moves the capture's cameras and clocks to where the run has learnt that they are: those of training, and held-out pictures
+/// Moves the capture's cameras and clocks to where the run has learnt that they are: those of training, and held-out
+/// images
 /// of the same cameras as far as they share them.
 ///
 /// Errors: those of [`read`].

@@ -1,5 +1,5 @@
 //! Memory of training, before it starts: tables of parameters are counted exactly, on a model made of a few rows;
-//! what steps need beside them is estimated.
+//! what steps need next to them is estimated.
 
 use crate::Result;
 use crate::capture::Capture;
@@ -13,9 +13,9 @@ use std::sync::Arc;
 
 /// Bytes a Gaussian takes in the renderer: records, gradient records, projections (measured: about 1.2 kB).
 const RENDER_BYTES: u64 = 1200;
-/// Bytes a pixel takes in training: pictures, gradients and the loss's scratch, all f32.
+/// Bytes a pixel takes in training: images, gradients and the loss's scratch, all f32.
 const PIXEL_BYTES: u64 = 200;
-/// Bytes a pixel takes in the picture store: colour of 8 bits, or of 16 where pictures are reduced, and a mask.
+/// Bytes a pixel takes in the image store: colour of 8 bits, or of 16 where images are reduced, and a mask.
 const STORED_BYTES: [u64; 2] = [4, 7];
 /// Bytes that nothing below counts: the program, threads, what the allocator holds back. Chosen on the runs of
 /// docs/models.md.
@@ -40,8 +40,8 @@ const fn splat_numbers() -> u64 {
     sum
 }
 
-/// Estimated peak memory of training, bytes: pictures in the cache and in flight, and Gaussians at the cap with what
-/// their model has beside them: networks, planes, nodes, the state of a filter.
+/// Estimated peak memory of training, bytes: images in the cache and in flight, and Gaussians at the cap with what
+/// their model has next to them: networks, planes, nodes, the state of a filter.
 pub fn memory_estimate(capture: &Capture, recipe: &Recipe) -> u64 {
     let frames = || capture.train.iter().map(|&i| &capture.frames[i]);
     let cap = recipe.densify.max_cap as u64;

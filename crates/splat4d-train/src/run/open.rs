@@ -22,7 +22,7 @@ use std::ops::Range;
 use std::path::Path;
 use std::sync::Arc;
 
-/// Pictures whose mean colour stands for all of them.
+/// Images whose mean colour stands for all of them.
 const LOOKED_AT: usize = 16;
 
 /// Extent of cameras in a single place, scene units.
@@ -93,7 +93,7 @@ pub fn open_frames(path: &Path, recipe: &Recipe, frames: Vec<Range<usize>>, lens
     Ok(capture)
 }
 
-/// Errors: a loss on flow or tracks, and not one training picture has any.
+/// Errors: a loss on flow or tracks, and not one training image has any.
 pub(super) fn check_flow(capture: &Capture, recipe: &Recipe) -> Result<()> {
     if recipe.loss.tracks > 0.0 && capture.train.iter().all(|&i| capture.frames[i].tracks.is_none()) {
         return Err(Error::input("loss.tracks compares point tracks, and the capture's training cameras have none")
@@ -118,7 +118,7 @@ pub(crate) struct OpenCapture {
     pub(crate) device: Device,
 }
 
-/// The training frames of a capture, with as much memory for pictures as the recipe grants. Errors: there are none.
+/// The training frames of a capture, with as much memory for images as the recipe grants. Errors: there are none.
 pub fn training_frames(capture: Arc<Capture>, recipe: &Recipe) -> Result<Arc<Dataset>> {
     if capture.train.is_empty() {
         return Err(Error::input("the capture has no training frames").remedy("Hold out fewer views with --hold-out"));
@@ -158,7 +158,7 @@ pub fn plan(capture: &Capture, recipe: &Recipe) -> Plan {
     }
 }
 
-/// The mean colour of some pictures, evenly chosen; of what lenses filled.
+/// The mean colour of some images, evenly chosen; of what lenses filled.
 fn mean_color(frames: &dyn Frames) -> Result<[f32; 3]> {
     let mut picture = Picture::default();
     let (mut sums, mut pixels) = ([0.0f64; 3], 0.0f64);
@@ -219,8 +219,9 @@ impl OpenCapture {
         Ok((recipe.with(|r| r.run.motion = MotionName::of(choice.motion)), choice))
     }
 
-    /// What shows where no Gaussian is: what pictures were cut out of or, where they fill their frames, their mean colour, which
-    /// is the best guess at what no training camera sees. Errors: a picture cannot be read.
+    /// What shows where no Gaussian is: what images were cut out of or, where they fill their frames, their mean
+    /// colour, which
+    /// is the best guess at what no training camera sees. Errors: an image cannot be read.
     pub(super) fn background(&self) -> Result<[f32; 3]> {
         match self.capture.background {
             Some(told) => Ok(told),
@@ -304,7 +305,8 @@ impl OpenCapture {
         };
         let mut trained: Vec<usize> = self.capture.train.iter().map(|&i| self.capture.frames[i].camera).collect();
         trained.sort_unstable();
-        // Cameras of a rig have colours of their own, and one picture of each tells them. Photos of one camera differ where it
+        // Cameras of a rig have colours of their own, and one image of each tells them. Photos of one camera differ
+        // where it
         // chose its exposure, which goes with the place and is then the scene's (docs/suite.md).
         let pictures = if self.capture.named || c.appearance.exposure_single { 1 } else { 2 };
         let trained: Vec<usize> =

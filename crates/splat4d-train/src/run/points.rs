@@ -1,4 +1,4 @@
-//! Points that a capture's own pictures show, where it brings too few: found once, kept beside the run as `points.ply`,
+//! Points that a capture's own images show, where it brings too few: found once, kept next to the run as `points.ply`,
 //! and from then on the capture's own.
 
 use super::checkpoint::write_atomically;
@@ -15,21 +15,22 @@ use splat4d::scene::Camera;
 use std::path::Path;
 use std::sync::Arc;
 
-/// The file beside the run.
+/// The file next to the run.
 const FILE: &str = "points.ply";
-/// Of the initial Gaussians: with fewer points of its own, a capture's pictures are searched for more.
+/// Of the initial Gaussians: with fewer points of its own, a capture's images are searched for more.
 const FEW: f64 = 0.05;
 /// A capture whose points leave out more than this share of what a camera sees (the median of its cameras) brings too few as
-/// well, however many: a sky, a far background. Of eight captures the bundled one, a kitchen, a hall and five made-up rooms
+/// well, however many: a sky, a far background. Of eight captures the bundled one, a kitchen, a hall and five
+/// synthetic rooms
 /// have 0 to 0.06, one before a far background has 0.34 (docs/suite.md).
 const BARE: f64 = 0.2;
-/// Cells along a picture's longer side in which that is counted; of a rig at most so many views.
+/// Cells along an image's longer side in which that is counted; of a rig at most so many views.
 const CELLS: f64 = 16.0;
 const VIEWS: usize = 64;
 /// Of the initial Gaussians, the points that are looked for: what lies between them is laid along surfaces.
 const WANTED: f64 = 0.5;
 
-/// The capture with points from its pictures, where it brings too few and the recipe lets them be looked for.
+/// The capture with points from its images, where it brings too few and the recipe lets them be looked for.
 pub(super) fn complete(
     opened: OpenCapture,
     recipe: &Recipe,
@@ -83,7 +84,7 @@ fn wanted(capture: &Capture, recipe: &Recipe) -> bool {
     }
 }
 
-/// The share of a camera's picture in which there are no points nearby, the median of the training cameras.
+/// The share of a camera's image in which there are no points nearby, the median of the training cameras.
 fn bare(capture: &Capture, points: &[[f64; 3]]) -> f64 {
     let views: Vec<&Camera> = capture.places().collect();
     let mut shares: Vec<f64> =
@@ -92,7 +93,7 @@ fn bare(capture: &Capture, points: &[[f64; 3]]) -> f64 {
     shares.get(shares.len() / 2).copied().unwrap_or(0.0)
 }
 
-/// The share of the cells of a picture in which no point lies, nor in the eight around it.
+/// The share of the cells of an image in which no point lies, nor in the eight around it.
 fn uncovered(camera: &Camera, points: &[[f64; 3]]) -> f64 {
     let side = camera.width.max(camera.height) as f64 / CELLS;
     let [columns, rows] = [camera.width, camera.height].map(|n| (n as f64 / side).round().max(1.0) as usize);
@@ -162,7 +163,7 @@ mod tests {
         assert_ne!(open_run(&run).unwrap().1.points, Some(cloud));
     }
 
-    /// Points before every training camera, `side` a row and as many rows, over this share of the picture's height.
+    /// Points before every training camera, `side` a row and as many rows, over this share of the image's height.
     fn spread(capture: &Capture, side: usize, height: f64) -> Vec<[f64; 3]> {
         let part = |k: usize| (k as f64 + 0.5) / side as f64;
         let place = |v: &Camera, k: usize| {
@@ -188,7 +189,7 @@ mod tests {
         let (auto, white) = (&["init=auto", "num_pts=1000"][..], Some([1.0; 3]));
         assert!(wants(auto, &first(0), None) && wants(auto, &first(49), None));
         assert!(!wants(auto, &all, None) && !wants(auto, &first(0), white));
-        // A sky of a third of the picture; the cells beside the last points count as theirs.
+        // A sky of a third of the image; the cells next to the last points count as theirs.
         assert!(wants(auto, &|c| spread(c, 12, 0.6), None) && !wants(auto, &|c| spread(c, 12, 0.9), None));
         assert!(!wants(auto, &|c| spread(c, 12, 0.6), white));
         assert!(wants(&["init=pictures"], &all, white));
@@ -208,7 +209,7 @@ mod tests {
             (cells - 16.0 * (16.0 * camera.height as f64 / camera.width as f64).round() / 9.0).abs() < 1e-9,
             "{cells}"
         );
-        // In a corner four cells, outside of the picture or behind the camera none.
+        // In a corner four cells, outside of the image or behind the camera none.
         assert!((1.0 - uncovered(camera, &[at(0.001, 0.001)]) - 4.0 / (9.0 * cells)).abs() < 1e-9);
         let behind = camera.unproject([0.5 * camera.width as f64, 0.5 * camera.height as f64], -2.0);
         assert_eq!(uncovered(camera, &[at(1.2, 0.5), at(0.5, -0.3), behind]), 1.0);

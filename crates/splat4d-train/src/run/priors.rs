@@ -1,4 +1,5 @@
-//! What files say of a capture beside its pictures, held against these: before training what can be told at once, after it
+//! What files say of a capture next to its images, held against these: before training what can be told at once,
+//! after it
 //! what the scene made of them.
 
 use super::open::{OpenCapture, training_frames};
@@ -17,18 +18,18 @@ const LOOKED_AT: usize = 8;
 const SHORT: f32 = 1.0;
 /// Points from which on a map tells something.
 const FEW: usize = 20;
-/// Pixels from which on a picture tells something.
+/// Pixels from which on an image tells something.
 const ENOUGH: usize = 200;
-/// Another reading of flow is the right one if it leaves less than this share of the difference between pictures.
+/// Another reading of flow is the right one if it leaves less than this share of the difference between images.
 const CLEARLY: f64 = 0.7;
 /// Logarithm of the factor beyond which depths and points are at different scales: more than the points' own noise leaves of
 /// the median of hundreds.
 const OTHER_SCALE: f64 = 0.02;
-/// Share of the points that what is in front of them hides from a picture at most but for this: the scale is that of the
+/// Share of the points that what is in front of them hides from an image at most but for this: the scale is that of the
 /// closest so many ratios.
 const VISIBLE: f64 = 0.3;
 /// Depths whose closest ratios to the points are spread by more than this either way (logarithm) are not theirs, at whatever
-/// scale: noise of a quarter of the depth does as much, and single-picture networks have less.
+/// scale: noise of a quarter of the depth does as much, and single-image networks have less.
 const FOREIGN: f64 = 0.1;
 /// Share of the points that stand before what a metric map shows, by more than [`METRIC_OFF`], from which on it is told: what is before
 /// a point hides it, and what it is itself nothing can be before.
@@ -201,7 +202,7 @@ fn is_metric(capture: &Capture, frame: usize) -> bool {
 }
 
 /// The capture with its metric depth in the unit of its points, or without it where it contradicts them, and what is to be
-/// said of that: poses and points are of one unit, and pictures were matched to find them.
+/// said of that: poses and points are of one unit, and images were matched to find them.
 pub(super) fn believed(opened: OpenCapture, recipe: &Recipe) -> Result<(OpenCapture, Option<String>)> {
     if recipe.loss.depth <= 0.0 || !opened.capture.train.iter().any(|&i| is_metric(&opened.capture, i)) {
         return Ok((opened, None));

@@ -26,13 +26,13 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant as Clock};
 
-/// Options of a run besides its recipe.
+/// Options of a run in addition to its recipe.
 #[derive(Clone, Debug, Default)]
 pub struct TrainOptions {
     /// What draws. It is no part of the recipe: a run may be resumed on another device, whose last bits are others.
     pub device: Device,
     /// Keep all from the clock's zero to the end of what follows training to so long: iterations are fitted to it, and
-    /// fitted anew while the run goes.
+    /// fitted again while the run goes.
     pub minutes: Option<f64>,
     /// What the caller does after training (measuring, filming, baking) takes as long as about so many steps at the end
     /// of training; `minutes` leaves room for it.
@@ -41,7 +41,8 @@ pub struct TrainOptions {
     pub predict: bool,
     /// The clock of `minutes`; its zero is when the command began, or these options were made.
     pub clock: Stopwatch,
-    /// A loss of the caller's own beside the recipe's. It is no part of the recipe either, but a run that began with one is
+    /// A loss of the caller's own next to the recipe's. It is no part of the recipe either, but a run that began
+    /// with one is
     /// only resumed with one.
     pub own_loss: Option<OwnLoss>,
     /// Emit [`Event::Snapshot`] about so often, and at the end. They never take more than a fortieth of the time, and
@@ -49,7 +50,7 @@ pub struct TrainOptions {
     pub snapshots: Option<Duration>,
 }
 
-/// A loss on pictures that a caller brings along: makes its term, once for every run.
+/// A loss on images that a caller brings along: makes its term, once for every run.
 #[derive(Clone)]
 pub struct OwnLoss(pub Arc<dyn Fn() -> Box<dyn ImageTerm> + Send + Sync>);
 
@@ -160,7 +161,7 @@ fn note(measured: &[Measured], state: &mut RunState, metrics: &mut Metrics) {
     }
 }
 
-/// Seconds since the last lap, which begins anew.
+/// Seconds since the last lap, which begins again.
 fn lap(clock: &Stopwatch, last: &mut f64) -> f64 {
     let now = clock.seconds();
     now - std::mem::replace(last, now)

@@ -176,7 +176,7 @@ pub struct Forecast {
 
 /// Looks at a capture as `train` would before its first step.
 ///
-/// Errors: what `train` would refuse the capture for, pictures that cannot be read.
+/// Errors: what `train` would refuse the capture for, images that cannot be read.
 pub fn forecast(capture: Arc<Capture>, listen: &mut dyn FnMut(&Event)) -> Result<Forecast> {
     let recipe = Recipe::default();
     let opened = OpenCapture::new(capture, &recipe)?;

@@ -189,7 +189,7 @@ pub(crate) fn copy_folder(from: &Path, to: &Path) {
     }
 }
 
-/// The renderer, and something that happens at the n-th picture.
+/// The renderer, and something that happens at the n-th image.
 struct Meddled<F: FnMut(usize, &mut Image<f32>) + Send> {
     inner: Renderer<f32>,
     drawn: usize,
@@ -563,7 +563,7 @@ fn where_no_gaussian_is_opaque_images_show_their_mean_colour_and_others_what_the
         capture.train.iter().map(of).sum::<f64>() / capture.train.len() as f64
     });
     let found = shown(capture.clone());
-    // Sixteen pictures stand for all.
+    // Sixteen images stand for all.
     assert!((0..3).all(|c| (f64::from(found[c]) - mean[c]).abs() < 0.02 && mean[c] > 0.05), "{found:?} {mean:?}");
     let told = [0.9, 0.1, 0.4];
     assert_eq!(shown(Arc::new(Capture { background: Some(told), ..Capture::clone(&capture) })), told);
@@ -668,7 +668,7 @@ fn figures_say_what_they_hold_for_and_what_is_colour_in_them() {
     let recipe = recipe(&["hold_out=camera=0"]);
     place.train("a", &recipe).unwrap();
     let mut scene = splat4d::format::scene::read(&place.scene("a")).unwrap();
-    // The pictures are opaque, but say that they were not.
+    // The images are opaque, but say that they were not.
     let open = |background| Arc::new(Capture { background: Some(background), ..(*place.open(&recipe)).clone() });
     let mut measure = |capture: &Arc<Capture>, measured, entry: Option<&str>| {
         let options =

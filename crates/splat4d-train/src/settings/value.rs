@@ -1,8 +1,8 @@
-//! Types of knobs, to and from TOML.
+//! Types of settings, to and from TOML.
 
 use super::nearest;
 
-/// A type of value that a knob may hold.
+/// A type of value that a setting may hold.
 pub(crate) trait Value: Sized {
     /// As TOML.
     fn to_toml(&self) -> toml::Value;

@@ -1,15 +1,15 @@
-//! When a knob has an effect, as data, so that checks, help and documents say the same.
+//! When a setting has an effect, as data, so that checks, help and documents say the same.
 
-/// A condition on other knobs, which are named `table.field`.
+/// A condition on other settings, which are named `table.field`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum When {
     /// In every recipe.
     Always,
-    /// The knob is one of these words.
+    /// The setting is one of these words.
     Is(&'static str, &'static [&'static str]),
-    /// The knob is none of these words.
+    /// The setting is none of these words.
     IsNot(&'static str, &'static [&'static str]),
-    /// The knob is on: see [`is_off`].
+    /// The setting is on: see [`is_off`].
     On(&'static str),
     /// All of these.
     All(&'static [Self]),
@@ -18,7 +18,7 @@ pub enum When {
 }
 
 impl When {
-    /// Whether it is so; `get` looks a knob up.
+    /// Whether it is so; `get` looks a setting up.
     pub(crate) fn holds(self, get: &dyn Fn(&str) -> toml::Value) -> bool {
         match self {
             Self::Always => true,
@@ -30,7 +30,7 @@ impl When {
         }
     }
 
-    /// Every knob that it looks at.
+    /// Every setting that it looks at.
     #[cfg(test)]
     pub(crate) fn keys(self) -> Vec<&'static str> {
         match self {

@@ -1,4 +1,4 @@
-//! [`Batch`]: the pictures of one step.
+//! [`Batch`]: the images of one step.
 
 use super::chain::View;
 use super::emphasis::Emphasis;

@@ -70,7 +70,7 @@ pub(crate) struct Step<'a, F: Real> {
 
 /// The losses of a step.
 pub(crate) struct Losses<'a, F: Real> {
-    /// Compares pictures.
+    /// Compares images.
     pub image: &'a mut dyn ImageTerm<F>,
     /// Look at several times.
     pub probes: &'a [Box<dyn ProbeLoss<F>>],
@@ -98,7 +98,7 @@ struct Work<'a, F: Real> {
 }
 
 impl<F: Real> Work<'_, F> {
-    /// Adds the picture loss of one view.
+    /// Adds the image loss of one view.
     fn tell_loss(&mut self, value: f64) {
         self.report.loss += value;
         self.report.view_losses.push(value);
@@ -253,7 +253,7 @@ impl<F: Real> Chain<F> {
     }
 }
 
-/// A picture, and the gradients to it and to its splats.
+/// An image, and the gradients to it and to its splats.
 #[derive(Default)]
 struct Compared<F> {
     image: Image<F>,
@@ -262,14 +262,14 @@ struct Compared<F> {
 }
 
 impl<F: Real> Compared<F> {
-    /// The picture loss and its gradient.
+    /// The image loss and its gradient.
     fn compare(&mut self, info: &StepInfo, view: &View<'_, F>, drawn: &[(Channel, usize)], work: &mut Work<'_, F>) {
         self.d_image.begin(&self.image);
         let value = work.image.eval(info, view, &Shown::new(&self.image, drawn), &mut self.d_image);
         work.tell_loss(value);
     }
 
-    /// Drawing, the picture loss and the backend's VJP, all on its device. Returns whether it could.
+    /// Drawing, the image loss and the backend's VJP, all on its device. Returns whether it could.
     fn compare_there(
         &mut self,
         view: &View<'_, F>,

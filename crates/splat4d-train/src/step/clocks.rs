@@ -1,4 +1,5 @@
-//! Search of clocks: by how much every camera is early or late, told by a scene that need not be finished. A camera's pictures
+//! Search of clocks: by how much every camera is early or late, told by a scene that need not be finished. A
+//! camera's images
 //! are compared with the scene at shifted times, and the shift that suits them best wins.
 //!
 //! Gradients alone do not find shifts of whole frames: they look no farther than edges are wide. The scene was learnt with
@@ -15,16 +16,16 @@ use splat4d::render::{Antialias, Image, RenderConfig, Shot};
 use splat4d::scene::{Planes, Time};
 use std::collections::BTreeMap;
 
-/// Pictures of a camera that are looked at, spread over the take.
+/// Images of a camera that are looked at, spread over the take.
 const LOOKS: usize = 6;
-/// Neighbouring searches look at other pictures: at so many places between two of them, in turn.
+/// Neighbouring searches look at other images: at so many places between two of them, in turn.
 const TURNS: usize = 3;
-/// Pictures are halved until their longer side is at most so long, pixels: that is quick, and a shift shows farther.
+/// Images are halved until their longer side is at most so long, pixels: that is quick, and a shift shows farther.
 const SIDE: usize = 160;
 /// A search looks no farther than this share of the clip: beyond its ends there is no scene to compare with.
 const FARTHEST: f64 = 0.25;
 
-/// The pictures that clocks are told from, and what is known of their cameras.
+/// The images that clocks are told from, and what is known of their cameras.
 #[derive(Clone, Copy)]
 pub(crate) struct Look<'a> {
     pub frames: &'a dyn Frames,
@@ -34,8 +35,8 @@ pub(crate) struct Look<'a> {
 }
 
 impl Look<'_> {
-    /// By how many seconds to shift each camera's clock from where it is now, so that its pictures suit the scene best.
-    /// Errors: pictures that cannot be read.
+    /// By how many seconds to shift each camera's clock from where it is now, so that its images suit the scene best.
+    /// Errors: images that cannot be read.
     pub(crate) fn shifts(&self, scene: &Scene<f32>, due: SearchDue) -> Result<Vec<(usize, f64)>> {
         let reach = due.reach.min(FARTHEST * (scene.clip[1] - scene.clip[0]));
         let sides = (reach / due.step).floor() as i64;
@@ -48,7 +49,8 @@ impl Look<'_> {
             .collect()
     }
 
-    /// The difference of a camera's pictures from the scene at shifted times; nothing where none of them can be shifted so
+    /// The difference of a camera's images from the scene at shifted times; nothing where none of them can be
+    /// shifted so
     /// far within the clip.
     fn costs(&self, scene: &Scene<f32>, frames: &[usize], shifts: &[f64], round: usize) -> Result<Vec<f64>> {
         let mut costs = vec![0.0; shifts.len()];

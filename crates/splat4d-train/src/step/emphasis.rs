@@ -1,4 +1,5 @@
-//! [`Emphasis`]: pixels that show what moves weigh more. What moves is a small part of most pictures and the hardest, since
+//! [`Emphasis`]: pixels that show what moves weigh more. What moves is a small part of most images and the hardest,
+//! since
 //! a still Gaussian learns from every frame and a moving one from those of its life.
 //!
 //! Source: the importance of DyNeRF (Li et al. 2022) by the distance from the temporal median, which draws rays there and
@@ -17,18 +18,18 @@ const GAMMA: f32 = 0.02;
 /// Rows of pixels of a task: fewer would cost more to hand out than to compute.
 const ROWS: usize = 16;
 
-/// Weights of pixels by how much they differ from what stands still; none where cameras move, or have few pictures.
+/// Weights of pixels by how much they differ from what stands still; none where cameras move, or have few images.
 pub(crate) struct Emphasis {
     /// k: how much more than others a pixel weighs that shows nothing but what moves.
     strength: f32,
-    /// By camera: its temporal median, channel by channel at the size that pictures are looked at in, as bytes.
+    /// By camera: its temporal median, channel by channel at the size that images are looked at in, as bytes.
     still: BTreeMap<usize, [Vec<u8>; 3]>,
     /// Scratch: Σ ψ/3 by pixel at that size.
     moves: Planes<f32>,
 }
 
 impl Emphasis {
-    /// Looks at what stands still. `None`: nothing is emphasised. Errors: a picture cannot be read.
+    /// Looks at what stands still. `None`: nothing is emphasised. Errors: an image cannot be read.
     pub(crate) fn new(frames: &dyn Frames, strength: f64) -> Result<Option<Self>> {
         if strength <= 0.0 {
             return Ok(None);
@@ -44,7 +45,7 @@ impl Emphasis {
         Ok(Some(Self { strength: strength as f32, still, moves: Planes::default() }))
     }
 
-    /// Multiplies the weights of a whole picture of camera `rig`, which is not yet halved.
+    /// Multiplies the weights of a whole image of camera `rig`, which is not yet halved.
     pub(super) fn apply(&mut self, rig: usize, picture: &mut Picture) {
         let Some(still) = self.still.get(&rig) else { return };
         let (width, height) = (picture.color.width, picture.color.height);
@@ -60,7 +61,8 @@ impl Emphasis {
         };
         self.moves.reset(1, color.height, color.width);
         assert_eq!(still[0].len(), color.pixels(), "images of one camera have one size");
-        // Rows in parallel: in series this was a twentieth of a step on two cores, and a quarter beside a graphics card.
+        // Rows in parallel: in series this was a twentieth of a step on two cores, and a quarter next to a graphics
+        // card.
         let simd = Simd::detect();
         self.moves.data.par_chunks_mut(color.width).with_min_len(ROWS).enumerate().for_each(|(y, row)| {
             let of_row = y * color.width..(y + 1) * color.width;
@@ -75,7 +77,7 @@ impl Emphasis {
         });
         let (moves, strength) = (&self.moves.data, self.strength);
         weight.data.par_chunks_mut(width).with_min_len(ROWS).enumerate().for_each(|(y, row)| {
-            // An odd last row or column is left out where pictures are halved: it is like the one before.
+            // An odd last row or column is left out where images are halved: it is like the one before.
             let from = (y >> halvings).min(color.height - 1) * color.width;
             let moves = &moves[from..from + color.width];
             if halvings == 0 {
@@ -158,7 +160,7 @@ mod tests {
         assert!(Emphasis::new(&Made::new(3, 2, 4), 1.0).unwrap().is_none(), "two moments have no median");
     }
 
-    /// Pictures that are larger than the size that is worked with: every pixel has a weight.
+    /// Images that are larger than the size that is worked with: every pixel has a weight.
     #[test]
     fn weights_are_those_of_the_place_in_a_smaller_image() {
         let (width, height) = (801, 603);

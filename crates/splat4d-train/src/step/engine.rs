@@ -20,9 +20,9 @@ use std::time::{Duration, Instant as Clock};
 pub struct StepPlan<'a> {
     /// The stage: learnable groups, their rates and losses.
     pub stage: &'a mut Stage,
-    /// Compares pictures.
+    /// Compares images.
     pub loss: &'a mut TrainLoss,
-    /// Pictures and their truth.
+    /// Images and their truth.
     pub views: &'a [View<'a, f32>],
     /// Where in training.
     pub info: &'a StepInfo,
@@ -60,11 +60,11 @@ pub struct Stepped {
     pub report: StepReport,
     /// What steps measured that are done now and were not before: this one, or, of a device that is still at it, earlier ones.
     pub measured: Vec<Measured>,
-    /// Loading pictures.
+    /// Loading images.
     pub load: Duration,
     /// Adam.
     pub adam: Duration,
-    /// Upkeep, noise and the rest.
+    /// Maintenance, noise and the rest.
     pub other: Duration,
     /// Gaussians born, moved, removed.
     pub change: Change,
@@ -139,10 +139,10 @@ pub(super) fn rates_of(scene: &Scene<f32>, plan: &StepPlan<'_>, all: &mut Rates)
 }
 
 /// Share of a stage after which exposures come to rest: before it they learn at a constant rate, since a rate that falls from the
-/// start leaves them short in runs of a few dozen pictures a camera (docs/suite.md).
+/// start leaves them short in runs of a few dozen images a camera (docs/suite.md).
 const EXPOSURE_RESTS: f64 = 0.7;
 /// What is left of their rate at the end: Adam moves a camera's colours by up to the rate a step whatever the gradient, and at the
-/// full rate pictures end a thousandth off.
+/// full rate images end a thousandth off.
 const EXPOSURE_END: f64 = 0.01;
 
 /// What is left of the exposures' rate at a place in the stage.
@@ -187,9 +187,9 @@ pub struct CpuEngine<'a> {
     rates: Rates,
     /// The scene as the stage's codec shows it.
     shown: Scene<f32>,
-    /// Whether `shown` is to be copied from the scene anew.
+    /// Whether `shown` is to be copied from the scene again.
     stale: bool,
-    /// Whether it was said that pictures are compared on the CPU.
+    /// Whether it was said that images are compared on the CPU.
     told: bool,
 }
 
@@ -227,7 +227,7 @@ impl<'a> CpuEngine<'a> {
         codec.show(scene, &plan.info.times, &mut self.shown);
     }
 
-    /// Evaluate, draw, compare, and all the way back: fills the gradients.
+    /// Evaluate, draw, compare, and all the backward pass: fills the gradients.
     fn evaluate(&mut self, learner: &mut Learner, plan: &mut StepPlan<'_>, out: &mut Stepped) -> Result<()> {
         let Parts { scene, stats, exposure, .. } = learner.parts_mut();
         let scene = if plan.stage.codec.is_some() { &self.shown } else { &*scene };
@@ -291,7 +291,7 @@ impl<'a> CpuEngine<'a> {
     }
 }
 
-/// Whether a backend compares pictures, where the loss lets it.
+/// Whether a backend compares images, where the loss lets it.
 fn compares(backend: &dyn Backend) -> bool {
     backend.can(&Wanted { compare: true, ..Wanted::default() }).is_ok()
 }

@@ -1,4 +1,4 @@
-//! The trainer's picture loss: a list of terms, on pictures as their cameras expose them.
+//! The trainer's image loss: a list of terms, on images as their cameras expose them.
 
 use crate::learner::Exposure;
 use crate::loss::image::{ImageTerm, Needs, PictureGrads, Shown, View};
@@ -7,8 +7,8 @@ use crate::loss::terms::StepInfo;
 use splat4d::render::{Comparison, Target};
 use splat4d::scene::Planes;
 
-/// The loss on pictures: terms, in the order in which their values and gradients are summed. The exposure of the
-/// view's camera lies between the drawn picture and all of them.
+/// The loss on images: terms, in the order in which their values and gradients are summed. The exposure of the
+/// view's camera lies between the drawn image and all of them.
 pub struct TrainLoss {
     terms: Vec<Box<dyn ImageTerm>>,
     exposed: Planes<f32>,
@@ -42,7 +42,7 @@ impl TrainLoss {
         self.terms.push(term);
     }
 
-    /// The loss of one step: these terms, then those of the stage, on pictures as their cameras expose them.
+    /// The loss of one step: these terms, then those of the stage, on images as their cameras expose them.
     pub(crate) fn of_step<'a>(
         &'a mut self,
         stage: &'a mut [Box<dyn ImageTerm>],
@@ -58,7 +58,7 @@ impl TrainLoss {
     }
 }
 
-/// The picture loss of one step; see [`TrainLoss::of_step`].
+/// The image loss of one step; see [`TrainLoss::of_step`].
 pub(crate) struct StepLoss<'a> {
     run: &'a mut TrainLoss,
     stage: &'a mut [Box<dyn ImageTerm>],
@@ -133,7 +133,7 @@ mod tests {
     /// Its matrix without the identity, and its offsets.
     const ROW: [f32; 12] = [0.2, 0.03, -0.02, 0.01, -0.1, 0.04, -0.03, 0.02, 0.05, 0.02, 0.0, -0.03];
 
-    /// A caller's own term: Σ w·picture with random weights, and what it saw.
+    /// A caller's own term: Σ w·image with random weights, and what it saw.
     struct Own {
         seen: std::sync::Arc<std::sync::Mutex<Vec<f32>>>,
     }

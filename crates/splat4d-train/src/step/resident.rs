@@ -264,7 +264,7 @@ impl Engine for DeviceEngine<'_> {
         let (known, targets) = match (known, targets) {
             (Ok(known), Some(targets)) => (known, targets),
             (known, _) => {
-                // Of losses on pictures the CPU's engine tells.
+                // Of losses on images the CPU's engine tells.
                 if let Err(why) = known {
                     self.tell(&why, &mut notices);
                 }
@@ -305,7 +305,7 @@ impl Engine for DeviceEngine<'_> {
         let resident = self.cpu.backend().resident().expect("it was there before");
         let done = match resident.step(&step) {
             Ok(Some(done)) => done,
-            // A picture too large for one piece: the CPU's engine draws it in several.
+            // An image too large for one piece: the CPU's engine draws it in several.
             Ok(None) => return self.step_on_cpu(learner, plan, notices),
             Err(error) => {
                 if self.newest != Newest::Both {

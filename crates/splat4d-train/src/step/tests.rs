@@ -1,4 +1,4 @@
-//! A made-up capture: a ring of cameras around a shaded ball that moves in front of a striped sky.
+//! A synthetic capture: a ring of cameras around a shaded ball that moves in front of a striped sky.
 
 mod bed;
 mod depth;
@@ -30,7 +30,7 @@ impl Made {
     /// The ball's radius.
     pub(crate) const RADIUS: f64 = 0.5;
 
-    /// `cameras` square pictures of `size` pixels at each of `times` moments, 10 a second.
+    /// `cameras` square images of `size` pixels at each of `times` moments, 10 a second.
     pub(crate) fn new(cameras: usize, times: usize, size: usize) -> Self {
         let camera = |i: usize| {
             let a = std::f64::consts::TAU * i as f64 / cameras as f64;

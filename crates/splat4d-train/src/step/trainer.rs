@@ -49,7 +49,7 @@ pub struct Position {
     pub iteration: usize,
     /// Current stage.
     pub stage: usize,
-    /// Steps of its schedule that are behind it: those taken, unless the run was planned anew.
+    /// Steps of its schedule that are behind it: those taken, unless the run was planned again.
     pub stage_step: usize,
     /// Steps taken in it.
     pub taken: usize,
@@ -80,7 +80,7 @@ pub struct Trainer<'a> {
     pub stages: Vec<Stage>,
     /// How far.
     pub progress: Position,
-    /// Compares pictures.
+    /// Compares images.
     pub loss: TrainLoss,
     /// Settings that hold for all stages.
     pub settings: Settings,
@@ -272,7 +272,7 @@ impl<'a> Trainer<'a> {
         self.stages[stage].codec.as_ref().filter(|_| begun)
     }
 
-    /// The scene as pictures show it: as it will be read from its file, where the stage has a codec.
+    /// The scene as images show it: as it will be read from its file, where the stage has a codec.
     pub(crate) fn shown(&self) -> Cow<'_, Scene<f32>> {
         self.codec().map_or(Cow::Borrowed(self.scene()), |c| Cow::Owned(c.whole(self.scene())))
     }
@@ -340,7 +340,7 @@ impl<'a> Trainer<'a> {
         self.engine.catch_up(&self.learner).map_err(|fault| self.named(fault))
     }
 
-    /// Goes on from what the learner holds, whatever a device that failed had besides.
+    /// Goes on from what the learner holds, whatever a device that failed had in addition.
     pub(crate) fn go_on(&mut self) {
         self.engine.changed(&self.learner);
     }
@@ -361,14 +361,14 @@ impl<'a> Trainer<'a> {
         Fault(format!("{what} ({})", names.join(", ")), blame, None)
     }
 
-    /// Whether upkeep, a hook or another stage looks at the learner after these steps of the stage's schedule.
+    /// Whether maintenance, a hook or another stage looks at the learner after these steps of the stage's schedule.
     fn looked_at_after(&self, mut passed: RangeInclusive<usize>) -> bool {
         let stage = &self.stages[self.progress.stage];
         let last = *passed.end() == stage.iterations;
         last || passed.any(|step| stage.upkeep.iter().any(|u| u.due(&At { step, steps: stage.iterations })))
     }
 
-    /// Loads the pictures of this step; the next one's are read meanwhile.
+    /// Loads the images of this step; the next one's are read meanwhile.
     fn load(&mut self) -> Result<()> {
         let (Position { taken, stage_step: place, .. }, next) = (self.progress, self.next_place());
         let stage = &self.stages[self.progress.stage];
@@ -386,7 +386,7 @@ impl<'a> Trainer<'a> {
         Ok(())
     }
 
-    /// The engine's step on the pictures that were loaded.
+    /// The engine's step on the images that were loaded.
     fn learn(&mut self) -> Result<std::result::Result<Stepped, Fault>> {
         let (Settings { seed, limits, background, sh_degree, exposure_lr }, at) =
             (self.settings.clone(), self.progress);

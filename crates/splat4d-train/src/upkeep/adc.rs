@@ -3,7 +3,7 @@
 //!
 //! Gaussians with a life and a path of their own that leave their own place within that life are split in time instead:
 //! the two halves follow the same path one after the other. What turns or speeds up needs shorter lives, which parts
-//! beside each other do not bring. Gaussians of four dimensions (Yang et al. 2024) split in time as well, at random.
+//! next to each other do not bring. Gaussians of four dimensions (Yang et al. 2024) split in time as well, at random.
 //!
 //! The original also removes Gaussians larger than a tenth of the extent. The extent is the spread of the cameras, and a
 //! wall before a forward-facing rig needs larger ones: removal cost 1.3 dB in a kitchen, 0.3 to 1.6 dB on four other
@@ -193,7 +193,7 @@ impl AdcSettings {
             }
             if grows[r] && !splits[r] {
                 // Two halves in one place are as opaque as the whole: 1 − √(1 − o) each. Parts of a split are smaller and
-                // lie beside each other; as faint as this they let training views fall by up to 2 dB (docs/suite.md).
+                // lie next to each other; as faint as this they let training views fall by up to 2 dB (docs/suite.md).
                 layer.params[GEOMETRY].set(j, OPACITY, logit(1.0 - (1.0 - old_opacity[j]).sqrt()));
             }
         }

@@ -1,6 +1,7 @@
 //! Removal of floaters: Gaussians that hang right before a camera that does not see them, and that one camera alone sees.
 //!
-//! One camera's pictures say nothing about depth, so that what it alone sees drifts along its rays, and some of it comes to rest
+//! One camera's images say nothing about depth, so that what it alone sees drifts along its rays, and some of it
+//! comes to rest
 //! between the other cameras, where it veils every view from there. What it showed is learnt again where others see it, or
 //! farther away. What stands before the camera that sees it may be there, and stays; so does all that two cameras see.
 
@@ -87,7 +88,7 @@ impl Upkeep for Floaters {
     }
 }
 
-/// From where pictures were taken, each place once.
+/// From where images were taken, each place once.
 struct Places<'a> {
     cameras: Vec<(&'a Camera, [f64; 3])>,
 }
@@ -98,7 +99,7 @@ impl<'a> Places<'a> {
         let mut last = std::collections::BTreeMap::new();
         for i in 0..frames.len() {
             let camera = frames.camera(i);
-            // A camera stands still, or is elsewhere in every picture: comparing it with its last place is enough.
+            // A camera stands still, or is elsewhere in every image: comparing it with its last place is enough.
             if last.insert(frames.rig(i), camera).is_none_or(|l| l.cam_from_world != camera.cam_from_world) {
                 cameras.push((camera, camera.cam_from_world.inverse().translation));
             }

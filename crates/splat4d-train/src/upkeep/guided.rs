@@ -1,4 +1,5 @@
-//! Guided sampling: where pictures are worst and there are too few Gaussians to mend them, new ones are put along the rays
+//! Guided sampling: where images are worst and there are too few Gaussians to mend them, new ones are put along the
+//! rays
 //! of the worst patches. It finds what no initial point stood for, far backgrounds above all.
 //!
 //! Source: Li et al. 2024 (STG) §4.2 and its released settings: of the views that were looked at the two worst; patches of
@@ -25,7 +26,7 @@ const LOOKS: usize = 24;
 const WORST_VIEWS: usize = 2;
 /// Side of a patch, pixels.
 const PATCH: usize = 16;
-/// Share of a picture's pixels that count as wrong: those with the largest errors.
+/// Share of an image's pixels that count as wrong: those with the largest errors.
 const WRONG: f64 = 0.4;
 /// Share of a patch's pixels that must be wrong.
 const WRONG_IN_PATCH: f64 = 0.85;
@@ -104,7 +105,7 @@ impl Upkeep for Guided {
         (at.step - first.max(1)).is_multiple_of(interval)
     }
 
-    /// Adds Gaussians to the first layer. Errors: a picture cannot be read.
+    /// Adds Gaussians to the first layer. Errors: an image cannot be read.
     fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
         let (rng, scene) = (c.rng("guided"), learner.scene());
         let room = c.limits.cap.saturating_sub(scene.len());

@@ -1,4 +1,4 @@
-//! Densification as Markov chain Monte Carlo: dead Gaussians are moved onto live ones so that the picture stays the same,
+//! Densification as Markov chain Monte Carlo: dead Gaussians are moved onto live ones so that the image stays the same,
 //! the cloud grows by 5 % a time up to the cap, and positions are shaken while a Gaussian is nearly transparent.
 //!
 //! Where they go is drawn in space-time from opacity and screen gradient (FreeTimeGS): a row carries its life with it.
@@ -172,7 +172,7 @@ pub(super) fn join(learner: &mut Learner, limits: &Limits, places: &Places, move
     for _ in 0..added {
         edit.push(next(&mut copies), Born::Clone);
     }
-    // The one that is joined changes as well: its moments start anew.
+    // The one that is joined changes as well: its moments start again.
     for j in 0..rows {
         if copies[edit.parent[j] as usize] > 1 && edit.born[j] == Born::Kept {
             edit.born[j] = Born::Moved;

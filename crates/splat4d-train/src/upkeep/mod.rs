@@ -118,7 +118,7 @@ impl std::ops::AddAssign for Change {
     }
 }
 
-/// All that an operation may know besides the learner.
+/// All that an operation may know in addition to the learner.
 #[derive(Clone, Copy)]
 pub struct Context<'a> {
     /// Where in the stage.
@@ -150,7 +150,7 @@ impl Context<'_> {
 pub enum Order {
     /// Nodes, while statistics of the Gaussians that follow them are still there.
     Nodes,
-    /// Gaussians are put where pictures want them; before densification, which begins the statistics anew.
+    /// Gaussians are put where images want them; before densification, which begins the statistics again.
     Place,
     /// The cloud grows.
     Grow,
@@ -219,7 +219,7 @@ pub trait Upkeep: Send + Sync {
 }
 
 /// Lets every layer grow under the one cap: `layer` gets a layer's number, how many rows it may add (to be lowered by those
-/// it adds) and its random numbers. Statistics begin anew.
+/// it adds) and its random numbers. Statistics begin again.
 fn grow(
     learner: &mut Learner,
     c: &Context<'_>,

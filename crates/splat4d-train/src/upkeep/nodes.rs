@@ -2,7 +2,7 @@
 //! that no Gaussian follows are removed.
 //!
 //! Source: Huang et al. 2024 (SC-GS), there every 5,000 of 80,000 steps from 1,000 to 25,000 with the gradient to
-//! positions in space; here with that to positions in the picture, which densification gathers anyway.
+//! positions in space; here with that to positions in the image, which densification gathers anyway.
 
 use super::{At, Change, Context, DensifySettings, Every, Order, Upkeep};
 use crate::Result;

@@ -1,4 +1,4 @@
-//! Opacity reset: every so many steps all opacities are lowered, so that what the pictures do not ask for stays faint and
+//! Opacity reset: every so many steps all opacities are lowered, so that what the images do not ask for stays faint and
 //! is pruned. Source: Kerbl et al. 2023 §5.2.
 
 use super::{At, Change, Context, DensifySettings, Every, Order, Strategy, Upkeep, logit};

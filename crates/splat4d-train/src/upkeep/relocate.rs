@@ -1,4 +1,5 @@
-//! Periodic relocation, beside any strategy: the faintest Gaussians go where the picture still wants to change, a few at a
+//! Periodic relocation, next to any strategy: the faintest Gaussians go where the image still wants to change, a few
+//! at a
 //! time, so that none is wasted, also after densification has ended.
 //!
 //! Source: Wang et al. 2025 (FreeTimeGS) §3.3: every 100 steps, below a threshold of opacity, to places drawn from ½
@@ -34,7 +35,7 @@ settings! {
 pub(crate) struct Relocate {
     /// How, and when.
     pub settings: RelocateSettings,
-    /// When statistics begin anew with densification; from its last time on they do so here.
+    /// When statistics begin again with densification; from its last time on they do so here.
     pub densification: Every,
 }
 

@@ -23,7 +23,7 @@ pub(crate) fn scene(rows: usize) -> Scene<f32> {
     Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 30.0, ..Scene::default() }
 }
 
-/// No picture: for operations that look at none.
+/// No image: for operations that look at none.
 struct Nothing;
 
 impl Frames for Nothing {
@@ -47,7 +47,7 @@ impl Frames for Nothing {
     }
 }
 
-/// A context without pictures, in which everything learns.
+/// A context without images, in which everything learns.
 pub(crate) fn context(limits: Limits, seed: u64, iteration: usize) -> Context<'static> {
     let at = At { step: 1, steps: 100 };
     Context { at, iteration, seed, limits, frames: &Nothing, antialias: Antialias::Off, learns: &|_, _| true }

@@ -1,26 +1,27 @@
-//! Where every pixel of one picture is in the next: least squares of the differences of small patches that overlap, coarse to
+//! Where every pixel of one image is in the next: least squares of the differences of small patches that overlap,
+//! coarse to
 //! fine (Kroeger et al. 2016, "Fast Optical Flow using Dense Inverse Search", without the variational step).
 
 use super::raster::{blurred, every_second, sample};
 use rayon::prelude::*;
 use splat4d::scene::Planes;
 
-/// Shorter side of the smallest picture, pixels: patches must have room to move.
+/// Shorter side of the smallest image, pixels: patches must have room to move.
 const SMALLEST: usize = 56;
-/// Pictures of falling size; motion of up to some 30 pixels is followed.
+/// Images of falling size; motion of up to some 30 pixels is followed.
 const LEVELS: usize = 4;
 /// Steps shorter than this change nothing, pixels.
 const STILL: f32 = 0.01;
 /// Blur before every second pixel is taken, pixels.
 const HALVING_BLUR: f64 = 1.0;
-/// The least eigenvalue of a window's gradients, a pixel: less has no corner to follow (of pictures in [0, 1]).
+/// The least eigenvalue of a window's gradients, a pixel: less has no corner to follow (of images in [0, 1]).
 const CORNER: f32 = 1e-5;
 
-/// A grey picture at falling sizes.
+/// A grey image at falling sizes.
 pub struct Pyramid(Vec<Planes<f32>>);
 
 impl Pyramid {
-    /// Of a grey picture.
+    /// Of a grey image.
     pub fn new(grey: Planes<f32>) -> Self {
         let mut levels = vec![grey];
         while levels.len() < LEVELS {
@@ -39,17 +40,18 @@ const PATCH: usize = 8;
 const STRIDE: usize = 4;
 /// Steps of a patch on a level, at most.
 const PATCH_STEPS: usize = 16;
-/// Differences below this, of pictures in [0, 1], weigh alike where patches overlap (one grey level there).
+/// Differences below this, of images in [0, 1], weigh alike where patches overlap (one grey level there).
 const GREY_LEVEL: f32 = 1.0 / 255.0;
 /// Forward and backward flow agree if |F + B|² is below this share of |F|² + |B|² and so many squared pixels (Sundaram et
 /// al. 2010).
 const AGREE_SHARE: f32 = 0.01;
 const AGREE_PIXELS: f32 = 0.5;
 
-/// The flow from one picture to the next and 1 where it is known: [3, height, width], u right and v down in pixels.
+/// The flow from one image to the next and 1 where it is known: [3, height, width], u right and v down in pixels.
 ///
-/// Known is what has texture, arrives within the picture, and is led back by the flow from there (occlusion test). Panics:
-/// pictures of two sizes.
+/// Known is what has texture, arrives within the image, and is led back by the flow from there (occlusion test).
+/// Panics:
+/// images of two sizes.
 pub(crate) fn dense(from: &Pyramid, to: &Pyramid) -> Planes<f32> {
     let (a, b) = (&from.0[0], &to.0[0]);
     assert_eq!((a.width, a.height), (b.width, b.height), "flow is between images of one size");
@@ -81,7 +83,7 @@ struct Field {
     textured: Vec<bool>,
 }
 
-/// A patch of the first picture: its vector, and whether it has texture.
+/// A patch of the first image: its vector, and whether it has texture.
 #[derive(Clone, Copy, Default)]
 struct Patch {
     vector: [f32; 2],
@@ -306,7 +308,7 @@ mod tests {
         let (median, most) = (errors[errors.len() / 2], errors[errors.len() * 95 / 100]);
         assert!(median < 0.06 && most < 0.5, "half of all within {median} px, 95 % within {most} px");
         assert!(inner[inner.len() / 2] < 0.1, "{} px", inner[inner.len() / 2]);
-        // What the patch covers in the second picture goes nowhere.
+        // What the patch covers in the second image goes nowhere.
         let hidden = |x: usize, y: usize| flow.plane(2)[y * 160 + x];
         let gone = (52..58).flat_map(|x| (52..78).map(move |y| hidden(x, y))).sum::<f32>();
         assert!(gone < 0.5 * 6.0 * 26.0, "{gone} of 156 pixels that are hidden");

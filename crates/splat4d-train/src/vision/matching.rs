@@ -29,7 +29,7 @@ const OVERLAP: f64 = 0.3;
 /// Largest distance from an epipolar line and from where a point is seen, pixels.
 const OFF: f64 = 1.5;
 /// The second best match must be this many times farther away (Lowe 2004: 0.8). Along a line are few, so that
-/// this says less than in a whole picture: points that only two cameras see must have more.
+/// this says less than in a whole image: points that only two cameras see must have more.
 const RATIO: f64 = 0.8;
 const RATIO_OF_TWO: f64 = 0.7;
 /// Descriptors farther apart than this have nothing in common: of two bytes' descriptors the squared distance is at most
@@ -108,7 +108,7 @@ const SAME_PLACE_OF_RIG: f64 = 1e-5;
 /// How ranks of neighbours grow: 0 to 4 one by one, then 5, 6, 8, 10, 13.
 const GROWTH: f64 = 1.25;
 
-/// Share of a camera's picture that another one holds too, at the depth where it holds most.
+/// Share of a camera's image that another one holds too, at the depth where it holds most.
 fn overlap(a: &Camera, b: &Camera) -> f64 {
     /// Pixels along either side that are asked.
     const ASKED: usize = 5;
@@ -165,7 +165,7 @@ fn matches(views: &[View], [a, b]: [usize; 2], [from, to]: [&[Feature]; 2]) -> V
                 second = (d, j);
             }
         }
-        // What is alone on its line must be as good as if something quite unlike stood beside it.
+        // What is alone on its line must be as good as if something quite unlike stood next to it.
         let ratio = (f64::from(first.0) / f64::from(second.0.clamp(1, FAR))).sqrt();
         forth.push((first.0 < FAR && ratio < RATIO).then_some((first.1, ratio)));
     }

@@ -1,8 +1,8 @@
-//! Points on surfaces, by plane sweep: a window of one picture is laid at many depths and compared with its neighbours
+//! Points on surfaces, by plane sweep: a window of one image is laid at many depths and compared with its neighbours
 //! there (normalised cross-correlation; Collins 1996).
 //!
 //! Not every pixel: the window with the strongest texture of every cell of a lattice, so that points lie evenly in
-//! pictures and the work follows from how many are wanted. The window is tilted at the best depth (floors and walls are
+//! images and the work follows from how many are wanted. The window is tilted at the best depth (floors and walls are
 //! rarely seen from in front), and neighbours must find the same depth by themselves.
 
 use super::triangulate::{Transfer, angle_at};
@@ -23,7 +23,7 @@ pub(crate) struct Swept {
 const HALF: usize = 3;
 const SIDE: usize = 2 * HALF + 1;
 const WINDOW: usize = SIDE * SIDE;
-/// Neighbours that a picture is compared with, at most.
+/// Neighbours that an image is compared with, at most.
 const NEIGHBOURS: usize = 4;
 /// A window whose grey values spread less than this (standard deviation, in [0, 1]) looks the same everywhere.
 const TEXTURE: f32 = 0.012;
@@ -36,7 +36,7 @@ const UNIQUE: f32 = 0.8;
 const SAME_PEAK: usize = 3;
 /// Neighbours that must find the same depth, where there are more of them; of fewer, one.
 const CONFIRMED: usize = 2;
-/// Steps in inverse depth by which two pictures may differ on a point.
+/// Steps in inverse depth by which two images may differ on a point.
 const AGREE: f64 = 1.5;
 /// Least and largest number of depths; between them, each moves the window by a pixel in the neighbour where it moves most.
 const DEPTHS: std::ops::RangeInclusive<usize> = 16..=256;
@@ -81,7 +81,7 @@ struct Other<'a> {
     transfer: Transfer,
 }
 
-/// A window of a picture, of mean 0 and length 1, and its middle pixel.
+/// A window of an image, of mean 0 and length 1, and its middle pixel.
 struct Window {
     values: [f32; WINDOW],
     x: usize,
@@ -323,7 +323,7 @@ impl<'a> Reference<'a> {
     }
 }
 
-/// Correlation of a window with the neighbour's pixels that a patch takes it to; `None` outside of that picture.
+/// Correlation of a window with the neighbour's pixels that a patch takes it to; `None` outside of that image.
 fn correlation(window: &Window, other: &Other<'_>, patch: Patch) -> Option<f32> {
     let Transfer { turn, shift } = &other.transfer;
     let [u, v] = window.pixel();
@@ -382,7 +382,7 @@ fn angle_worth(degrees: f64) -> f64 {
     (-0.5 * ((degrees - BEST_ANGLE) / spread).powi(2)).exp()
 }
 
-/// Pixels that the middle of a picture moves over in a neighbour between infinity and an inverse depth.
+/// Pixels that the middle of an image moves over in a neighbour between infinity and an inverse depth.
 fn path(view: &View, transfer: &Transfer, to: f64) -> f64 {
     /// Pieces of the way: it is nearly straight, and not evenly fast.
     const PIECES: usize = 8;

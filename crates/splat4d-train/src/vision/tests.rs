@@ -1,4 +1,5 @@
-//! Made-up rooms in which every point's place is known: a slanted wall and a floor with a noise texture, and a panel that
+//! Synthetic rooms in which every point's place is known: a slanted wall and a floor with a noise texture, and a
+//! panel that
 //! moves before them.
 
 use super::*;
@@ -214,7 +215,7 @@ fn images_without_texture_and_single_cameras_give_no_points() {
 fn wrong_poses_give_few_points() {
     let right = Room::new(6, 1.0);
     let mut wrong = Room::new(6, 1.0);
-    // The pictures are those of the right cameras: only what is told of them is wrong.
+    // The images are those of the right cameras: only what is told of them is wrong.
     struct Told<'a>(&'a Room, &'a Room);
     impl Frames for Told<'_> {
         fn len(&self) -> usize {

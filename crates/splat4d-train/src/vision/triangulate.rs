@@ -37,14 +37,14 @@ impl Transfer {
         Self { turn: mat_mul(&mat_mul(&k, &rotation), &inverse), shift: mat_vec(&k, shift) }
     }
 
-    /// Where the pixel lies in the other picture at an inverse depth; nothing behind that camera.
+    /// Where the pixel lies in the other image at an inverse depth; nothing behind that camera.
     pub fn at(&self, pixel: [f64; 2], inverse: f64) -> Option<[f64; 2]> {
         let q = mat_vec(&self.turn, [pixel[0], pixel[1], 1.0]);
         let q: [f64; 3] = std::array::from_fn(|k| q[k] + inverse * self.shift[k]);
         (q[2] > 0.0).then(|| [q[0] / q[2], q[1] / q[2]])
     }
 
-    /// The pixel's epipolar line in the other picture: a, b, c with a² + b² = 1, so that a u + b v + c is a distance in
+    /// The pixel's epipolar line in the other image: a, b, c with a² + b² = 1, so that a u + b v + c is a distance in
     /// pixels. Nothing where it has no direction.
     pub fn line(&self, pixel: [f64; 2]) -> Option<[f64; 3]> {
         let l = cross(self.shift, mat_vec(&self.turn, [pixel[0], pixel[1], 1.0]));
@@ -58,12 +58,12 @@ impl Transfer {
 pub struct Sight<'a> {
     /// By which camera (pinhole).
     pub camera: &'a Camera,
-    /// Where in its picture.
+    /// Where in its image.
     pub pixel: [f64; 2],
 }
 
 impl Sight<'_> {
-    /// Distance of a world point's picture from where it was seen, pixels; infinite behind the camera.
+    /// Distance of a world point's image from where it was seen, pixels; infinite behind the camera.
     pub fn error(&self, x: [f64; 3]) -> f64 {
         let off = |([u, v], _): ([f64; 2], f64)| (u - self.pixel[0]).hypot(v - self.pixel[1]);
         self.camera.project(x).map_or(f64::INFINITY, off)

@@ -1,4 +1,4 @@
-//! The pictures that points are looked for in: what stands still as fixed cameras see it, single moments, or the frames
+//! The images that points are looked for in: what stands still as fixed cameras see it, single moments, or the frames
 //! of moving cameras.
 
 use super::raster::{blurred, grey};
@@ -9,9 +9,9 @@ use splat4d::math::median_by;
 use splat4d::scene::{Camera, Planes};
 use std::collections::BTreeMap;
 
-/// Pictures that are looked at together, at most, evenly chosen.
+/// Images that are looked at together, at most, evenly chosen.
 const VIEWS: usize = 64;
-/// Pictures are halved until they have no more pixels than this: finer detail places points no better than Gaussians
+/// Images are halved until they have no more pixels than this: finer detail places points no better than Gaussians
 /// need.
 const PIXELS: usize = 300_000;
 /// Moments of a fixed camera whose median is what stands still.
@@ -24,9 +24,9 @@ const MOVED: f32 = 0.06;
 /// Differences are blurred by so many pixels: single ones are noise.
 const MOVED_BLUR: f64 = 1.0;
 
-/// A picture to look for points in.
+/// An image to look for points in.
 pub(crate) struct View {
-    /// Where it was taken from; its size is the picture's.
+    /// Where it was taken from; its size is the image's.
     pub camera: Camera,
     /// Colours as bytes, pixel by pixel.
     pub colors: Vec<[u8; 3]>,
@@ -48,20 +48,20 @@ impl View {
         self.wanted[y * self.camera.width + x]
     }
 
-    /// Its colour in [0, 1] at a pixel position inside the picture.
+    /// Its colour in [0, 1] at a pixel position inside the image.
     pub(crate) fn color(&self, [u, v]: [f64; 2]) -> [f32; 3] {
         let x = (u.max(0.0) as usize).min(self.camera.width - 1);
         let y = (v.max(0.0) as usize).min(self.camera.height - 1);
         self.colors[y * self.camera.width + x].map(|c| f32::from(c) / 255.0)
     }
 
-    /// Whether a pixel position lies inside the picture.
+    /// Whether a pixel position lies inside the image.
     pub(crate) fn holds(&self, [u, v]: [f64; 2]) -> bool {
         (0.0..self.camera.width as f64).contains(&u) && (0.0..self.camera.height as f64).contains(&v)
     }
 }
 
-/// A capture's pictures, sorted by what can be compared.
+/// A capture's images, sorted by what can be compared.
 pub(crate) enum Rigs {
     /// Cameras that do not move, each with its frames in the order of time.
     Fixed(Vec<Vec<usize>>),
@@ -142,12 +142,12 @@ pub(crate) fn spread(count: usize, most: usize) -> impl Iterator<Item = usize> {
     (0..kept).map(move |k| k * count / kept)
 }
 
-/// How often a picture is halved to the size that is worked with.
+/// How often an image is halved to the size that is worked with.
 pub(crate) fn halvings(width: usize, height: usize) -> usize {
     (0..).find(|&k| (width >> k) * (height >> k) <= PIXELS).expect("an image can be halved to nothing")
 }
 
-/// A frame's picture at the size that is worked with, and its camera.
+/// A frame's image at the size that is worked with, and its camera.
 fn load(frames: &dyn Frames, i: usize) -> Result<(Camera, Picture)> {
     let mut picture = Picture::default();
     frames.load(i, &mut picture)?;

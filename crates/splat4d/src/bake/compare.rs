@@ -10,7 +10,7 @@ use crate::render::{Backend, Image, Shot};
 use crate::scene::splats::{SPLAT_COLUMNS, Splats};
 use crate::scene::{Camera, Color, Part, Rows, Table, Time};
 
-/// PSNR where two pictures are the same, dB: rounding to 8 bits alone would give about 59.
+/// PSNR where two images are the same, dB: rounding to 8 bits alone would give about 59.
 const SAME: f64 = 99.0;
 
 /// How like the model the baked scene looks.
@@ -18,11 +18,11 @@ const SAME: f64 = 99.0;
 pub struct Likeness {
     /// PSNR of all pixels together, dB.
     pub psnr: f64,
-    /// The worst picture's PSNR, dB.
+    /// The worst image's PSNR, dB.
     pub worst_psnr: f64,
-    /// Second of the worst picture.
+    /// Second of the worst image.
     pub worst_time: f64,
-    /// Pictures compared.
+    /// Images compared.
     pub pictures: usize,
 }
 

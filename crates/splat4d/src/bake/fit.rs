@@ -305,7 +305,7 @@ pub(super) fn primitive(
 ) -> Primitive {
     let mut sizes = shape.scales;
     sizes.sort_by(f64::total_cmp);
-    // How much of the picture it covers, how strongly, for how long: what is missed most comes first.
+    // How much of the image it covers, how strongly, for how long: what is missed most comes first.
     let importance = (opacity * sizes[2] * sizes[1] * area) as f32;
     Primitive {
         mean,

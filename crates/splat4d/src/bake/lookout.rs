@@ -9,7 +9,7 @@ const MAX_CAMERAS: usize = 32;
 /// A camera counts as no nearer than this share of the median distance to the middle: what drifts before a lens must
 /// not be followed to the hundredth of its own width.
 const NEAREST: f64 = 0.2;
-/// Focal length and distance (in radii of the cloud) where no camera is given: a 1080p picture that the cloud fills.
+/// Focal length and distance (in radii of the cloud) where no camera is given: a 1080p image that the cloud fills.
 const FOCAL: f64 = 1000.0;
 const DISTANCE: f64 = 2.0;
 

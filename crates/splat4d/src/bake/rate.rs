@@ -204,7 +204,7 @@ impl<'a> Sums<'a> {
         };
         let Weight { opacity, color: of_color, .. } = &self.weight;
         let positive = |x: f64| if x > 0.0 { x } else { 0.0 };
-        // What rounding turned negative, or what is no number, costs nothing.
+        // What rounding turned negative, or what is not finite, costs nothing.
         let [mean, cov] = [mean, SHAPE * opacity * cov].map(positive);
         let [alpha, color] = [opacity * alpha, of_color * color].map(positive);
         // Being further off than a Gaussian is wide is no worse.

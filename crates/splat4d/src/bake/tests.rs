@@ -116,7 +116,7 @@ fn a_cross_fade_is_baked_into_opacities() {
     let faded = baked(&scene, &options(0.25));
     let like = likeness(&scene, &faded);
     assert!(like.worst_psnr > 40.0, "{like:?}");
-    // Looked at in the midst of it: without the fade it is another picture.
+    // Looked at in the midst of it: without the fade it is another image.
     scene.layers.iter_mut().for_each(|l| l.cross_fade = [0.0; 2]);
     assert!(likeness(&scene, &faded).worst_psnr < 35.0);
 }

@@ -29,7 +29,7 @@ impl KeptMotion {
         if let Some(Slices { own, speed, floor, ceiling, harmonics, period }) = layer.motion.slices() {
             return Some(known(Moves::Sliced { speed, floor, ceiling, harmonics, period }, [Some(own), None]));
         }
-        // Pictures of several frames, or of a time between two, are the CPU's.
+        // Images of several frames, or of a time between two, are the CPU's.
         let page = layer.motion.pose_table(*times.first()?)?;
         let one = times.iter().all(|t| layer.motion.pose_table(*t) == Some(page));
         one.then(|| match page {

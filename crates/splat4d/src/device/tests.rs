@@ -33,7 +33,7 @@ fn what_only_the_cpu_can_is_done_by_the_cpu() {
     }
 }
 
-/// A device whose driver fails at its second picture, or at the way back from it.
+/// A device whose driver fails at its second image, or at the backward pass from it.
 struct Failing {
     renderer: Renderer<f32>,
     drawn: usize,
@@ -127,7 +127,7 @@ fn training_goes_on_on_the_cpu_with_the_very_gradients() {
     }
 }
 
-/// The renderer of the CPU with a fault in the picture or in the way back.
+/// The renderer of the CPU with a fault in the image or in the backward pass.
 struct Crooked(Renderer<f32>, [f32; 2]);
 
 impl Backend for Crooked {
@@ -278,7 +278,7 @@ impl<F: Real> Scene<F> {
         }
     }
 
-    /// The picture of a backend, if it can draw it.
+    /// The image of a backend, if it can draw it.
     fn drawn(&self, backend: &mut dyn Backend<F>, camera: &Camera, sh_degree: usize, depth: bool) -> Option<Image<F>> {
         let sh = Color::Sh { table: &self.sh, rows: Rows::All, weights: None, base: true };
         // Harmonics in axes of their own, and in the world's.

@@ -15,7 +15,8 @@ use crate::{Error, Result};
 const LOOKS: usize = 8;
 /// Moments of the clip at which neighbours are sought.
 const NEIGHBOUR_LOOKS: usize = 8;
-/// Share of the pictures that have a Gaussian in them in which it must lie on the subject: others may hide it, whose masks
+/// Share of the images that have a Gaussian in them in which it must lie on the subject: others may hide it, whose
+/// masks
 /// then leave it out.
 const ON_SUBJECT: f32 = 0.75;
 
@@ -294,19 +295,19 @@ fn evaluate(expr: &Expr, scene: &Scene<f32>, looks: &Looks, context: &dyn Contex
     })
 }
 
-/// The pixel of a point and its depth, where it lies in the picture.
+/// The pixel of a point and its depth, where it lies in the image.
 fn pixel(camera: &Camera, x: [f64; 3]) -> Option<([usize; 2], f64)> {
     let ([u, v], z) = camera.project(x)?;
     let inside = u >= 0.0 && v >= 0.0 && u < camera.width as f64 && v < camera.height as f64;
     inside.then_some(([u as usize, v as usize], z))
 }
 
-/// Whether a point lies on the white of a mask; none: not in the picture.
+/// Whether a point lies on the white of a mask; none: not in the image.
 fn on(camera: &Camera, mask: &Mask, x: [f64; 3]) -> Option<bool> {
     pixel(camera, x).map(|([u, v], _)| mask.white[v * mask.width + u])
 }
 
-/// Errors unless a mask of this size, [width, height], is one for pictures of `camera`.
+/// Errors unless a mask of this size, [width, height], is one for images of `camera`.
 pub fn mask_fits([width, height]: [usize; 2], camera: &Camera, name: &str) -> Result<()> {
     if [width, height] == [camera.width, camera.height] {
         return Ok(());
@@ -320,7 +321,7 @@ fn fits(mask: &Mask, camera: &Camera, name: &str) -> Result<()> {
     mask_fits([mask.width, mask.height], camera, name)
 }
 
-/// The Gaussians that lie on the subject in most pictures that have masks.
+/// The Gaussians that lie on the subject in most images that have masks.
 fn subject(scene: &Scene<f32>, context: &dyn Context) -> Result<Selected> {
     let views = context.subject()?;
     let mut votes: Vec<Vec<[u32; 2]>> = scene.layers.iter().map(|l| vec![[0; 2]; l.params.len()]).collect();

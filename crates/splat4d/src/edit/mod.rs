@@ -198,7 +198,7 @@ pub enum Step {
         #[serde(default)]
         to: Option<f64>,
     },
-    /// Another scene beside this one.
+    /// Another scene next to this one.
     Merge {
         /// File, as whoever reads the edits finds it.
         scene: String,
@@ -270,7 +270,7 @@ impl Step {
     }
 }
 
-/// A mask picture.
+/// A mask image.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Mask {
     /// Pixels across.
@@ -288,7 +288,7 @@ pub trait Context {
         Err(missing(&format!("camera `{name}`"), "Give a run folder, or a file that brings its cameras along"))
     }
 
-    /// The mask picture of that name, for pictures of `camera`: of another size it need not be decoded.
+    /// The mask image of that name, for images of `camera`: of another size it need not be decoded.
     fn mask(&self, name: &str, _camera: &Camera) -> Result<Mask> {
         Err(missing(&format!("mask `{name}`"), "Give a file that can be read"))
     }

@@ -1,7 +1,7 @@
 //! Selections: what an edit is about, in words that hold for any scene.
 //!
 //! `box(-1,-1,0, 1,1,2) and not color(0,0.6,0, 0.2)`: predicates of places, looks and lives, never row numbers, so that a
-//! selection finds the same thing again after the scene was trained anew. See docs/edit.md for the list.
+//! selection finds the same thing again after the scene was trained again. See docs/edit.md for the list.
 
 use crate::math::quat;
 use crate::math::se3::{mat_vec, sub, transpose};
@@ -23,7 +23,7 @@ pub enum Expr {
     Box([f64; 3], [f64; 3]),
     /// Centre and radius, scene units.
     Sphere([f64; 3], f64),
-    /// In the picture of a camera, and farther than and nearer than so many scene units.
+    /// In the image of a camera, and farther than and nearer than so many scene units.
     Frustum(String, [f64; 2]),
     /// Base colour within a distance of one, 0 to 1.
     Color([f64; 3], f64),
@@ -37,13 +37,13 @@ pub enum Expr {
     Speed(f64, f64),
     /// Name of a layer.
     Layer(String),
-    /// Within what was drawn on a picture.
+    /// Within what was drawn on an image.
     Lasso(Box<Lasso>),
     /// Name of a label.
     Label(String),
     /// Features like those of the Gaussian nearest to a place, scene units: the least cosine between them.
     Like([f64; 3], f64),
-    /// On the white of a mask picture, seen by a camera.
+    /// On the white of a mask image, seen by a camera.
     Mask(String, String),
     /// On the subject, as the capture's masks have it.
     Subject,
@@ -63,10 +63,10 @@ pub enum Expr {
     Not(Box<Expr>),
 }
 
-/// A polygon on a picture, and how far behind it is looked.
+/// A polygon on an image, and how far behind it is looked.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Lasso {
-    /// Where the picture was seen from, scene units.
+    /// Where the image was seen from, scene units.
     pub eye: [f64; 3],
     /// World from camera, wxyz of any length but zero; camera axes are OpenCV's.
     pub turn: [f64; 4],

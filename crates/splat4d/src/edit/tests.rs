@@ -237,7 +237,7 @@ fn labels_are_selected_kept_and_merged() {
 #[test]
 fn masks_are_seen_from_their_camera() {
     let s = walker();
-    // The left half of the picture is white: x < 0 of the camera, which sees the world mirrored in no axis.
+    // The left half of the image is white: x < 0 of the camera, which sees the world mirrored in no axis.
     let white = (0..48 * 64).map(|i| i % 64 < 32).collect::<Vec<_>>();
     let side = front().project([-0.5, 0.0, 0.0]).unwrap().0[0] < 32.0;
     let mask = Mask { width: 64, height: 48, white };
@@ -419,7 +419,7 @@ fn copies_and_parts_are_layers() {
     }
 }
 
-/// An upright rod, and a second one beside it that nobody touches.
+/// An upright rod, and a second one next to it that nobody touches.
 fn rods() -> Scene<f32> {
     let mut params = Params::new(1200, 1, &[]);
     for i in 0..1200 {

@@ -1,4 +1,4 @@
-//! From flow in pictures back to flow in space: one camera with depth, several cameras without; integration over frames
+//! From flow in images back to flow in space: one camera with depth, several cameras without; integration over frames
 //! and how far it drifts.
 //!
 //! One camera cannot tell motion along its rays: with the depth of one frame alone ([`lift_in_plane`]) that part is left
@@ -9,7 +9,7 @@ use crate::scene::Camera;
 
 /// Two points on a pixel ray: the start by its depth z, the end by the flow and its own depth. World, scene units.
 ///
-/// `pixel`, `flow`: pixels in the first and from the first to the second picture.
+/// `pixel`, `flow`: pixels in the first and from the first to the second image.
 pub fn lift(from: &Camera, to: &Camera, pixel: [f64; 2], flow: [f64; 2], depth: f64, depth_to: f64) -> [f64; 3] {
     let a = from.unproject(pixel, depth);
     let b = to.unproject([pixel[0] + flow[0], pixel[1] + flow[1]], depth_to);
@@ -27,7 +27,7 @@ pub fn lift_in_plane(camera: &Camera, pixel: [f64; 2], flow: [f64; 2], depth: f6
 pub struct Sight<'a> {
     /// From where (pinhole, standing still).
     pub camera: &'a Camera,
-    /// The point's flow in its picture, pixels.
+    /// The point's flow in its image, pixels.
     pub flow: [f64; 2],
     /// Confidence, ≥ 0.
     pub weight: f64,

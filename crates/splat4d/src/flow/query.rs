@@ -1,4 +1,4 @@
-//! Points that are asked for and followed: a pixel of a picture, or a place in the world, through all times, with what a
+//! Points that are asked for and followed: a pixel of an image, or a place in the world, through all times, with what a
 //! camera sees of it.
 //!
 //! A pixel belongs to the Gaussians that it shows: the eight heaviest α_i T_i at about the depth of the one at which half of
@@ -66,15 +66,15 @@ impl Followed {
 /// A camera's sight of a point.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sight {
-    /// Pixel position; outside of the picture too.
+    /// Pixel position; outside of the image too.
     pub pixel: [f64; 2],
-    /// Whether it lies in the picture with at least half of the light left before it.
+    /// Whether it lies in the image with at least half of the light left before it.
     pub visible: bool,
 }
 
 /// Follows points to `times`, ascending, forwards and backwards from the time of each query.
 ///
-/// Panics: times that do not rise, or are no numbers.
+/// Panics: times that do not rise, or are not finite.
 pub fn follow(scene: &Scene<f32>, queries: &[Query], times: &[f64]) -> Followed {
     assert!(times.windows(2).all(|w| w[0] < w[1]), "times rise");
     let mut moments: Vec<f64> = times.iter().copied().chain(queries.iter().map(|q| q.time)).collect();
@@ -195,7 +195,7 @@ struct Hit {
     depth: f64,
 }
 
-/// All splats of a picture before any is blended.
+/// All splats of an image before any is blended.
 fn projected(scene: &Scene<f32>, seen: &Seen, camera: &Camera) -> Vec<Projected<f32>> {
     Importance::new(RenderConfig::default()).project(&scene.splats(&seen.evaluation), camera).to_vec()
 }

@@ -13,7 +13,7 @@ const EXACT: f64 = 1e-9;
 /// Flow where the field is not constant under a splat, pixels: the camera comes 8 % nearer, so that the field changes by
 /// .08 px a pixel, and the centre of the splat that a pixel shows may be a pixel aside.
 const UNDER_A_SPLAT: f64 = 0.08;
-/// Edge of the test pictures, pixels.
+/// Edge of the test images, pixels.
 const SIZE: usize = 40;
 
 fn camera(eye: [f64; 3], target: [f64; 3]) -> Camera {
@@ -94,7 +94,7 @@ fn a_moving_camera_over_a_still_wall_is_depth_reprojection() {
     let nearer = camera([0.3, 0.1, 3.7], [0.1, 0.0, 0.0]);
     let flow = render_flow(&scene, shot(&from), shot(&nearer), &mut renderer());
     each_pixel(&flow, |x, y, f| {
-        // The wall ends beyond the picture's edge by less than the splats there reach.
+        // The wall ends beyond the image's edge by less than the splats there reach.
         let inside = (4..SIZE - 4).contains(&x) && (4..SIZE - 4).contains(&y);
         let g = reprojected(&flow, &nearer, x, y);
         let e = (f[0] - g[0]).abs().max((f[1] - g[1]).abs());
@@ -110,7 +110,7 @@ fn a_translating_wall_has_constant_flow_and_velocity() {
         let scene = wall(velocity, life);
         let shot = |t: f64| Shot { t: Time(t), camera: &eye };
         let (from, to) = (0.4, 0.65);
-        // Seen from +z with +y up: x runs right, y runs against the picture's.
+        // Seen from +z with +y up: x runs right, y runs against the image's.
         let scale = eye.intrinsics.fx / 4.0 * (to - from);
         let truth = [velocity[0] * scale, -velocity[1] * scale];
         let forward = render_flow(&scene, shot(from), shot(to), &mut renderer());

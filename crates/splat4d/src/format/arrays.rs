@@ -73,7 +73,7 @@ pub(crate) fn tensors_to_loaded(prefix: &str, file: &SafeTensors<'_>) -> Result<
             .remedy("The file was not written as a scene; export it again"));
         }
         let (rows, row) = (tensor.shape()[0], &tensor.shape()[1..]);
-        // Axes beside an empty one are not bounded by the data: without this check a caller could believe 2^60 rows of
+        // Axes next to an empty one are not bounded by the data: without this check a caller could believe 2^60 rows of
         // no numbers.
         let Some(width) = row.iter().try_fold(1usize, |n, &d| n.checked_mul(d)).filter(|&w| w > 0) else {
             return Err(Error::input(format!("array `{}` has an impossible shape", tensor.name()))

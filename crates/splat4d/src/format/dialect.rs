@@ -77,7 +77,7 @@ impl Default for WriteOptions {
     }
 }
 
-/// Metadata of a .ply, besides its numbers.
+/// Metadata of a .ply, in addition to its numbers.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PlyInfo {
     /// Rows.

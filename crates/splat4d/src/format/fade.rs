@@ -81,7 +81,7 @@ impl Seen {
                 if center - half <= first && center + half >= last {
                     return fade(0.5 * (first + last), FLAT * (last - first).max(1.0));
                 }
-                // A top that is narrow beside its tails is that of a Gaussian.
+                // A top that is narrow next to its tails is that of a Gaussian.
                 (half <= CUT * softness).then(|| fade(center, softness * std::f64::consts::SQRT_2)).flatten()
             }
         }

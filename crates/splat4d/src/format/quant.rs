@@ -53,7 +53,7 @@ pub(crate) fn signed_code(value: f64, most: f64, half: u32) -> u32 {
     coarse_signed_code(value, most, half, 1)
 }
 
-/// As [`signed_code`], but only `half` and what lies multiples of `step`, a power of two, beside it.
+/// As [`signed_code`], but only `half` and what lies multiples of `step`, a power of two, next to it.
 #[inline(always)]
 pub(crate) fn coarse_signed_code(value: f64, most: f64, half: u32, step: u32) -> u32 {
     let share = if most > 0.0 { value / most } else { 0.0 };

@@ -1,4 +1,4 @@
-//! The way back of a picture: records, sums and the projection's VJP on the GPU, colours on the CPU.
+//! The backward pass of an image: records, sums and the projection's VJP on the GPU, colours on the CPU.
 
 use super::buffers::{SPARE, UNIFORM_STRIDE};
 use super::clock::{Recorder, STAGES, TIMES_BYTES};
@@ -30,7 +30,7 @@ const CHUNK: usize = 1024;
 pub(super) struct Returned {
     /// 0: not drawn.
     pub radii: Vec<f32>,
-    /// Of which the CPU's half of the way back looks at the radius alone.
+    /// Of which the CPU's half of the backward pass looks at the radius alone.
     projected: Vec<Projected<f32>>,
     channels: Vec<[f32; CHANNELS]>,
     d_channels: Vec<[f32; CHANNELS]>,
@@ -48,7 +48,7 @@ pub(super) struct Layout {
     all: u64,
 }
 
-/// What a submission of the way back leaves to the CPU.
+/// What a submission of the backward pass leaves to the CPU.
 pub(super) struct Came {
     /// Gradient to the background, by tile.
     pub sums: Vec<f32>,
@@ -75,7 +75,8 @@ pub(super) enum End {
 }
 
 impl GpuRenderer {
-    /// Compiles the kernels of the way back, and draws so that its records have room. Errors: the driver refuses one.
+    /// Compiles the kernels of the backward pass, and draws so that its records have room. Errors: the driver
+    /// refuses one.
     pub fn for_training(&mut self) -> Result<()> {
         // Lists may grow by a share more than they need; behind the records are a few sums.
         let room = super::largest_binding(&self.gpu) / (RECORD_BYTES + 1) * SPARE / (SPARE + 1);
@@ -240,7 +241,8 @@ impl GpuRenderer {
         self.come_back(recorder, (band, pairs), across, end, layout)
     }
 
-    /// The way back of a band whose lists, planes and gradient are at hand after what `recorder` holds, and the reading of
+    /// The backward pass of a band whose lists, planes and gradient are at hand after what `recorder` holds, and the
+    /// reading of
     /// what comes of it. `pairs`: so many at most.
     pub(super) fn come_back(
         &self,
@@ -372,7 +374,7 @@ impl GpuRenderer {
     }
 }
 
-/// The background's gradient of a picture without splats, or without pixels.
+/// The background's gradient of an image without splats, or without pixels.
 fn d_background_of_nothing(color: &Planes<f32>, no_pixels: bool) -> [f32; 3] {
     if no_pixels { [0.0; 3] } else { std::array::from_fn(|c| color.plane(c).iter().sum()) }
 }

@@ -6,11 +6,11 @@ use wgpu::BufferUsages as Usage;
 
 /// Bytes that the smallest buffer has: no binding may be empty.
 const LEAST: u64 = 256;
-/// A buffer that grows gets this share more than it needs, so that a scene that grows slowly does not make it anew
+/// A buffer that grows gets this share more than it needs, so that a scene that grows slowly does not make it again
 /// every frame.
 pub(super) const SPARE: u64 = 4;
 
-/// One buffer, made anew when it must hold more.
+/// One buffer, made again when it must hold more.
 #[derive(Debug)]
 pub(super) struct Grown {
     what: &'static str,
@@ -46,7 +46,7 @@ impl Grown {
         Ok(true)
     }
 
-    /// Makes the buffer anew with `size` bytes.
+    /// Makes the buffer again with `size` bytes.
     fn make(&mut self, gpu: &Gpu, size: u64) -> Result<()> {
         let most = largest_binding(gpu);
         if size > most.next_multiple_of(LEAST) {
@@ -163,7 +163,7 @@ pub(super) struct Buffers {
     pub times: Grown,
     /// Memory that the CPU reads.
     pub staging: Grown,
-    /// The same, of the way back.
+    /// The same, of the backward pass.
     pub back_staging: Grown,
 }
 

@@ -61,7 +61,7 @@ pub struct GpuTimings {
     pub gather: f64,
     /// Projection, backward.
     pub splats_back: f64,
-    /// Comparing the picture with its truth, and the gradient to it.
+    /// Comparing the image with its truth, and the gradient to it.
     pub loss: f64,
     /// Rows to splats, of tables that stay on the GPU.
     pub answer: f64,
@@ -69,13 +69,13 @@ pub struct GpuTimings {
     pub answer_back: f64,
     /// Adam.
     pub adam: f64,
-    /// From the last submission to the picture in the CPU's memory, the GPU's work included.
+    /// From the last submission to the image in the CPU's memory, the GPU's work included.
     pub wait: f64,
     /// The whole call.
     pub total: f64,
-    /// The same of the way back, which adds to the stages above; 0 where there was none.
+    /// The same of the backward pass, which adds to the stages above; 0 where there was none.
     pub back_wait: f64,
-    /// The whole call of the way back.
+    /// The whole call of the backward pass.
     pub back_total: f64,
 }
 

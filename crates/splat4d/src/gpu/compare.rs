@@ -1,4 +1,4 @@
-//! A picture that never leaves the GPU: drawn, compared with its truth and taken back in one submission.
+//! An image that never leaves the GPU: drawn, compared with its truth and taken back in one submission.
 
 use super::back::{Came, End};
 use super::buffers::UNIFORM_STRIDE;
@@ -73,7 +73,7 @@ pub(super) fn means(held: &Held, [l1, ssim, mse]: [f64; 3], d_response: Option<[
 }
 
 impl GpuRenderer {
-    /// Whether a picture of so many splats can be compared at all: its planes are in one piece.
+    /// Whether an image of so many splats can be compared at all: its planes are in one piece.
     pub(super) fn can_compare(&self, splats: usize, [w, h]: [usize; 2]) -> bool {
         let room = largest_binding(&self.gpu) - 4 * UNIFORM_STRIDE;
         let whole = Band { first: 0, rows: h.div_ceil(TILE) };
@@ -165,7 +165,7 @@ impl GpuRenderer {
         self.gpu.queue.write_buffer(self.buffers.uniforms.get(), at, bytemuck::bytes_of(loss));
     }
 
-    /// Buffers of the loss of a picture, of which so many numbers come.
+    /// Buffers of the loss of an image, of which so many numbers come.
     pub(super) fn make_room_for_loss(&mut self, [w, h]: [usize; 2], partials: usize) -> Result<bool> {
         let (gpu, b) = (&self.gpu, &mut self.buffers);
         b.maps.ensure(gpu, (4 * CHANNELS * MAPS * w * h) as u64)?;

@@ -82,7 +82,7 @@ const BAND_BYTES: u64 = 16;
 const BLEND_BYTES: u64 = 48;
 const LOSS_BYTES: u64 = 80;
 
-/// Everything that is bound, made anew when a buffer is.
+/// Everything that is bound, made again when a buffer is.
 #[derive(Debug)]
 pub(super) struct Groups {
     scan_visible: BindGroup,
@@ -301,7 +301,7 @@ impl Frame<'_> {
     }
 }
 
-/// What the way back of a frame runs over.
+/// What the backward pass of a frame runs over.
 #[derive(Clone, Copy)]
 pub(super) struct Back<'a> {
     /// The frame before.
@@ -313,7 +313,8 @@ pub(super) struct Back<'a> {
 }
 
 impl Back<'_> {
-    /// Compares the planes, a whole picture, with a truth, as a camera shows them that responds like one of `responses`, and writes
+    /// Compares the planes, a whole image, with a truth, as a camera shows them that responds like one of
+    /// `responses`, and writes
     /// the gradient to them.
     pub(super) fn loss(
         &self,

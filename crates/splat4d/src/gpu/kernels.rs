@@ -296,7 +296,7 @@ fn rasterize_back(gpu: &Gpu) -> String {
     }
 }
 
-/// The kernels of the loss and of the way back.
+/// The kernels of the loss and of the backward pass.
 #[derive(Debug)]
 pub(super) struct BackKernels {
     /// moments, gradient

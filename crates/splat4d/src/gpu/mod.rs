@@ -52,7 +52,7 @@ use resident::{AHEAD, Flights, Tables as KeptTables};
 use std::time::Instant;
 use upload::Upload;
 
-/// Planes of a picture: red, green, blue, alpha, depth.
+/// Planes of an image: red, green, blue, alpha, depth.
 const PLANES: usize = 5;
 /// An owner's bits from here on are its quadrants (tiles.wgsl).
 const OWNER_SHIFT: u32 = 28;
@@ -70,11 +70,11 @@ const MOST_GROUPS: usize = 65_535;
 pub struct GpuStats {
     /// Splats given.
     pub splats: usize,
-    /// Splats whose box touches the picture.
+    /// Splats whose box touches the image.
     pub visible: usize,
     /// Pairs of 16² tile and splat.
     pub pairs: usize,
-    /// Bands in which the picture was drawn.
+    /// Bands in which the image was drawn.
     pub bands: usize,
 }
 
@@ -83,7 +83,7 @@ pub struct GpuStats {
 pub struct GpuRenderer {
     /// Options; `simd` means nothing here.
     pub config: RenderConfig,
-    /// Whether tables are sent for every picture.
+    /// Whether tables are sent for every image.
     pub tables: Tables,
     /// Source of the stages' times.
     pub clock: StageClock,
@@ -175,7 +175,7 @@ impl GpuRenderer {
         lacks.iter().find(|(wanted, _)| *wanted).map_or(Ok(()), |(_, what)| Err(refusal("the GPU", what)))
     }
 
-    /// Draws all bands of a picture that has pixels.
+    /// Draws all bands of an image that has pixels.
     fn draw_bands(&mut self, shot: &Shot<'_, f32>, out: &mut Out<'_>) -> Result<()> {
         let start = Instant::now();
         let (n, w, h) = (self.stats.splats, shot.camera.width, shot.camera.height);
@@ -329,7 +329,7 @@ impl GpuRenderer {
         self.gpu.check()
     }
 
-    /// Runs a submission and reads its picture, unless there were too many pairs. Returns how many there were.
+    /// Runs a submission and reads its image, unless there were too many pairs. Returns how many there were.
     fn draw(&mut self, band: Band, [width, height]: [usize; 2], project: bool, out: &mut Out<'_>) -> Result<usize> {
         let (gpu, b) = (&self.gpu, &self.buffers);
         let groups = self.groups.as_ref().expect("groups are made before a frame");
@@ -392,7 +392,7 @@ impl Backend<f32> for GpuRenderer {
         Self::refuses(wanted)
     }
 
-    /// Errors besides those of every backend: the scene or the picture is too large for WebGPU's limits.
+    /// Errors in addition to those of every backend: the scene or the image is too large for WebGPU's limits.
     fn render(&mut self, shot: &Shot<'_, f32>, out: &mut Image<f32>) -> Result<()> {
         self.can(&shot.wanted())?;
         let (n, w, h) = (shot.splats.len(), shot.camera.width, shot.camera.height);
@@ -419,7 +419,7 @@ impl Backend<f32> for GpuRenderer {
         Ok(true)
     }
 
-    /// Errors besides: a gradient that is not finite.
+    /// Errors in addition: a gradient that is not finite.
     fn vjp(
         &mut self,
         shot: &Shot<'_, f32>,
@@ -431,7 +431,8 @@ impl Backend<f32> for GpuRenderer {
         self.take_back(shot, grads, d_sh, d)
     }
 
-    /// Errors besides: a gradient that is not finite. `None` besides: the picture must be drawn in bands, or none of its pixels
+    /// Errors in addition: a gradient that is not finite. `None` in addition: the image must be drawn in bands, or
+    /// none of its pixels
     /// counts.
     fn compare(
         &mut self,
@@ -461,28 +462,28 @@ impl Backend<f32> for GpuRenderer {
     }
 }
 
-/// What a submission does besides drawing a band.
+/// What a submission does in addition to drawing a band.
 #[derive(Clone, Copy, Debug, Default)]
 struct Way {
-    /// Of the way back, flags and place of the sums in `Blend`.
+    /// Of the backward pass, flags and place of the sums in `Blend`.
     flags: u32,
     sums_at: u32,
     /// Whether records are added to those of earlier bands.
     further: bool,
-    /// Whether the planes are those of the whole picture, and not of the band.
+    /// Whether the planes are those of the whole image, and not of the band.
     whole: bool,
     /// 1 + the view of a step on tables that stay (scan.wgsl); 0: of none.
     view: u32,
 }
 
-/// Where a picture goes.
+/// Where an image goes.
 enum Out<'a> {
     Planes(&'a mut Image<f32>),
     /// Red, green, blue, alpha of every pixel.
     Bytes(&'a mut [[u8; 4]]),
 }
 
-/// Copies the planes of a band into the picture, from pixel row `first` on; the depth only where it is drawn.
+/// Copies the planes of a band into the image, from pixel row `first` on; the depth only where it is drawn.
 fn read_planes(bytes: &[u8], first: usize, rows: usize, out: &mut Image<f32>) {
     let width = out.alpha.width;
     let Image { color, alpha, depth, .. } = out;
@@ -496,12 +497,12 @@ fn read_planes(bytes: &[u8], first: usize, rows: usize, out: &mut Image<f32>) {
     });
 }
 
-/// Rows of pixels of a band in a picture of `height`.
+/// Rows of pixels of a band in an image of `height`.
 fn pixel_rows(band: Band, height: usize) -> usize {
     (band.rows * TILE).min(height - band.first * TILE)
 }
 
-/// Bytes of a band's planes, rows beyond the picture included.
+/// Bytes of a band's planes, rows beyond the image included.
 fn plane_bytes(band: Band, width: usize) -> u64 {
     (4 * PLANES * width * band.rows * TILE) as u64
 }

@@ -1,4 +1,4 @@
-//! The pictures that are compared with, kept on the GPU within a budget of bytes.
+//! The images that are compared with, kept on the GPU within a budget of bytes.
 
 use super::buffers::Grown;
 use super::device::Gpu;
@@ -8,7 +8,8 @@ use crate::{ErrorKind, Result};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
-/// Bytes of pictures that are kept unless somebody says otherwise: two hundred of 1080p, which cards with 4 GiB have beside a
+/// Bytes of images that are kept unless somebody says otherwise: two hundred of 1080p, which cards with 4 GiB have
+/// next to a
 /// million Gaussians.
 pub(super) const PICTURE_BYTES: u64 = 2 << 30;
 /// Bits of `Loss::flags` in loss.wgsl.
@@ -20,7 +21,7 @@ pub(super) const FLAG_PLANE: u32 = 8;
 const LARGEST: f32 = 255.0;
 const SAME: f32 = 1e-7;
 
-/// A picture on the GPU; another handle to the same memory when it is cloned.
+/// An image on the GPU; another handle to the same memory when it is cloned.
 #[derive(Clone, Debug)]
 pub(super) struct Held {
     /// Its samples, as loss.wgsl reads them.
@@ -35,19 +36,19 @@ pub(super) struct Held {
     stays: bool,
 }
 
-/// Pictures by their number. What fits into the budget stays; what comes later is sent every time.
+/// Images by their number. What fits into the budget stays; what comes later is sent every time.
 #[derive(Debug)]
 pub(super) struct Pictures {
     kept: BTreeMap<usize, Held>,
     bytes: u64,
     /// Most bytes kept; lowered where there is too little memory.
     pub budget: u64,
-    /// Memory of pictures that are not kept, which nobody uses now.
+    /// Memory of images that are not kept, which nobody uses now.
     spare: Vec<Grown>,
     /// Bytes of these and of those in use.
     passing: u64,
     words: Vec<u32>,
-    /// Pictures sent so far.
+    /// Images sent so far.
     pub sent: usize,
 }
 
@@ -63,14 +64,14 @@ impl Pictures {
         self.bytes + self.passing
     }
 
-    /// A picture on the GPU, which is to be [given back](Self::give_back). Errors: not even this one has room.
+    /// An image on the GPU, which is to be [given back](Self::give_back). Errors: not even this one has room.
     pub(super) fn hold(&mut self, gpu: &Gpu, target: &Target<'_, f32>) -> Result<Held> {
         let (size, weighted) = ([target.truth.width, target.truth.height], target.weight.is_some());
         match self.kept.get(&target.picture) {
             Some(held) if held.size == size && (held.flags & FLAG_WEIGHTED != 0) == weighted => {
                 return Ok(held.clone());
             }
-            // Pictures are of another size from here on.
+            // Images are of another size from here on.
             Some(_) => self.forget(),
             None => {}
         }
@@ -104,7 +105,7 @@ impl Pictures {
         Ok(Held { buffer: buffer.get().clone(), flags, weight, size, stays: false })
     }
 
-    /// Takes back a picture that nobody compares with any more.
+    /// Takes back an image that nobody compares with any more.
     pub(super) fn give_back(&mut self, held: Held) {
         if !held.stays {
             self.spare.push(Grown::of("an image's truth", held.buffer));
@@ -130,7 +131,7 @@ fn sample(x: f32) -> Option<u32> {
     ((0.0..=LARGEST).contains(&k) && (k / LARGEST - x).abs() <= SAME).then_some(k as u32)
 }
 
-/// A picture as loss.wgsl reads it: in 8 bits where that is what its samples are, and so its weights. Returns its flags.
+/// An image as loss.wgsl reads it: in 8 bits where that is what its samples are, and so its weights. Returns its flags.
 fn pack(target: &Target<'_, f32>, words: &mut Vec<u32>) -> u32 {
     let (truth, pixels) = (target.truth, target.truth.pixels());
     let packed = |words: &mut Vec<u32>, weight: Option<&Planes<f32>>| {

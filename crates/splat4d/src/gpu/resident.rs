@@ -1,4 +1,5 @@
-//! Tables that stay on the GPU: rows become splats, splats a picture, and its loss steps of Adam, without a number of them
+//! Tables that stay on the GPU: rows become splats, splats an image, and its loss steps of Adam, without a number of
+//! them
 //! passing through the CPU. Densification, files and whatever else looks at a scene fetch the tables, and hand them back.
 //!
 //! Tables of more rows than a binding holds lie in pages of whole blocks, each with buffers and dispatches of its own; every row
@@ -300,7 +301,7 @@ impl KeptPass<'_> {
         self.step.rows != RowWeights::default()
     }
 
-    /// Writes what is asked and by which rules is learnt, of a picture of so many tiles.
+    /// Writes what is asked and by which rules is learnt, of an image of so many tiles.
     fn write_uniforms(&self, gpu: &Gpu, tiles: usize) {
         let Self { tables, step, view } = *self;
         let status = tables.status(step.views.len());

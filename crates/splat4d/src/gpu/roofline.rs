@@ -17,7 +17,7 @@ const RUNS: usize = 4;
 const COPY: u64 = 1 << 28;
 /// Bytes that a workgroup of copy.wgsl copies: 256 threads, four vectors of sixteen bytes each.
 const COPY_GROUP: u64 = 256 * 4 * 16;
-/// Bytes that are sent and read: a picture of 1080p.
+/// Bytes that are sent and read: an image of 1080p.
 const BUS: u64 = 1 << 25;
 /// Copies in one submission at most.
 const MOST_COPIES: usize = 1 << 12;
@@ -99,7 +99,7 @@ impl GpuRenderer {
         Ok(groups * (THREADS * SPLATS) as f64)
     }
 
-    /// Bytes a second that come up, and go down: as tables are sent and pictures are read.
+    /// Bytes a second that come up, and go down: as tables are sent and images are read.
     fn bus(&self) -> Result<[f64; 2]> {
         let data = vec![1u8; BUS as usize];
         let mut on_gpu = Grown::storage("a copy's target");

@@ -1,4 +1,4 @@
-//! Every stage against its twin on the CPU, then whole pictures. Without an adapter each test prints "skipped"; with
+//! Every stage against its twin on the CPU, then whole images. Without an adapter each test prints "skipped"; with
 //! REQUIRE_GPU=1 that is a failure.
 
 mod back;

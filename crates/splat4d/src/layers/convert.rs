@@ -31,9 +31,9 @@ pub(crate) fn with_polynomial<F: Real>(layer: &Layer<F>) -> Result<Cow<'_, Layer
     }
 }
 
-/// A `native4d` layer as a `spacetime` one of order 1 with a `GaussHalf` life: the same picture at every time.
+/// A `native4d` layer as a `spacetime` one of order 1 with a `GaussHalf` life: the same image at every time.
 ///
-/// Errors: the layer moves otherwise; its colours change with time, or it has another life besides its own.
+/// Errors: the layer moves otherwise; its colours change with time, or it has another life in addition to its own.
 pub fn to_spacetime<F: Real>(layer: &Layer<F>) -> Result<Layer<F>> {
     let Spec::Native4d(spec) = layer.motion.spec() else {
         return Err(cannot("this layer is not of the model native4d", "Give one that is"));
@@ -65,7 +65,7 @@ pub fn to_spacetime<F: Real>(layer: &Layer<F>) -> Result<Layer<F>> {
     Ok(Layer { params: p, motion: Arc::new(motion), life: LifeKind::GaussHalf, ..layer.clone() })
 }
 
-/// A `spacetime` layer as a `native4d` one with the given spec (its harmonics start at zero): the same picture at every
+/// A `spacetime` layer as a `native4d` one with the given spec (its harmonics start at zero): the same image at every
 /// time, where the lives are within the spec's bounds.
 ///
 /// Errors: the layer moves otherwise, along curves, turns, or its life is no Gaussian; a spec out of its ranges.

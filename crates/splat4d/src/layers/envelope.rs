@@ -15,7 +15,7 @@ const TASK_ROWS: usize = 8192;
 /// σ, ∂σ/∂t, ∂σ/∂log width and ∂σ/∂log softness of sixteen rows; columns that the life lacks are not read.
 #[inline(always)]
 fn eval<F: Real>(kind: LifeKind, columns: &[Lane<F>; 3], t: Time) -> [Lane<F>; 4] {
-    // The kind is told apart outside of the loop over lanes.
+    // The kind is distinguished outside of the loop over lanes.
     match kind {
         LifeKind::Infinite => eval_lanes(LifeKind::Infinite, columns, t),
         LifeKind::GaussHalf => eval_lanes(LifeKind::GaussHalf, columns, t),

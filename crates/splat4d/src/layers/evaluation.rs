@@ -1,6 +1,7 @@
 //! [`Evaluation`]: the scene at these times, forth and back.
 //!
-//! A motion model wants all questions of a step at once (`prepare`), then answers them one by one (`at`); on the way back it
+//! A motion model wants all questions of a step at once (`prepare`), then answers them one by one (`at`); in the
+//! backward pass it
 //! takes a gradient a question (`backward`) and hears when that was the last one (`finish`). That order is written here,
 //! once, for training, playback, freezing, flow and baking.
 
@@ -51,7 +52,7 @@ impl<F: Real> Evaluation<F> {
         self.spare.append(&mut self.questions);
     }
 
-    /// Asks for rows of a layer at a time, beside those that were asked for already. Returns the question's number.
+    /// Asks for rows of a layer at a time, next to those that were asked for already. Returns the question's number.
     pub fn ask(&mut self, layer: usize, of: Space, rows: Rows<'_>, t: Time) -> usize {
         match self.find(layer, of, t) {
             Some(i) => {
@@ -62,7 +63,8 @@ impl<F: Real> Evaluation<F> {
         }
     }
 
-    /// Asks for the Gaussians of a layer that are alive at t, beside those that were asked for already. `of` is that layer.
+    /// Asks for the Gaussians of a layer that are alive at t, next to those that were asked for already. `of` is
+    /// that layer.
     /// Returns the question's number.
     pub fn ask_active(&mut self, layer: usize, of: &Layer<F>, t: Time) -> usize {
         let i = match self.find(layer, Space::Gaussians, t) {
@@ -113,7 +115,7 @@ impl<F: Real> Evaluation<F> {
         }
     }
 
-    /// Answers all questions: `prepare` once a layer, `at` once a question. Gradients begin anew.
+    /// Answers all questions: `prepare` once a layer, `at` once a question. Gradients begin again.
     pub fn answer(&mut self, layers: &[Layer<F>]) {
         self.caches.resize_with(layers.len(), Default::default);
         for (index, (layer, (cache, d_cache))) in layers.iter().zip(&mut self.caches).enumerate() {

@@ -380,7 +380,7 @@ pub enum Head {
     #[default]
     Identity,
     /// By the network of Spacetime Gaussians, whose weights lie in the first layer that has features. Layers without
-    /// features may stand beside it: theirs count as zero.
+    /// features may stand next to it: theirs count as zero.
     Features,
 }
 

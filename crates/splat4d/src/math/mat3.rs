@@ -62,7 +62,7 @@ pub fn procrustes<F: Real>(cov: [[F; 3]; 3]) -> [[F; 3]; 3] {
 
 /// The unit eigenvector of the largest eigenvalue; the first of equals.
 fn top_eigenvector(a: [[f64; 4]; 4]) -> [f64; 4] {
-    // An entry that rounding cannot see beside both of its diagonal's does not turn anything.
+    // An entry that rounding cannot see next to both of its diagonal's does not turn anything.
     let negligible =
         |x: f64, [p, q]: [f64; 2]| x.abs() <= f64::EPSILON * 0.25 * p.abs().min(q.abs()) || x.abs() < 1e-300;
     let (values, vectors) = jacobi(a, SWEEPS, negligible);

@@ -40,7 +40,7 @@ impl Se3 {
         Self { rotation: mat_mul(&self.rotation, &first.rotation), translation: self.apply(first.translation) }
     }
 
-    /// The pose `cam_from_world` of a camera at `eye` that looks at `target` with `up` upwards in its picture
+    /// The pose `cam_from_world` of a camera at `eye` that looks at `target` with `up` upwards in its image
     /// (OpenCV axes: x right, y down, z forward).
     pub fn look_at(eye: [f64; 3], target: [f64; 3], up: [f64; 3]) -> Self {
         let z = normalize(sub(target, eye));

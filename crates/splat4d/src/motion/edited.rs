@@ -92,7 +92,7 @@ impl Change {
         }
     }
 
-    /// Whether the answer depends on t beside the model's own.
+    /// Whether the answer depends on t next to the model's own.
     fn moves(&self) -> bool {
         match self {
             Change::Clock { .. } | Change::Color { .. } => false,
@@ -593,7 +593,7 @@ impl<F: Real> Motion<F> for Edited<F> {
         own
     }
 
-    /// Places inside a path or a drag are not the world's: only what stands beside them can take a frame in.
+    /// Places inside a path or a drag are not the world's: only what stands next to them can take a frame in.
     fn absorb_frame(&self, p: &mut Params<F>, frame: &Sim3) -> bool {
         match self.change {
             Change::Path { .. } | Change::Drag(_) => false,

@@ -182,7 +182,7 @@ impl<F: Real> Filtered<F> {
         At { t: Time(q.t.0 - frames as f64 * self.spec.frame), ..*q }
     }
 
-    /// How many frames earlier a fused question asks besides t itself.
+    /// How many frames earlier a fused question asks in addition to t itself.
     fn frames(&self) -> impl Iterator<Item = usize> + use<F> {
         let (baseline, history) = (self.spec.baseline, self.spec.history);
         (1..=history + 1 + baseline).filter(move |&k| k <= history + 1 || k > baseline)

@@ -213,7 +213,7 @@ pub trait Motion<F: Real = f32>: Any + Send + Sync {
         None
     }
 
-    /// Bytes that training keeps of one question about `rows` Gaussians until its backward, beside the answer and its
+    /// Bytes that training keeps of one question about `rows` Gaussians until its backward, next to the answer and its
     /// gradient: what an estimate of memory must know.
     fn scratch_bytes(&self, p: &Params<F>, rows: usize) -> u64;
 

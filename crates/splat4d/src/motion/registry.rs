@@ -24,7 +24,7 @@ pub trait Model {
 /// model from outside the library.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Capabilities {
-    /// Something may depend on time, beside the layer's life.
+    /// Something may depend on time, next to the layer's life.
     pub moves: bool,
     /// Gaussians may turn as they move.
     pub rotates: bool,
@@ -105,7 +105,8 @@ impl Polynomial {
     }
 
     /// Moves the centre of a row's life by `shift` seconds and leaves its path and its turning as they are, of every order:
-    /// what it showed at any time it shows still, but for its life. Colours that change with time begin anew at the centre.
+    /// what it showed at any time it shows still, but for its life. Colours that change with time begin again at the
+    /// centre.
     ///
     /// Panics: the layer's Gaussians live for ever.
     pub fn recentre<F: Real>(&self, p: &mut Params<F>, row: usize, shift: f64) {
@@ -143,7 +144,7 @@ macro_rules! registry {
     ) => {
         /// A model as plain data: what files store, and all that [`build`] needs to make it again.
         ///
-        /// Its JSON form is an object whose `model` is the model's name, beside the fields of its spec.
+        /// Its JSON form is an object whose `model` is the model's name, next to the fields of its spec.
         #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
         #[serde(tag = "model")]
         #[non_exhaustive]

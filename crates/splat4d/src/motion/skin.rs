@@ -13,7 +13,7 @@
 //!
 //! Nothing is detached (the reference stops the gradient at x and p inside the blend): finite differences hold for every
 //! table. What is not learnt is which nodes are looked at: every Gaussian has a list of the nearest ones, refreshed by
-//! [`Skinned::bind`] now and then; among them the weights choose anew at every step, continuously.
+//! [`Skinned::bind`] now and then; among them the weights choose again at every step, continuously.
 
 mod blend;
 mod offset;
@@ -405,7 +405,7 @@ impl<F: Real> Motion<F> for Skinned<F> {
         self.trajectory.finish(p, &c.times, &mut c.trajectory, &mut pending.trajectory, d);
     }
 
-    /// Lists name nodes by number: an edit of the nodes makes them anew.
+    /// Lists name nodes by number: an edit of the nodes makes them again.
     fn on_edit(&self, p: &mut Params<F>, edit: &RowEdit, _rng: &Rng) {
         if edit.space == Space::Nodes {
             self.trajectory.on_edit(p, edit);

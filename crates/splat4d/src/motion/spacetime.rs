@@ -39,7 +39,7 @@ pub struct SpacetimeSpec {
     pub features: Option<FeatureSpec>,
 }
 
-/// Features beside the base colour, and the head that reads them.
+/// Features next to the base colour, and the head that reads them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FeatureSpec {

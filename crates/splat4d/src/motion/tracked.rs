@@ -43,7 +43,7 @@ const MAX_MADE: usize = 1 << 28;
 pub struct TrackedSpec {
     /// Seconds of every frame that has been tracked, strictly increasing. Frame 0 is the geometry, the others have pages.
     pub times: Vec<f64>,
-    /// Whether Gaussians have a [`FOREGROUND`] logit: what masks say of them. No picture depends on it.
+    /// Whether Gaussians have a [`FOREGROUND`] logit: what masks say of them. No image depends on it.
     pub foreground: bool,
 }
 

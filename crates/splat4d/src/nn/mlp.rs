@@ -346,7 +346,7 @@ impl Mlp {
         (CHUNK_NUMBERS / self.shape.width.max(1)).clamp(CHUNK_ROWS[0], CHUNK_ROWS[1])
     }
 
-    /// Numbers a row that the hidden layers give, with the input where it stands beside them.
+    /// Numbers a row that the hidden layers give, with the input where it stands next to them.
     fn hidden(&self) -> usize {
         self.maps[1..].iter().map(|m| m.inputs).sum()
     }

@@ -15,18 +15,18 @@ pub struct Wanted {
     pub extra: bool,
     /// A pixel head ([`Splats::head`]).
     pub head: bool,
-    /// The way back ([`Backend::vjp`]).
+    /// The backward pass ([`Backend::vjp`]).
     pub backward: bool,
     /// The comparison with a truth ([`Backend::compare`]).
     pub compare: bool,
 }
 
-/// A picture to draw.
+/// An image to draw.
 #[derive(Clone, Copy, Debug)]
 pub struct Shot<'a, F = f32> {
     /// The scene at one instant.
     pub splats: &'a Splats<'a, F>,
-    /// A pinhole; its size is the picture's.
+    /// A pinhole; its size is the image's.
     pub camera: &'a Camera,
     /// Colour behind the scene.
     pub background: [F; 3],
@@ -53,7 +53,7 @@ impl<'a, F: Real> Shot<'a, F> {
 /// Whether a scene's tables change between renders.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Tables {
-    /// Everything is sent to a device for every picture.
+    /// Everything is sent to a device for every image.
     Changing,
     /// A layer's own SH table ([`crate::scene::Color::Sh`] with `base`) that lies at the same address and has the same
     /// size as in the last render is the same table, and is not sent again: right for a scene that is played, wrong
@@ -61,15 +61,15 @@ pub enum Tables {
     Constant,
 }
 
-/// Draws splats and takes gradients back; memory is reused from picture to picture.
+/// Draws splats and takes gradients back; memory is reused from image to image.
 pub trait Backend<F: Real = f32>: Send {
     /// Whether it has these abilities. Errors: it lacks one; the message names it and says what can.
     fn can(&self, wanted: &Wanted) -> Result<()>;
 
-    /// Draws into `out`, which is resized to the camera's picture. Rows that are NaN, infinite, behind the camera or
+    /// Draws into `out`, which is resized to the camera's image. Rows that are NaN, infinite, behind the camera or
     /// transparent are not drawn.
     ///
-    /// Errors: what [`can`](Self::can) refuses; a picture too large for the device; a driver that failed. `out` means
+    /// Errors: what [`can`](Self::can) refuses; an image too large for the device; a driver that failed. `out` means
     /// nothing then. Panics: `extra` has not one row a splat.
     fn render(&mut self, shot: &Shot<'_, F>, out: &mut Image<F>) -> Result<()>;
 
@@ -95,10 +95,11 @@ pub trait Backend<F: Real = f32>: Send {
         d: &mut RenderGrads<F>,
     ) -> Result<()>;
 
-    /// Draws, compares with the truth and takes the gradient of that loss back, without the picture ever leaving the device.
+    /// Draws, compares with the truth and takes the gradient of that loss back, without the image ever leaving the
+    /// device.
     /// Targets, overwritten and added to, as of [`vjp`](Self::vjp). `None`: it cannot, and nothing was done.
     ///
-    /// Errors: as of `render`. Panics: the truth has another size than the camera's picture.
+    /// Errors: as of `render`. Panics: the truth has another size than the camera's image.
     fn compare(
         &mut self,
         shot: &Shot<'_, F>,

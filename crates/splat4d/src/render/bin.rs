@@ -1,4 +1,4 @@
-//! Lists of the splats that touch each 32² bin of the picture, nearest first.
+//! Lists of the splats that touch each 32² bin of the image, nearest first.
 //!
 //! A deterministic two-pass count over fixed chunks of splats, then one sort a bin: a bin's keys stay in cache, where a
 //! global sort would scatter. Order inside a bin is (depth, number of the splat).
@@ -20,7 +20,7 @@ pub(super) const MASK_SIDE: usize = 8;
 /// Set in a footprint's first column: it is a rectangle larger than a mask.
 const LARGE: u16 = 1 << 15;
 
-/// Pairs of bin and splat that are held at once. A picture with more is drawn in runs of bins, each of at most this
+/// Pairs of bin and splat that are held at once. An image with more is drawn in runs of bins, each of at most this
 /// many pairs (or a single bin, whose pairs are at most the splats). A pair holds about 130 bytes in f32 with
 /// gradients, so this is about 2 GiB; ordinary scenes of a million splats have a fifth of it.
 pub(crate) const PAIR_BUDGET: usize = 1 << 24;
@@ -111,7 +111,7 @@ impl Footprint {
         }
     }
 
-    /// The numbers of all touched bins of a picture.
+    /// The numbers of all touched bins of an image.
     #[cfg(test)]
     pub(super) fn numbers(&self, across: usize, down: usize) -> Vec<usize> {
         let (mut all, mut out) = ((0..across * down).collect::<Vec<usize>>(), Vec::new());
@@ -258,7 +258,7 @@ fn by_digits<const BITS: u32, const SIZE: usize>(staged: &[AtomicU64], scratch: 
 }
 
 impl Bins {
-    /// Divides a picture of `width` x `height` into runs of bins of at most `budget` pairs each, and makes the lists
+    /// Divides an image of `width` x `height` into runs of bins of at most `budget` pairs each, and makes the lists
     /// of the first.
     pub(crate) fn prepare(&mut self, footprints: &[Footprint], width: usize, height: usize, budget: usize) {
         assert!(u32::try_from(footprints.len()).is_ok(), "a key holds the number of a splat in 32 bits");

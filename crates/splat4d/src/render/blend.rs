@@ -1,4 +1,4 @@
-//! Blending one bin of 32² pixels, and the way back.
+//! Blending one bin of 32² pixels, and the backward pass.
 //!
 //! Its 16 tiles of 8² pixels stay in cache while a batch of splats passes: for each tile the batch's bit map says which
 //! splats can touch it, and for each of these its rows of pixels go through one loop over eight lanes.
@@ -7,7 +7,7 @@
 //! T_min. Source: Kerbl et al. 2023; gradients are 0 where α is at its ceiling, as in gsplat.
 //!
 //! Backward walks in the same order as forward, so that it meets the same α, T and stops: what lies behind a splat is
-//! what the picture holds less what has passed (as in Taming 3DGS, Mallick et al. 2024). It needs no record of the
+//! what the image holds less what has passed (as in Taming 3DGS, Mallick et al. 2024). It needs no record of the
 //! last splat of a pixel, which would cost the forward pass two memory accesses a pixel and splat.
 
 #[cfg(test)]
@@ -26,7 +26,7 @@ pub(super) const BATCH: usize = 64;
 const GROUP: usize = 16;
 /// Splats between two tests whether all pixels of a tile have stopped.
 const EXIT_EVERY: usize = 16;
-/// The smallest T that is told from 0: the way back divides by it.
+/// The smallest T that is told from 0: the backward pass divides by it.
 const T_FLOOR: f64 = 1e-30;
 
 /// Lanes of a strip where a register holds one row of pixels, and where it holds two.
@@ -236,7 +236,7 @@ pub(super) fn pass<F: Real>(t: F, alpha: F, limits: &Limits<F>) -> (F, F, bool) 
 pub(super) struct Blend<'a, F> {
     pub records: &'a [Record<F>],
     pub tiles: &'a mut [Tile<F>],
-    /// Pixels from the bin's corner to the picture's right and lower ends.
+    /// Pixels from the bin's corner to the image's right and lower ends.
     pub inside: [usize; 2],
     pub limits: Limits<F>,
 }
@@ -261,7 +261,7 @@ impl<F: Real> Blend<'_, F> {
     }
 }
 
-/// Tiles before the first splat; bit t of the result: tile t lies in the picture.
+/// Tiles before the first splat; bit t of the result: tile t lies in the image.
 #[inline(always)]
 pub(super) fn begin<F: Real>(tiles: &mut [Tile<F>], inside: [usize; 2]) -> u32 {
     let mut open = 0;
@@ -270,7 +270,7 @@ pub(super) fn begin<F: Real>(tiles: &mut [Tile<F>], inside: [usize; 2]) -> u32 {
         let ny = inside[1].saturating_sub(t / SIDE * TILE);
         *tile = Tile { t: [F::ONE; TILE * TILE], ..Tile::default() };
         if nx < TILE || ny < TILE {
-            // Pixels outside the picture have stopped from the start.
+            // Pixels outside the image have stopped from the start.
             for (y, row) in tile.t.chunks_mut(TILE).enumerate() {
                 row[if y < ny { nx.min(TILE) } else { 0 }..].fill(-F::ONE);
             }
@@ -352,7 +352,7 @@ const ABS: usize = LIGHT + CHANNELS;
 /// Numbers in a record.
 const NUMBERS: usize = ABS + 2;
 
-/// Gradients to the picture of one pass; `None` is zero.
+/// Gradients to the image of one pass; `None` is zero.
 #[derive(Clone, Copy, Debug)]
 pub struct PixelGrads<'a, F = f32> {
     /// To the channels with background, [height, width] each.
@@ -421,7 +421,7 @@ pub(super) struct Backward<'a, F> {
     pub background: [F; CHANNELS],
     /// The bin's first pixel.
     pub corner: [usize; 2],
-    /// The picture's width and height.
+    /// The image's width and height.
     pub size: [usize; 2],
     pub limits: Limits<F>,
     /// Whether absolute gradients are wanted.
@@ -442,7 +442,7 @@ impl<F: Real> Kernel for Backward<'_, F> {
     }
 }
 
-/// State of the way back in the pixels of a tile.
+/// State of the backward pass in the pixels of a tile.
 #[repr(C, align(64))]
 #[derive(Clone, Copy)]
 struct Back<F> {
@@ -512,7 +512,7 @@ impl<F: Real> Backward<'_, F> {
     }
 }
 
-/// The way back through the tiles.
+/// The backward pass through the tiles.
 struct Returning<'a, F, const N: usize, const WITH_ABS: bool> {
     backs: &'a mut [Back<F>; TILES],
     limits: Limits<F>,

@@ -11,7 +11,7 @@ use rayon::prelude::*;
 /// Pairs of a pixel and a splat.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct PairCounts {
-    /// That the blend loop evaluates, lanes outside the picture and pixels that have stopped included.
+    /// That the blend loop evaluates, lanes outside the image and pixels that have stopped included.
     pub tested: usize,
     /// Of these: whose α reaches the cut-off before the pixel stops. No blend could do with fewer.
     pub contributing: usize,
@@ -89,7 +89,7 @@ mod tests {
         }
         let splats = Splats { parts: vec![Part::new(&out, Color::Direct { table: &colors })], head: None };
         let pose = Se3::look_at([0.0, 0.0, -4.0], [0.0; 3], [0.0, -1.0, 0.0]);
-        // Odd sizes: tiles and bins that the picture's edges cut.
+        // Odd sizes: tiles and bins that the image's edges cut.
         let camera = Camera::with_fov_y(pose, 0.5, 77, 61);
         let config = RenderConfig { simd: Simd::Scalar, ..RenderConfig::default() };
         let mut renderer = Renderer::new(config);

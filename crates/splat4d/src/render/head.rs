@@ -16,7 +16,8 @@ use crate::scene::{BLOCK, Camera, Color, HeadGrads, HeadWeights, Planes, Splats,
 use crate::simd::each;
 use rayon::prelude::*;
 
-/// Logits are straight lines beyond this distance from 0 and 1: one step of 8 bits. A picture can then be white, and has a
+/// Logits are straight lines beyond this distance from 0 and 1: one step of 8 bits. An image can then be white, and
+/// has a
 /// gradient even there.
 pub(super) const NEAREST: f64 = 1.0 / 255.0;
 /// Rows of pixels that are one task; sums over tasks are made in their order.
@@ -29,7 +30,7 @@ const SUMS: usize = HIDDEN * (FURTHER + 3) + HIDDEN + 3 * HIDDEN + 3;
 
 type Lane<F> = [F; BLOCK];
 
-/// Record of a picture with a head for its way back; all memory is reused.
+/// Record of an image with a head for its way back; all memory is reused.
 #[derive(Debug, Default)]
 pub(super) struct Headed<F> {
     /// Further channels of every splat, the head's and then the caller's, [splats, 6 + C].
@@ -132,7 +133,7 @@ impl<F: Real> Headed<F> {
 }
 
 impl<F: Real> Renderer<F> {
-    /// The way back of a picture that a head made; see [`Renderer::backward`].
+    /// The backward pass of an image that a head made; see [`Renderer::backward`].
     pub(super) fn backward_headed(
         &mut self,
         head: HeadWeights<'_, F>,
@@ -193,7 +194,7 @@ fn part<F>(plane: &[F], task: usize, chunk: usize) -> &[F] {
     &plane[task * chunk..plane.len().min((task + 1) * chunk)]
 }
 
-/// The network with what is the same for all pixels of a picture.
+/// The network with what is the same for all pixels of an image.
 struct Net<F> {
     first: [[F; INPUTS]; HIDDEN],
     second: [[F; HIDDEN]; 3],

@@ -1,11 +1,12 @@
-//! The importance of each splat to a picture, in three scores that one walk as forward's sums over the pixels.
+//! The importance of each splat to an image, in three scores that one walk as forward's sums over the pixels.
 //!
 //! *Contribution*: Σ over pixels of α_i T_i, T_i = Π_{j<i} (1 − α_j): the gradient of a channel's sum to that channel, which
-//! the way back would compute together with eleven other numbers. *Removal*: the change that it makes to be without the
+//! the backward pass would compute together with eleven other numbers. *Removal*: the change that it makes to be
+//! without the
 //! splat, Σ over pixels and channels of (α_i T_i (b_i − c_i))², b_i the colour of all that lies behind: exact for one splat
 //! alone (pixels that had stopped stay stopped). A splat before others of its colour contributes much and changes little.
 //!
-//! *Sensitivity*: how strongly the picture answers to a splat. A pixel's channels depend on its shape through ln α alone,
+//! *Sensitivity*: how strongly the image answers to a splat. A pixel's channels depend on its shape through ln α alone,
 //! with the slope v_c = αT(c − b), and ln α = ln o − ½ dᵀ Q d, d = μ − p, Q the conic. Its gradient to (μ, Q) is a polynomial
 //! s(d) of second degree, so that Σ over pixels and channels of the products of gradients is known from the moments
 //! Σ_p (Σ_c v_c²) dx^i dy^j of degree 2 to 4: twelve sums a splat, exact. Slow and clear: it is meant for scores, not for
@@ -36,7 +37,7 @@ const POWERS: [[usize; 2]; 12] =
 /// The moments, and Σ of (Σ_c v_c²)/α².
 const MOMENTS: usize = POWERS.len() + 1;
 
-/// The answer of a picture to changes of one splat.
+/// The answer of an image to changes of one splat.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Sensitivity {
     /// Upper triangle, row by row, of the 6x6 block Σ over pixels and channels of ∇I ∇Iᵀ with respect to the mean (3, world) and
@@ -93,9 +94,10 @@ impl Importance {
 }
 
 impl<F: Real> Renderer<F> {
-    /// Σ over pixels of α_i Π_{j<i} (1 − α_j) of every splat: how much of the picture it is. No colour is looked at.
+    /// Σ over pixels of α_i Π_{j<i} (1 − α_j) of every splat: how much of the image it is. No colour is looked at.
     ///
-    /// `out` is overwritten, one a splat; exactly 0 where no pixel shows it. Draws no picture; no backward may follow. Costs
+    /// `out` is overwritten, one a splat; exactly 0 where no pixel shows it. Draws no image; no backward may follow.
+    /// Costs
     /// less than a render's blend. Source: the significance of LightGaussian (Fan et al. 2024) and the spatial score of
     /// 4DGS-1K (Yuan et al. 2025).
     pub fn contributions(&mut self, splats: &Splats<'_, F>, camera: &Camera, out: &mut Vec<F>) {
@@ -108,18 +110,21 @@ impl<F: Real> Renderer<F> {
         self.score_all::<Contribution>(None, out);
     }
 
-    /// Σ over pixels and channels of the squared change that a splat's removal would make to the picture, one a splat, exact
+    /// Σ over pixels and channels of the squared change that a splat's removal would make to the image, one a splat,
+    /// exact
     /// for each alone.
     ///
-    /// Neither head nor further channels are looked at: it is the base colours' picture that changes. `out` is overwritten,
+    /// Neither head nor further channels are looked at: it is the base colours' image that changes. `out` is
+    /// overwritten,
     /// one a splat. Draws by itself; no backward may follow.
     pub fn removals(&mut self, shot: &Shot<'_, F>, out: &mut Vec<F>) {
         self.list_and_blend(shot);
         self.score_all::<Removal>(Some(shot.background), out);
     }
 
-    /// The strength of the picture's answer to each splat: exact sums over its pixels, for splats that stay in front of and
-    /// behind the same others. Neither head nor further channels are looked at: the picture is that of the base colours.
+    /// The strength of the image's answer to each splat: exact sums over its pixels, for splats that stay in front
+    /// of and
+    /// behind the same others. Neither head nor further channels are looked at: the image is that of the base colours.
     ///
     /// `out` is overwritten, one a splat; zeros where no pixel shows it. Draws by itself; no backward may follow.
     pub fn sensitivities(&mut self, shot: &Shot<'_, F>, out: &mut Vec<Sensitivity>) {
@@ -170,7 +175,7 @@ impl<F: Real> Renderer<F> {
         self.raster.score::<S, 1, _>(&pass, out, |sum, pair| *sum += pair[0]);
     }
 
-    /// Lists, colours and blends what a picture shows.
+    /// Lists, colours and blends what an image shows.
     fn list_and_blend(&mut self, shot: &Shot<'_, F>) -> View<F> {
         let view = self.list(shot.splats, shot.camera);
         self.channels.resize(shot.splats.len(), [F::ZERO; CHANNELS]);
@@ -191,7 +196,7 @@ impl<F: Real> Renderer<F> {
     fn list(&mut self, splats: &Splats<'_, F>, camera: &Camera) -> View<F> {
         let (n, simd) = (splats.len(), self.config.simd);
         let view = View::new(camera, &self.config);
-        // A picture of another size than any: a backward is refused.
+        // An image of another size than any: a backward is refused.
         self.size = [0; 2];
         self.projected.resize(n, Projected::default());
         self.footprints.resize(n, Default::default());
@@ -284,7 +289,7 @@ trait Score<F, const NUMBERS: usize>: Sync {
     fn of(pixel: &Pixel<F>) -> [F; NUMBERS];
 }
 
-/// The share of the picture.
+/// The share of the image.
 struct Contribution;
 
 impl<F: Real> Score<F, 1> for Contribution {
@@ -342,7 +347,7 @@ struct Walk<'a, F, S, const NUMBERS: usize> {
     /// As the blend left them.
     tiles: &'a [Tile<F>],
     background: [F; CHANNELS],
-    /// Pixels from the bin's corner to the picture's right and lower ends.
+    /// Pixels from the bin's corner to the image's right and lower ends.
     inside: [usize; 2],
     limits: Limits<F>,
     /// One a record; those that no pixel meets are not written.

@@ -77,7 +77,7 @@ pub struct RenderConfig {
     pub low_pass: f64,
     /// Compensation for the low-pass.
     pub antialias: Antialias,
-    /// Whether the way back sums absolute gradients ([`RenderGrads::mean2d_abs`]).
+    /// Whether the backward pass sums absolute gradients ([`RenderGrads::mean2d_abs`]).
     pub abs_grads: bool,
     /// Instructions to use; lowered to what the machine has.
     pub simd: Simd,
@@ -110,7 +110,7 @@ impl Default for RenderConfig {
     }
 }
 
-/// A rendered picture.
+/// A rendered image.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Image<F = f32> {
     /// Red, green, blue over the background, not clamped, after the head where there is one, [3, h, w].
@@ -134,7 +134,7 @@ impl<F: Real> Image<F> {
     }
 }
 
-/// Gradients to a picture; `None` is zero.
+/// Gradients to an image; `None` is zero.
 #[derive(Clone, Copy, Debug)]
 pub struct ImageGrads<'a, F = f32> {
     /// To colour, [3, h, w].
@@ -185,7 +185,7 @@ pub struct RenderGrads<F = f32> {
 pub struct RenderStats {
     /// Splats given.
     pub splats: usize,
-    /// Splats that touch the picture.
+    /// Splats that touch the image.
     pub visible: usize,
     /// Pairs of bin and splat.
     pub pairs: usize,
@@ -200,7 +200,7 @@ pub struct StageSeconds {
     pub shade: f64,
     /// Lists, sort and records.
     pub bin: f64,
-    /// Blending, all passes, with the writing of the picture.
+    /// Blending, all passes, with the writing of the image.
     pub blend: f64,
     /// Blending backward, all passes, with the sums per splat.
     pub blend_backward: f64,
@@ -208,7 +208,7 @@ pub struct StageSeconds {
     pub splats_backward: f64,
 }
 
-/// Draws splats and keeps what the way back needs. All memory is reused from call to call.
+/// Draws splats and keeps what the backward pass needs. All memory is reused from call to call.
 #[derive(Debug)]
 pub struct Renderer<F = f32> {
     /// Options; may be changed between renders, not between a render and its backward.

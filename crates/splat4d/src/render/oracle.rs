@@ -1,4 +1,4 @@
-//! The definition of a picture: plain loops in f64, every splat against every pixel, matrices written out.
+//! The definition of an image: plain loops in f64, every splat against every pixel, matrices written out.
 //!
 //! Shares no code with the fast path but the spherical-harmonics constants. For tests, goldens and doubts.
 
@@ -107,7 +107,7 @@ fn blob<F: Real>(part: &Part<'_, F>, j: usize, id: usize, shot: &Shot<'_, F>, co
     if p[2] <= camera.near {
         return None;
     }
-    // J, with x/z and y/z held inside the picture and its margin.
+    // J, with x/z and y/z held inside the image and its margin.
     let (w, h) = (camera.width as f64, camera.height as f64);
     let (mx, my) = (MARGIN * 0.5 * w / k.fx, MARGIN * 0.5 * h / k.fy);
     let u = (p[0] / p[2]).max(-k.cx / k.fx - mx).min((w - k.cx) / k.fx + mx);
@@ -167,7 +167,7 @@ fn color<F: Real>(part: &Part<'_, F>, j: usize, direction: [f64; 3], degree: usi
     }
 }
 
-/// Channels of a splat that a head sees besides its colour.
+/// Channels of a splat that a head sees in addition to its colour.
 fn further<F: Real>(part: &Part<'_, F>, j: usize) -> [f64; FURTHER] {
     match part.color {
         Color::Direct { table } if table.width() == FEATURES => table.read::<FURTHER>(j, BASE).map(F::f64),

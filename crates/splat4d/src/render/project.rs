@@ -15,7 +15,7 @@ use rayon::prelude::*;
 #[cfg(test)]
 mod tests;
 
-/// x/z inside J may leave the picture by this share of its half-width's tangent (Inria, gsplat).
+/// x/z inside J may leave the image by this share of its half-width's tangent (Inria, gsplat).
 const J_MARGIN: f64 = 0.3;
 /// Least compensation ρ of the antialiased mode (gsplat).
 const RHO_MIN: f64 = 0.005;
@@ -52,8 +52,9 @@ pub struct Projected<F = f32> {
 }
 
 impl<F: Real> Projected<F> {
-    /// About how many pixels of a picture of this size (width, height) it may touch: its ellipse's area, times the share of
-    /// the ellipse's box that lies in the picture. 0: culled.
+    /// About how many pixels of an image of this size (width, height) it may touch: its ellipse's area, times the
+    /// share of
+    /// the ellipse's box that lies in the image. 0: culled.
     pub fn pixels(&self, size: [usize; 2]) -> f64 {
         if self.radius <= F::ZERO {
             return 0.0;
@@ -581,7 +582,7 @@ pub(crate) fn reshape<F: Real>(table: &mut Table<F>, like: &Table<F>) {
     }
 }
 
-/// First and last column and row of bins with pixels whose centres are in the box of the ellipse and in the picture,
+/// First and last column and row of bins with pixels whose centres are in the box of the ellipse and in the image,
 /// and whether there are any.
 #[inline(always)]
 fn bin_range<F: Real>(p: &Projected<F>, view: &View<F>) -> ([i32; 4], bool) {
@@ -601,7 +602,7 @@ fn bin_range<F: Real>(p: &Projected<F>, view: &View<F>) -> ([i32; 4], bool) {
 }
 
 impl Footprint {
-    /// The bins that hold a pixel centre inside the cut-off ellipse of `p` in the picture of `view`.
+    /// The bins that hold a pixel centre inside the cut-off ellipse of `p` in the image of `view`.
     pub fn new<F: Real>(p: &Projected<F>, view: &View<F>) -> Self {
         let (bins, met) = bin_range(p, view);
         if met { Self::of_bins(p, bins, view) } else { Self::default() }
@@ -619,7 +620,7 @@ impl Footprint {
         let columns = u64::from(u8::MAX) >> (MASK_SIDE - 1 - right);
         let rows = FIRST_COLUMN >> (MASK_SIDE * (MASK_SIDE - 1 - lower));
         let mut mask = columns * rows;
-        // A connected ellipse meets every bin of a single row or column of its own box. Where the picture's edge has cut
+        // A connected ellipse meets every bin of a single row or column of its own box. Where the image's edge has cut
         // the box, a bin too many does no harm.
         if right.min(lower) > 0 {
             mask &= met_bins(p, [x0, y0], lower, view);

@@ -1,4 +1,4 @@
-//! Rasterises sorted splats, a few channels at a time, and the way back.
+//! Rasterises sorted splats, a few channels at a time, and the backward pass.
 //!
 //! A bin of 32² pixels is one task: its splats are gathered once into records (`gather.rs`), which pass through
 //! its tiles front to back (`blend.rs`). Any number of channels is any number of passes over the same projection.
@@ -75,7 +75,7 @@ pub struct Raster<F = f32> {
 }
 
 impl<F: Real> Raster<F> {
-    /// Bins, sorts and gathers the splats of a picture of `width` x `height`.
+    /// Bins, sorts and gathers the splats of an image of `width` x `height`.
     pub fn prepare(
         &mut self,
         projected: &[Projected<F>],
@@ -171,7 +171,7 @@ impl<F: Real> Raster<F> {
     }
 
     /// Calls `f(tile, row of the tile, its pixels)` for all that lies in one band of bins, which has `count` pixels; a
-    /// row that the picture's edge cuts has fewer pixels than the tile's.
+    /// row that the image's edge cuts has fewer pixels than the tile's.
     #[inline(always)]
     fn each_row(&self, band: usize, count: usize, mut f: impl FnMut(&Tile<F>, Range<usize>, Range<usize>)) {
         let (w, across) = (self.width, self.bins.across);

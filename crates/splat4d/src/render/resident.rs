@@ -154,7 +154,7 @@ pub struct KeptRule {
     pub floor: Option<(usize, f64)>,
 }
 
-/// One picture of a step.
+/// One image of a step.
 #[derive(Clone, Copy, Debug)]
 pub struct KeptView<'a> {
     /// From where.
@@ -172,7 +172,7 @@ pub struct KeptView<'a> {
 /// All that a step is of.
 #[derive(Clone, Copy, Debug)]
 pub struct KeptStep<'a> {
-    /// Pictures, one after the other.
+    /// Images, one after the other.
     pub views: &'a [KeptView<'a>],
     /// Highest degree of spherical harmonics.
     pub sh_degree: usize,
@@ -226,7 +226,8 @@ pub trait Resident {
         corrections: &[[f32; 2]],
     ) -> Result<()>;
 
-    /// Begins a step. Returns the results of steps that are done; `None`: a picture is too large to be compared in one piece, or no
+    /// Begins a step. Returns the results of steps that are done; `None`: an image is too large to be compared in
+    /// one piece, or no
     /// pixel of it counts, and nothing was begun.
     ///
     /// Errors: the device failed, and nothing kept is to be trusted. Panics: nothing is kept.

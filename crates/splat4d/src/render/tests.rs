@@ -181,7 +181,7 @@ fn f32_equals_the_oracle() {
     }
 }
 
-/// A random linear loss of the picture, and its gradient planes.
+/// A random linear loss of the image, and its gradient planes.
 struct Loss {
     color: Planes<f64>,
     alpha: Planes<f64>,
@@ -246,7 +246,7 @@ fn nudge(k: usize, h: f64) -> Se3 {
 
 #[test]
 fn every_gradient_equals_finite_differences() {
-    // Wide splats beside the picture put some x/z at J's clamp.
+    // Wide splats next to the image put some x/z at J's clamp.
     for (antialias, size, n) in [(Antialias::Off, 0.15, 12), (Antialias::On, 0.04, 12), (Antialias::Off, 0.5, 5)] {
         let mut s = scene(21, n, size);
         s.outs[1].write(0, 0, [4.0, 0.3, -1.0]);
@@ -529,7 +529,7 @@ fn threads_change_no_bit() {
 
 #[test]
 fn a_render_of_too_many_pairs_is_split_into_runs_of_bins() {
-    // Wide and small splats, on a picture of more than 8 bins across.
+    // Wide and small splats, on an image of more than 8 bins across.
     for (size, (w, h)) in [(0.8, (300, 100)), (0.05, (150, 131))] {
         let s = scene(17, 40, size);
         let view = camera(w, h);
@@ -578,7 +578,7 @@ fn instruction_levels_agree() {
 fn contributions_are_the_oracles_and_sum_to_alpha() {
     let mut s = scene(8, 50, 0.1);
     let n = s.splats().len();
-    // A channel of its own for every splat, white there alone: the oracle's pictures of these channels are the answer.
+    // A channel of its own for every splat, white there alone: the oracle's images of these channels are the answer.
     s.extra = Table::new(&[("own", n)], n);
     (0..n).for_each(|j| s.extra.set(j, j, 1.0));
     let view = camera(75, 41);
@@ -596,7 +596,7 @@ fn contributions_are_the_oracles_and_sum_to_alpha() {
     assert!((a - b).abs() < 1e-9 * b && b > 100.0, "{a} {b}");
     assert!(share.contains(&0.0), "some are hidden or outside");
 
-    // Without a picture, and a run of bins at a time: the same bits.
+    // Without an image, and a run of bins at a time: the same bits.
     let mut again = Vec::new();
     let mut blind = Renderer::new(complete());
     blind.contributions(&s.splats(), &view, &mut again);
@@ -655,7 +655,7 @@ fn removals_are_what_an_image_loses_with_each_splat() {
     assert!(changes > 20, "{changes} splats matter");
 }
 
-/// Brute force: the oracle's picture with each mean and standard deviation moved, and with each opacity.
+/// Brute force: the oracle's image with each mean and standard deviation moved, and with each opacity.
 #[test]
 fn sensitivities_are_sums_of_squared_differences() {
     let mut s = scene(12, 4, 0.15);
@@ -731,7 +731,8 @@ fn sensitivities_are_sums_of_squared_differences() {
     assert!(strong > 6, "{strong} splats matter");
 }
 
-/// Precision of f32 on the way back: behind many opaque splats, what is still to come is a small difference of large sums.
+/// Precision of f32 in the backward pass: behind many opaque splats, what is still to come is a small difference of
+/// large sums.
 #[test]
 fn f32_gradients_are_those_of_f64() {
     let mut s = scene(9, 150, 0.12);

@@ -149,7 +149,7 @@ pub struct Camera {
     pub cam_from_world: Se3,
     /// Focal lengths and principal point.
     pub intrinsics: Intrinsics,
-    /// Lens distortion of the original picture.
+    /// Lens distortion of the original image.
     pub lens: Lens,
     /// Pixels across.
     pub width: usize,

@@ -1,4 +1,5 @@
-//! Feature channels: numbers of a Gaussian that pictures of features have taught it (what a network sees in a picture, or any
+//! Feature channels: numbers of a Gaussian that images of features have taught it (what a network sees in an image,
+//! or any
 //! other numbers a pixel), in a table of the layer that follows every edit of rows.
 
 use super::{Key, Params, Space, Table};

@@ -11,7 +11,7 @@ use crate::math::{Real, Rng};
 pub(crate) const FEATURES: usize = BASE + FURTHER;
 /// Those of them that are the base colour.
 pub(crate) const BASE: usize = 3;
-/// Those of them that are blended beside the base colour.
+/// Those of them that are blended next to the base colour.
 pub const FURTHER: usize = 6;
 /// Numbers that the network sees of a pixel: its further channels, its ray's origin and direction.
 pub const INPUTS: usize = FURTHER + 6;

@@ -1,7 +1,8 @@
 //! Labels: what a Gaussian is part of, as a logit for each of a scene's labels, in a table of the layer that follows every
 //! edit of rows.
 //!
-//! A Gaussian's probabilities are the softmax of its logits; pictures blend probabilities, not logits (Siddiqui et al. 2023,
+//! A Gaussian's probabilities are the softmax of its logits; images blend probabilities, not logits (Siddiqui et al.
+//! 2023,
 //! "Panoptic Lifting", §3.2: what is blended stays a distribution, whatever single logits grow to).
 
 use super::{Key, Params, Space, Table};

@@ -20,7 +20,7 @@ pub enum Space {
 pub enum Born {
     /// The row itself.
     Kept,
-    /// A copy beside its parent.
+    /// A copy next to its parent.
     Clone,
     /// One of the parts of its parent.
     Split,

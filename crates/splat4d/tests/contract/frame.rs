@@ -1,4 +1,4 @@
-//! A layer's frame, for every motion model: frame then evaluate is evaluate then frame, in numbers and in pictures; its
+//! A layer's frame, for every motion model: frame then evaluate is evaluate then frame, in numbers and in images; its
 //! gradient; files, frozen moments and baked scenes take it along.
 
 use crate::check::subject;
@@ -11,11 +11,11 @@ use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::splats::COV;
 use splat4d::scene::{Camera, Grads, LifeKind, Rows, SH, Space, SplatGrads, Table, Time};
 
-/// Largest difference between a framed answer and the answer framed by hand, and of their pictures, in f64.
+/// Largest difference between a framed answer and the answer framed by hand, and of their images, in f64.
 const SAME: f64 = 1e-6;
-/// Largest difference between a frozen moment's picture and the scene's: f32, and shapes out of a decomposition.
+/// Largest difference between a frozen moment's image and the scene's: f32, and shapes out of a decomposition.
 const FROZEN: f32 = 2e-3;
-/// Likeness of a baked scene and the model from which on pictures are the same, dB.
+/// Likeness of a baked scene and the model from which on images are the same, dB.
 const ALIKE: f64 = 45.0;
 /// A framed scene is baked as well as an unframed one, dB.
 const AS_WELL: f64 = 3.0;

@@ -19,7 +19,7 @@ use splat4d::nn::HashShape;
 use splat4d::nn::hexplane::PlaneShape;
 use splat4d::scene::{LifeKind, Space};
 
-/// Gaussians of a made-up layer: more than a block, and no multiple of one.
+/// Gaussians of a synthetic layer: more than a block, and no multiple of one.
 const ROWS: usize = 21;
 
 #[test]

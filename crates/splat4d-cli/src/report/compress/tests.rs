@@ -36,7 +36,7 @@ fn told(source: &Path) -> Compressed {
     }
 }
 
-/// A run with a picture of one colour.
+/// A run with an image of one colour.
 fn run(folder: &Path, colour: u8) {
     std::fs::write(folder.join("recipe.toml"), "").unwrap();
     let psnr = json!({"00000.png": 30.0});

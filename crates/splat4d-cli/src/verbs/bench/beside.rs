@@ -1,4 +1,5 @@
-//! The same training in other programs: a scene, its cameras and pictures as plain files, and beside them what each program's losses
+//! The same training in other programs: a scene, its cameras and images as plain files, and next to them what each
+//! program's losses
 //! and times were. A time is compared only where the losses agree, because else it is of other work.
 
 use super::rows::Row;
@@ -40,7 +41,7 @@ const RATES: [RateOf; 6] = [
     ("sh0", "sh", Some((0, 3)), 2.5e-3),
     ("shN", "sh", Some((3, 45)), 2.5e-3 / 20.0),
 ];
-/// The files of a scene and of this program; every other `.json` beside them is of another program.
+/// The files of a scene and of this program; every other `.json` next to them is of another program.
 const SCENE: &str = "scene.json";
 const OURS: &str = "splat4d.json";
 

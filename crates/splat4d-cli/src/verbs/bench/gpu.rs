@@ -1,4 +1,5 @@
-//! Times of a GPU: every stage of a picture and of its way back by the GPU's own clock, and whole training steps in which it
+//! Times of a GPU: every stage of an image and of its way back by the GPU's own clock, and whole training steps in
+//! which it
 //! draws.
 
 use super::roofline::bytes;
@@ -23,7 +24,7 @@ const GEOMETRY: usize = 40;
 const SHAPE: usize = 48;
 const NUMBER: usize = 4;
 const BACK: usize = 80;
-/// Planes of a picture (colours, alpha, depth), and those that have a gradient.
+/// Planes of an image (colours, alpha, depth), and those that have a gradient.
 const PLANES: usize = 5;
 const COLORS: usize = 3;
 /// Bytes of a pair in the lists: key, number, owner; and of its record.
@@ -31,7 +32,7 @@ const PAIR: usize = 12;
 const RECORD: usize = 48;
 /// A pass of a sort reads keys twice and values once, and writes both.
 const SORT: usize = 20;
-/// Passes over depths, and over tiles of pictures of up to 65,535 of them.
+/// Passes over depths, and over tiles of images of up to 65,535 of them.
 const DEPTH_PASSES: usize = 4;
 const TILE_PASSES: usize = 2;
 
@@ -91,7 +92,7 @@ fn floors(
     out
 }
 
-/// Those of a picture that stays there, and of its way back.
+/// Those of an image that stays there, and of its way back.
 const LISTS: [&str; 6] = ["project", "compact", "sort splats", "tiles", "sort pairs", "rasterize"];
 const BACKWARD: [&str; 3] = ["rasterize backward", "gather", "splats backward"];
 /// A whole training step; a frame of a film.

@@ -1,7 +1,7 @@
 //! How a training step's cost grows: with Gaussians, with pixels, with frames of the capture; and where memory is with a
 //! million Gaussians.
 //!
-//! The picture stays the same. More Gaussians are those of the trained scene split, fewer are every so many-th of them
+//! The image stays the same. More Gaussians are those of the trained scene split, fewer are every so many-th of them
 //! widened, so that together they cover what they covered before: a Gaussian of n children of one parent has √(1/n) of
 //! its scales, and lies where chance puts it inside the parent. All have the default recipe's model: one velocity each
 //! and a Gaussian life.
@@ -50,13 +50,13 @@ const FRAMES: [usize; 5] = [10, 30, 100, 300, 1000];
 /// Gaussians of the memory figure, and the degree of their spherical harmonics.
 const MILLION: usize = 1_000_000;
 const DEGREE: usize = 3;
-/// Side of the pictures with more Gaussians and in the memory figure; and with more frames.
+/// Side of the images with more Gaussians and in the memory figure; and with more frames.
 const SIDE: usize = 800;
 const SMALL_SIDE: usize = 400;
 /// Steps before times count, and steps of which the median is told, with more frames.
 const WARM_UP: usize = 10;
 const STEPS: usize = 60;
-/// As the bundled capture's pictures.
+/// As the bundled capture's images.
 const JPEG_QUALITY: u8 = 90;
 
 /// Measures what was asked for, in a pool of `way.threads` threads.
@@ -132,7 +132,7 @@ fn own_degree(base: &Pinned) -> usize {
     sh::degree_of(columns / 3).unwrap_or(0)
 }
 
-/// Steps on a capture of `count` pictures, on disk, through the trainer's own store: the first look at each decodes it.
+/// Steps on a capture of `count` images, on disk, through the trainer's own store: the first look at each decodes it.
 fn frames(base: &Pinned, count: usize, side: usize, way: Way) -> Result<Vec<Row>> {
     let pinned = grown(base, base.scene.len(), own_degree(base), side);
     let folder = Folder::new()?;
@@ -155,7 +155,7 @@ fn frames(base: &Pinned, count: usize, side: usize, way: Way) -> Result<Vec<Row>
     Ok(vec![step, load])
 }
 
-/// A made-up capture: eight picture files, each of which stands for every eighth frame.
+/// A synthetic capture: eight image files, each of which stands for every eighth frame.
 fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> Capture {
     let clip = pinned.scene.clip;
     let frame = |i: usize| {
@@ -281,7 +281,7 @@ fn renderer_bytes(pinned: &Pinned, way: Way) -> u64 {
     most as u64
 }
 
-/// The scene with another number of Gaussians and another degree, seen in square pictures of `side`; see the module.
+/// The scene with another number of Gaussians and another degree, seen in square images of `side`; see the module.
 fn grown(base: &Pinned, count: usize, degree: usize, side: usize) -> Pinned {
     let view = |v: &View| {
         let k = &v.camera.intrinsics;
@@ -346,7 +346,7 @@ fn split(from: &Scene<f32>, count: usize, degree: usize) -> Scene<f32> {
     Scene { layers: vec![layer], ..from.clone() }
 }
 
-/// One picture an axis: its name and the SVG.
+/// One image an axis: its name and the SVG.
 pub(super) fn plots(rows: &[Row]) -> Vec<(String, String)> {
     let axes = [("Gaussians", "gaussians"), ("pixels", "pixels"), ("frames", "frames")];
     let mut out = Vec::new();

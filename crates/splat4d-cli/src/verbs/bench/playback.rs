@@ -24,7 +24,7 @@ pub(super) struct Played {
 /// Measures in turns, with all threads of the current pool.
 pub(super) fn measure(files: &[PathBuf], size: [usize; 2], console: &Console) -> Result<Vec<Played>> {
     let sources = files.iter().map(|f| Opened::new(f)).collect::<Result<Vec<_>>>()?;
-    // Frame rates compare only where the pictures do: all are seen from the first one's cameras that has some.
+    // Frame rates compare only where the images do: all are seen from the first one's cameras that has some.
     let first = sources.iter().position(|s| s.source.run.is_some() || s.source.playback.is_some()).unwrap_or(0);
     let looks = looks_of(&sources[first].source, size)?;
     let subjects: Vec<Subject<'_>> = sources

@@ -85,7 +85,7 @@ pub(super) mod bytes {
         splats.len() * each + visible * 3 * sh_width(splats) * NUMBER
     }
 
-    /// Picture and truth in, gradient out.
+    /// Image and truth in, gradient out.
     pub(crate) fn loss(pixels: usize) -> usize {
         pixels * 9 * NUMBER
     }

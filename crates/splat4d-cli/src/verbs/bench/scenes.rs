@@ -48,7 +48,7 @@ impl Name {
     #[cfg(feature = "gpu")]
     pub(super) const OF_GPU: [Self; 3] = [Self::A, Self::B, Self::C];
 
-    /// Gaussians and picture of a scene that is made up.
+    /// Gaussians and image of a scene that is synthetic.
     fn made(self) -> Option<(usize, [usize; 2])> {
         match self {
             Self::A => Some((100_000, [800, 800])),
@@ -174,7 +174,7 @@ pub(super) fn made_up(name: &str, count: usize, [width, height]: [usize; 2]) -> 
     Pinned { name: name.into(), scene, views: (0..VIEWS).map(view).collect() }
 }
 
-/// Eight of the capture's cameras over its clip; square pictures with the same horizontal field of view.
+/// Eight of the capture's cameras over its clip; square images with the same horizontal field of view.
 fn of_the_capture(source: &Source, path: &Path, size: usize) -> Result<Vec<View>> {
     let cameras = source.views()?;
     if cameras.is_empty() {

@@ -52,7 +52,7 @@ pub(super) fn simd_name(simd: Simd) -> &'static str {
     }
 }
 
-/// A gradient to a picture: always the same numbers, small and of both signs.
+/// A gradient to an image: always the same numbers, small and of both signs.
 pub(super) fn gradient(view: &View) -> Planes<f32> {
     let mut grad = Planes::new(3, view.camera.height, view.camera.width);
     for (i, g) in grad.data.iter_mut().enumerate() {

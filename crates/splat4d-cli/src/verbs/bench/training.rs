@@ -1,4 +1,4 @@
-//! Times of training: whole steps of the trainer on a scene that is already good, against pictures of itself with noise,
+//! Times of training: whole steps of the trainer on a scene that is already good, against images of itself with noise,
 //! so that every gradient is small and none is zero.
 
 use super::roofline::{Roofline, bytes};
@@ -32,7 +32,7 @@ const NOISE: f64 = 0.02;
 /// Standard share of D-SSIM in the loss (Kerbl et al. 2023).
 pub(super) const LAMBDA_DSSIM: f64 = 0.2;
 
-/// Pictures in memory.
+/// Images in memory.
 pub(super) struct Held {
     cameras: Vec<Camera>,
     times: Vec<Time>,
@@ -66,12 +66,12 @@ impl Held {
         }
     }
 
-    /// The picture that was loaded last.
+    /// The image that was loaded last.
     pub(super) fn last(&self) -> usize {
         self.last.load(Ordering::Relaxed)
     }
 
-    /// The pictures.
+    /// The images.
     pub(super) fn pictures(&self) -> &[Planes<f32>] {
         &self.pictures
     }
@@ -286,7 +286,7 @@ pub(super) fn measure(pinned: &Pinned, held: &Arc<Held>, way: Way, roofline: &Ro
     Ok(PARTS.iter().enumerate().zip(all).map(row).collect())
 }
 
-/// Starts the process's peak memory anew where the system lets it (Linux); elsewhere it stays that of the whole run.
+/// Starts the process's peak memory again where the system lets it (Linux); elsewhere it stays that of the whole run.
 pub(super) fn forget_peak() {
     const PEAK: &str = "5"; // proc(5), /proc/pid/clear_refs
     let _ = std::fs::write("/proc/self/clear_refs", PEAK);

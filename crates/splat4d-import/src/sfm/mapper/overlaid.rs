@@ -9,7 +9,7 @@ use rayon::prelude::*;
 /// Of a camera with fewer sightings whose windows agree, the others stay too.
 const LEFT: usize = 100;
 
-/// Pictures in which a point is looked for beside those that show it, at most: a walk has hundreds.
+/// Images in which a point is looked for next to those that show it, at most: a walk has hundreds.
 const LOOKED_IN: usize = 32;
 
 /// What windows about a track's point say.
@@ -31,7 +31,7 @@ impl Map<'_> {
             let kept = laid.offs.iter().filter(|(_, off)| off.is_some()).map(|(k, _)| self.tracks[t].seen[*k].0);
             kept.chain(laid.found.iter().map(|f| f.0)).for_each(|s| left[s] += 1);
         }
-        // Without the pictures, which are many bytes.
+        // Without the images, which are many bytes.
         let bare = |s: &Sight| Sight { name: s.name.clone(), features: s.features.clone(), shown: Vec::new(), ..*s };
         let mut sights: Vec<Sight> = self.sights.iter().map(bare).collect();
         let mut tracks = self.tracks.to_vec();

@@ -6,7 +6,7 @@ use serde_json::json;
 use splat4d::ErrorKind;
 use std::sync::Arc;
 
-/// The message of opening the sample and, if that works, of loading its first picture.
+/// The message of opening the sample and, if that works, of loading its first image.
 fn message(sample: &Sample) -> String {
     message_with(sample, &CaptureOptions::default())
 }

@@ -103,7 +103,7 @@ fn panoramas_become_the_faces_of_a_cube() {
     sample.edit("transforms.json", |v| {
         ["fl_x", "fl_y", "cx", "cy"].iter().for_each(|key| drop(v.as_object_mut().unwrap().remove(*key)));
         v["camera_model"] = json!("EQUIRECTANGULAR");
-        // Of pictures that were reduced since.
+        // Of images that were reduced since.
         (v["w"], v["h"]) = (json!(2 * SIZE[0]), json!(2 * SIZE[1]));
     });
     let capture = Arc::new(open(&sample, ""));

@@ -62,7 +62,7 @@ fn vectors_are_read_where_they_are_known() {
 
 #[test]
 fn flow_is_undistorted_with_its_image() {
-    // Rays move by a constant on the pinhole's picture; the distorted picture shows something else.
+    // Rays move by a constant on the pinhole's image; the distorted image shows something else.
     let lens = Lens::Brown { k: [-0.2, 0.03, 0.0, 0.0, 0.0, 0.0], p: [2e-3, -1e-3], s: [0.0; 4] };
     let distortion = Distortion::new(lens);
     let ray = |x: f64, y: f64| [(x - 12.0) / FOCAL, (y - 8.0) / FOCAL];

@@ -1,4 +1,4 @@
-//! Every layout, from made-up files to poses, times, splits and pixels.
+//! Every layout, from synthetic files to poses, times, splits and pixels.
 
 use super::super::*;
 use super::samples::{self, FOCAL, HEIGHT, Sample, WIDTH};
@@ -31,7 +31,7 @@ fn names(capture: &Capture) -> Vec<&str> {
     capture.cameras.iter().map(|c| c.name.as_str()).collect()
 }
 
-/// The blue value of a frame's first pixel: which picture it is, see `Sample::rgb`.
+/// The blue value of a frame's first pixel: which image it is, see `Sample::rgb`.
 fn blue(capture: &Arc<Capture>, frame: usize) -> usize {
     let picture = ImageStore::new(Arc::clone(capture), 0).load(frame).unwrap().to_picture();
     (picture.color.get(2, 0, 0) * 255.0).round() as usize
@@ -203,7 +203,7 @@ fn nerfstudio() {
     let store = ImageStore::new(Arc::clone(&capture), 1 << 20);
     assert!(store.load(0).unwrap().to_picture().mask.is_some());
     assert!(store.load(1).unwrap().to_picture().mask.is_none());
-    // The corner ray of the pinhole picture lies inside the barrel-distorted one, so all pixels are valid, and the
+    // The corner ray of the pinhole image lies inside the barrel-distorted one, so all pixels are valid, and the
     // corner shows what was nearer the middle.
     let picture = store.load(2).unwrap().to_picture();
     assert!(picture.valid.is_none() && picture.color.get(0, 0, 0) > 0.02, "{}", picture.color.get(0, 0, 0));

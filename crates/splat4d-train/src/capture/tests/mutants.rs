@@ -6,7 +6,7 @@ use super::samples;
 use splat4d::math::Rng;
 use std::sync::Arc;
 
-/// Mutants of every metadata file and picture.
+/// Mutants of every metadata file and image.
 const MUTANTS: u64 = 120;
 const SEED: u64 = 20_261_121;
 

@@ -85,7 +85,7 @@ fn jpeg_orientation_is_honoured() {
     assert_eq!(jpeg(Some(1), false), plain);
     let half = jpeg(Some(3), false);
     assert_eq!(half.get(0, 15, 23), plain.get(0, 0, 0));
-    // Orientation 6: the stored picture must be turned by 90° clockwise, its top left goes to the top right.
+    // Orientation 6: the stored image must be turned by 90° clockwise, its top left goes to the top right.
     let quarter = jpeg(Some(6), true);
     assert_eq!((quarter.width, quarter.height), (16, 24));
     assert_eq!(quarter.get(0, 0, 15), plain.get(0, 0, 0));
@@ -106,7 +106,7 @@ fn fisheye_borders_are_marked() {
 
 #[test]
 fn undistortion_inverts_a_distorted_image() {
-    // A picture whose colours are linear in its ray is distorted by the closed model and must come back linear.
+    // An image whose colours are linear in its ray is distorted by the closed model and must come back linear.
     let sample = samples::own();
     let lens = splat4d::scene::Lens::Brown { k: [-0.2, 0.03, 0.0, 0.0, 0.0, 0.0], p: [2e-3, -1e-3], s: [0.0; 4] };
     let distortion = Distortion::new(lens);
@@ -160,7 +160,7 @@ fn cache_keeps_its_budget_and_never_changes_pixels() {
 
 #[test]
 fn an_image_is_undistorted_while_all_workers_are_busy() {
-    // A worker that waits for a picture cannot help to make it: whoever makes one must not need the workers.
+    // A worker that waits for an image cannot help to make it: whoever makes one must not need the workers.
     let sample = samples::own();
     sample.edit("capture.json", |v| {
         v["cameras"][1]["distortion"] = json!({"model": "opencv", "k": [-0.2, 0.03], "p": [0.002, -0.001]});

@@ -1,4 +1,4 @@
-//! Tiny made-up captures: two or three cameras round the origin, pictures of 24x16 pixels.
+//! Tiny synthetic captures: two or three cameras round the origin, images of 24x16 pixels.
 
 use image::{ImageBuffer, Luma, Rgb, Rgba};
 use serde_json::{Value, json};
@@ -42,7 +42,7 @@ impl Sample {
         std::fs::write(path, bytes).unwrap();
     }
 
-    /// An opaque picture that tells cameras and frames apart.
+    /// An opaque image that tells cameras and frames apart.
     pub(in crate::capture) fn rgb(&self, name: &str, camera: usize, frame: usize) {
         let pixel = |x: u32, y: u32| Rgb([(x * 10) as u8, (y * 15) as u8, (camera * 40 + frame * 7) as u8]);
         self.save(name, ImageBuffer::from_fn(WIDTH as u32, HEIGHT as u32, pixel));
@@ -118,7 +118,7 @@ pub(in crate::capture) fn own() -> Sample {
     sample
 }
 
-/// Three training pictures, one validation, one test.
+/// Three training images, one validation, one test.
 pub(in crate::capture) fn dnerf() -> Sample {
     let sample = Sample::new(&["transforms_train.json", "transforms_val.json", "transforms_test.json"]);
     for (split, times, first) in [("train", &[0.0, 0.5, 1.0][..], 0), ("val", &[0.25], 3), ("test", &[0.75], 4)] {
@@ -222,7 +222,7 @@ pub(in crate::capture) fn nerfstudio() -> Sample {
     sample
 }
 
-/// Pictures of `names`; three cameras whose first pictures are registered.
+/// Images of `names`; three cameras whose first images are registered.
 fn colmap_pictures(sample: &Sample) -> Vec<String> {
     for (c, t) in (0..3).flat_map(|c| (0..2).map(move |t| (c, t))) {
         sample.rgb(&format!("images/cam{c}/{t:04}.png"), c, t);
@@ -289,7 +289,7 @@ pub(in crate::capture) fn colmap_txt() -> Sample {
     sample
 }
 
-/// Pictures of one place each, by the names that `name` gives them in `images/`, in a `transforms.json` and, where
+/// Images of one place each, by the names that `name` gives them in `images/`, in a `transforms.json` and, where
 /// `model` brings that world into another, a COLMAP model of the same. No times.
 pub(in crate::capture) fn photos(
     count: usize,

@@ -494,7 +494,7 @@ fn standard_folders_of_colmap_are_read() {
         assert!(capture.frames.len() == 9 && capture.frames.iter().all(|f| f.image.starts_with(sample.path(folder))));
         assert_said(&capture, Aspect::Assumed, Severity::Note, &["Images are those in", folder]);
     }
-    // Mip-NeRF 360: reduced copies, and LLFF's poses beside the model.
+    // Mip-NeRF 360: reduced copies, and LLFF's poses next to the model.
     let sample = colmap_at("sparse/0", &["images", "images_2"]);
     std::fs::copy(samples::n3dv().path("poses_bounds.npy"), sample.path("poses_bounds.npy")).unwrap();
     let capture = open(&sample);

@@ -188,7 +188,7 @@ fn nearest(instants: &[f64], t: f64) -> usize {
     if earlier { after - 1 } else { after }
 }
 
-/// The cameras' names, the camera of every frame, and whether the data set tells cameras apart.
+/// The cameras' names, the camera of every frame, and whether the data set distinguishes cameras.
 fn cameras(entries: &[Entry], times: &[f64]) -> (Vec<String>, Vec<usize>, bool) {
     let names: Vec<&str> = entries.iter().map(|e| e.name.as_str()).collect();
     let naming = rig::naming(&names);

@@ -1,4 +1,4 @@
-//! One frame of a transforms file: its picture, pose, lens and time. What a frame says of itself goes before what the
+//! One frame of a transforms file: its image, pose, lens and time. What a frame says of itself goes before what the
 //! file says for all.
 
 use super::super::convention::{Convention, Poses};
@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 pub(super) struct Entry {
     /// `file_path` as it is written.
     pub name: String,
-    /// The picture.
+    /// The image.
     pub image: PathBuf,
     /// Pose, intrinsics and lens.
     pub source: Camera,

@@ -1,4 +1,4 @@
-//! Learning behind a codec: the same picture as the file's, gradients past the rounding, a palette that is a sum, a
+//! Learning behind a codec: the same image as the file's, gradients past the rounding, a palette that is a sum, a
 //! memory that comes back.
 
 use super::*;
@@ -14,7 +14,7 @@ use splat4d::math::Rng;
 use splat4d::render::{RenderConfig, Renderer};
 use splat4d::scene::{GEOMETRY, Rows};
 
-/// Colour of the made-up sky, about.
+/// Colour of the synthetic sky, about.
 const SKY: [f32; 3] = [0.2, 0.3, 0.6];
 /// So coarse that a rounding is seen.
 fn coarse() -> Depths {

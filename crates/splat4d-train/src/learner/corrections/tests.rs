@@ -27,7 +27,7 @@ fn twists_move_rigidly_and_have_the_gradient_of_perturbations() {
     assert!(motion.orthogonality_error() < 1e-14 && (motion.det() - 1.0).abs() < 1e-14);
     let back = exp(TWIST.map(|x| -x)).after(&motion);
     assert!(norm(back.translation) < 1e-14);
-    // A made-up loss of a pose: d is its gradient to a perturbation from the left, by differences.
+    // A synthetic loss of a pose: d is its gradient to a perturbation from the left, by differences.
     let (x, g) = ([0.3, 1.2, -0.7], [0.5, -1.0, 0.8]);
     let loss = |pose: &Se3| dot(pose.apply(x), g);
     const H: f64 = 1e-6;
@@ -98,7 +98,7 @@ fn searches_are_spread_over_the_run_and_keep_the_median_of_all_clocks() {
     assert_eq!(found.iter().map(|(_, d)| d.round).collect::<Vec<_>>(), (0..c.settings.searches).collect::<Vec<_>>());
     assert!(found[0].0 == 100 && found.iter().all(|(k, _)| *k < 500), "{found:?}");
     assert!((found[0].1.reach - 0.4).abs() < 1e-12 && found.last().unwrap().1.reach < 0.2, "far first: {found:?}");
-    // Places are passed over where the run was planned anew: one search is made, and none twice.
+    // Places are passed over where the run was planned again: one search is made, and none twice.
     assert_eq!(c.search_due(0.05, 0.44).map(|d| d.round), Some(6));
     assert_eq!(c.search_due(0.25, 0.25), None);
     // Four clocks that are right by themselves and one that is not.

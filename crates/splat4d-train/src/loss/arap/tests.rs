@@ -74,7 +74,7 @@ fn the_envelope_gradient_is_that_of_the_least_energy() {
     let rest = cloud("rest", 1.0);
     let g = graph(&rest);
     let at = [moved(&shaken(&rest, "a"), [0.9, 0.1, 0.4, 0.0], 0.3), shaken(&rest, "b")];
-    // The finite differences find the best rotation anew.
+    // The finite differences find the best rotation again.
     check(&at, |at, d| energy(&g, at, d), |at| energy(&g, at, &mut [zeros(), zeros()]));
 }
 

@@ -8,7 +8,7 @@ use splat4d::math::{Real, median_by};
 use splat4d::scene::Planes;
 
 /// [`depth`] of views that know theirs, times a weight that falls to [`LAST`] of it by the end: a map that is wrong bends
-/// the scene early, and pictures decide in the end.
+/// the scene early, and images decide in the end.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Depth(pub f64);
 
@@ -132,7 +132,7 @@ fn standardised<F: Real>(mut values: Vec<F>) -> Option<(Vec<F>, F)> {
     Some((values, F::of(spread)))
 }
 
-/// How far a drawn picture's depth is from a map.
+/// How far a drawn image's depth is from a map.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Apart {
     /// Of a metric map: the median of D / D*, and the median of |D / D* − 1|.
@@ -141,7 +141,7 @@ pub(crate) enum Apart {
     Correlation(f64),
 }
 
-/// How far the depth of a picture, Σ z α T and A, is from a map; `None`: too little of it is known to tell.
+/// How far the depth of an image, Σ z α T and A, is from a map; `None`: too little of it is known to tell.
 pub(crate) fn apart([depth, alpha]: [&Planes<f32>; 2], truth: DepthTruth<'_>) -> Option<Apart> {
     /// Pixels from which on they tell something.
     const ENOUGH: usize = 50;

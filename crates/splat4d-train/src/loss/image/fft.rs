@@ -1,4 +1,4 @@
-//! A discrete Fourier transform of pictures whose sides are powers of two.
+//! A discrete Fourier transform of images whose sides are powers of two.
 //!
 //! Our own, because it is a page: radix 2 over sixteen columns at a time, so that every butterfly is a vector operation
 //! and the work stays in cache. A general library would bring three more crates for lengths we do not use.
@@ -9,7 +9,7 @@ use splat4d::math::Real;
 /// Columns that are transformed together.
 const LANES: usize = 16;
 
-/// A complex picture [side, side], side a power of two, row by row.
+/// A complex image [side, side], side a power of two, row by row.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Spectrum<F> {
     pub(super) side: usize,
@@ -21,7 +21,7 @@ pub(super) struct Spectrum<F> {
 }
 
 impl<F: Real> Spectrum<F> {
-    /// Sizes the picture and fills it with zeros. Panics: the side is no power of two.
+    /// Sizes the image and fills it with zeros. Panics: the side is no power of two.
     pub(super) fn reset(&mut self, side: usize) {
         assert!(side.is_power_of_two() && side >= LANES, "sides are powers of two from {LANES} on, not {side}");
         if self.side != side {

@@ -52,7 +52,7 @@ impl<F: Real> ImageTerm<F> for Tracks {
 /// Known flow is that of a whole pixel: of a mean of pixels all must be known.
 const KNOWN: f64 = 0.999;
 
-/// Mean over pixels of known flow that show something of ‖F − F*‖₁ over the picture's longer side; F = Σ α T f / Σ α T.
+/// Mean over pixels of known flow that show something of ‖F − F*‖₁ over the image's longer side; F = Σ α T f / Σ α T.
 ///
 /// Shapes: `drawn` [3, h, w] holds Σ α T f (2) and Σ α T of the splats that have an f; `d` adds up its gradient.
 /// Source: SC-GS (Huang et al. 2024) and GaussianFlow (Gao et al. 2024).
@@ -64,7 +64,8 @@ pub(crate) fn flow<F: Real>(drawn: &Planes<F>, truth: &Planes<F>, weight: f64, d
 /// Errors of tracks up to here cost their square, pixels.
 const HUBER: f64 = 3.0;
 
-/// Mean over pixels of tracked points that show something of h(‖F − F*‖₂) over the picture's longer side, F as in [`flow`] but
+/// Mean over pixels of tracked points that show something of h(‖F − F*‖₂) over the image's longer side, F as in
+/// [`flow`] but
 /// to the time of the track's other end: r²/(2δ) to δ = 3 pixels, and r − δ/2 beyond (Huber). What the pixel shows is followed by
 /// the weights with which it is blended: the point is where these Gaussians are, and goes where they go.
 ///

@@ -1,4 +1,4 @@
-//! Frequencies: amplitude and phase of the picture's spectrum, coarse ones first.
+//! Frequencies: amplitude and phase of the image's spectrum, coarse ones first.
 
 use super::fft::Spectrum;
 use super::{ImageTerm, PictureGrads, Shown, View};
@@ -35,13 +35,14 @@ const FULL: f64 = 0.75;
 /// Amplitudes below this are rounding and have no phase.
 const SILENT: f64 = 1e-8;
 
-/// Amplitude and phase discrepancy of the spectra of picture and truth, over the frequencies up to a radius that grows
+/// Amplitude and phase discrepancy of the spectra of image and truth, over the frequencies up to a radius that grows
 /// with training: Σ over channels and band of ||X| − |X*|| + |X|·|∠X − ∠X*|, over their number, X the transform divided
-/// by √pixels: in the picture's unit. The |X| that weighs a phase is held constant, so that a phase error costs the arc that
+/// by √pixels: in the image's unit. The |X| that weighs a phase is held constant, so that a phase error costs the
+/// arc that
 /// it spans and its slope stays bounded where there is no amplitude.
 ///
 /// Source: Zhang et al. 2024, "FreGS", equations 5 to 9 (there phases count unweighted, and the band grows linearly too).
-/// Pictures are padded with zeros to the next power of two.
+/// Images are padded with zeros to the next power of two.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Frequency<F> {
     spectrum: Spectrum<F>,
@@ -66,18 +67,18 @@ impl<F: Real> Frequency<F> {
         let side = w.max(h).next_power_of_two().max(16);
         let radius = (FIRST + (1.0 - FIRST) * progress / FULL).min(1.0) * 0.5 * side as f64;
         let wave = |u: usize| if 2 * u > side { u as f64 - side as f64 } else { u as f64 };
-        // Of the two frequencies ±(u, v) of a real picture one says all.
+        // Of the two frequencies ±(u, v) of a real image one says all.
         let in_band = |u: usize, v: usize| wave(u).hypot(wave(v)) <= radius * std::f64::consts::SQRT_2;
         let count: usize =
             (0..side).into_par_iter().map(|u| (0..side).filter(|&v| in_band(u, v)).count()).sum::<usize>();
         let scale = weight / (count * image.channels).max(1) as f64;
         let unit = 1.0 / ((w * h) as f64).sqrt();
         let mut value = 0.0;
-        // The gradients of two channels go back through one transform: what belongs to a real picture is symmetric.
+        // The gradients of two channels go back through one transform: what belongs to a real image is symmetric.
         for pair in (0..image.channels).step_by(2) {
             self.grads.reset(side);
             for (part, c) in (pair..(pair + 2).min(image.channels)).enumerate() {
-                // Picture and truth share a transform as its real and imaginary part.
+                // Image and truth share a transform as its real and imaginary part.
                 self.spectrum.reset(side);
                 for y in 0..h {
                     let (to, from) = (y * side, y * w);
@@ -219,7 +220,7 @@ mod tests {
         (0..256).for_each(|i| fine.data[i] += if (i / 16 + i % 16) % 2 == 0 { 0.1 } else { -0.1 });
         assert!(run(&fine, &truth, 0.0, &mut Planes::new(1, 16, 16)) < 1e-12);
         assert!(run(&fine, &truth, 1.0, &mut Planes::new(1, 16, 16)) > 1e-4);
-        // A brighter picture is seen at once.
+        // A brighter image is seen at once.
         let mut bright = truth.clone();
         bright.data.iter_mut().for_each(|x| *x += 0.1);
         assert!(run(&bright, &truth, 0.0, &mut Planes::new(1, 16, 16)) > 1e-4);

@@ -17,7 +17,7 @@ pub(crate) struct Segmentation {
 }
 
 impl Segmentation {
-    /// Of a column group of one logit, with a weight beside the colours' and their share of D-SSIM.
+    /// Of a column group of one logit, with a weight next to the colours' and their share of D-SSIM.
     pub(crate) fn new(column: &str, weight: f64, dssim: f64) -> Self {
         let photometric = Photometric::new(dssim as f32);
         Self { channel: Channel::Sigmoid(column.to_owned()), weight, photometric, d_shown: Planes::default() }

@@ -1,4 +1,4 @@
-//! The contract of losses on rendered pictures, [`ImageTerm`]: it says which channels it needs, looks at a picture and its
+//! The contract of losses on rendered images, [`ImageTerm`]: it says which channels it needs, looks at an image and its
 //! truth, and adds its gradient.
 
 use crate::capture::frames::{DepthTruth, FlowTruth};
@@ -20,7 +20,7 @@ pub struct LossValue {
     pub mse: f64,
 }
 
-/// One picture that the scene is compared with.
+/// One image that the scene is compared with.
 #[derive(Clone, Copy, Debug)]
 pub struct View<'a, F = f32> {
     /// From where.
@@ -41,7 +41,7 @@ pub struct View<'a, F = f32> {
     pub flow: Option<FlowTruth<'a, F>>,
     /// Where tracked points are at another time: flow that is known in their pixels alone.
     pub tracks: Option<FlowTruth<'a, F>>,
-    /// The frame's number in the capture, for messages and for devices that keep its picture.
+    /// The frame's number in the capture, for messages and for devices that keep its image.
     pub frame: usize,
     /// The camera's number in the capture, for the exposure.
     pub rig: usize,
@@ -90,7 +90,7 @@ impl Channel {
     }
 }
 
-/// The planes to draw of a view beside colour and alpha.
+/// The planes to draw of a view next to colour and alpha.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Needs {
     /// Σ z α T.
@@ -109,7 +109,7 @@ impl Needs {
     }
 }
 
-/// A picture as terms see it.
+/// An image as terms see it.
 #[derive(Clone, Copy, Debug)]
 pub struct Shown<'a, F = f32> {
     /// Red, green, blue over the background, as the view's camera exposes them, [3, h, w].
@@ -139,7 +139,7 @@ impl<'a, F: Real> Shown<'a, F> {
     }
 }
 
-/// The gradient to some planes of a picture: zero until a term touches it.
+/// The gradient to some planes of an image: zero until a term touches it.
 #[derive(Clone, Debug, Default)]
 pub struct Gradient<F = f32> {
     planes: Planes<F>,
@@ -172,7 +172,7 @@ impl<F: Real> Gradient<F> {
     }
 }
 
-/// The gradient to a picture.
+/// The gradient to an image.
 #[derive(Clone, Debug, Default)]
 pub struct PictureGrads<F = f32> {
     /// To colour, [3, h, w].
@@ -213,9 +213,9 @@ impl<F: Real> PictureGrads<F> {
     }
 }
 
-/// A loss on rendered pictures.
+/// A loss on rendered images.
 pub trait ImageTerm<F: Real = f32>: Send {
-    /// The planes that it needs of this view beside colour and alpha.
+    /// The planes that it needs of this view next to colour and alpha.
     fn needs(&self, _view: &View<'_, F>) -> Needs {
         Needs::default()
     }

@@ -1,4 +1,4 @@
-//! Total variation: pictures and depths without speckle.
+//! Total variation: images and depths without speckle.
 
 use super::{ImageTerm, Needs, PictureGrads, SEEN, Shown, View, expected_depth_backward, over_rows};
 use crate::loss::terms::StepInfo;
@@ -15,7 +15,7 @@ impl<F: Real> ImageTerm<F> for TotalVariation {
     }
 }
 
-/// [`depth_smoothness`] beside the view's truth, times a weight.
+/// [`depth_smoothness`] next to the view's truth, times a weight.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct DepthSmoothness(pub f64);
 
@@ -29,7 +29,7 @@ impl<F: Real> ImageTerm<F> for DepthSmoothness {
     }
 }
 
-/// How fast an edge of the picture frees the depth beside it: a difference of a tenth of the colour range counts e⁻¹.
+/// How fast an edge of the image frees the depth next to it: a difference of a tenth of the colour range counts e⁻¹.
 const EDGE: f64 = 10.0;
 
 /// The weight of a pair of neighbouring pixels, by their numbers; 0: they are not compared.
@@ -77,7 +77,7 @@ fn variation<F: Real>(plane: &[F], [width, height]: [usize; 2], pair: &Pair<'_, 
     })
 }
 
-/// Mean over pixels and channels of |difference to the right| + |difference below|, in the picture's unit.
+/// Mean over pixels and channels of |difference to the right| + |difference below|, in the image's unit.
 ///
 /// Source: Rudin, Osher, Fatemi 1992, anisotropic.
 pub(crate) fn total_variation<F: Real>(image: &Planes<F>, weight: f64, d: &mut Planes<F>) -> f64 {

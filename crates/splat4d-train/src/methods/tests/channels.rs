@@ -1,10 +1,10 @@
-//! Gradients through the whole chain of what is drawn beside colours: depth, normals, flow and a column's sigmoid.
+//! Gradients through the whole chain of what is drawn next to colours: depth, normals, flow and a column's sigmoid.
 
 use super::*;
 use crate::capture::frames::FlowTruth;
 use crate::loss::image::{Channel, Needs};
 
-/// Random weights on every number of every picture but the colours.
+/// Random weights on every number of every image but the colours.
 struct Weighted(Needs);
 
 impl ImageTerm<f64> for Weighted {

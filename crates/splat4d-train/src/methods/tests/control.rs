@@ -161,7 +161,7 @@ fn a_scene_on_nodes_learns_with_every_trajectory() {
     }
 }
 
-/// Shaken nodes come to rest in training, whatever the pictures say.
+/// Shaken nodes come to rest in training, whatever the images say.
 #[test]
 fn losses_on_nodes_calm_them() {
     let clip = [0.0, 0.2];

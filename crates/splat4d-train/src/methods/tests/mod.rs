@@ -88,7 +88,7 @@ const H: f64 = 1e-5;
 /// Analytic against central differences in f64: relative, and a floor for what is nearly zero.
 const FD_TOLERANCE: (f64, f64) = (2e-6, 2e-9);
 
-/// No thresholds: the picture is a smooth function of every parameter.
+/// No thresholds: the image is a smooth function of every parameter.
 fn smooth() -> RenderConfig {
     RenderConfig { alpha_min: 1e-14, alpha_max: 1.0 - 1e-9, transmittance_min: 0.0, ..RenderConfig::default() }
 }
@@ -148,7 +148,7 @@ impl ImageTerm<f64> for Squared {
     }
 }
 
-/// One posed picture at any time.
+/// One posed image at any time.
 #[derive(Clone)]
 struct Shot {
     camera: Camera,
@@ -156,7 +156,7 @@ struct Shot {
     truth: Planes<f64>,
 }
 
-/// Pictures of the made-up capture, in f64, at times of our choice: (camera, seconds).
+/// Images of the synthetic capture, in f64, at times of our choice: (camera, seconds).
 fn shots(list: &[(usize, f64)]) -> Vec<Shot> {
     let made = Made::new(3, 1, 12);
     let mut picture = Picture::default();
@@ -170,7 +170,7 @@ fn shots(list: &[(usize, f64)]) -> Vec<Shot> {
     list.iter().map(shot).collect()
 }
 
-/// The losses of a check beside the pictures.
+/// The losses of a check next to the images.
 type Probes = Vec<Box<dyn ProbeLoss<f64>>>;
 
 /// One step of the chain with any drawing device.
@@ -317,7 +317,7 @@ fn shake<F: Real>(p: &mut Params<F>, key: Key, size: f64, seed: u64) {
     }
 }
 
-/// An ordinary trainer on the made-up capture: 4 cameras, 3 moments, 16 pixels.
+/// An ordinary trainer on the synthetic capture: 4 cameras, 3 moments, 16 pixels.
 fn trainer(scene: Scene<f32>, stages: Vec<Stage>, cap: usize) -> Trainer<'static> {
     trainer_on(Arc::new(Made::new(4, 3, 16)), scene, stages, cap)
 }

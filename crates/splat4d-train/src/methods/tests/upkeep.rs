@@ -98,7 +98,7 @@ fn every_row_edit_reaches_every_loss() {
         stage.probes.push(Box::new(probe.clone()));
         stage.params.push(Box::new(param.clone()));
         change(&mut stage);
-        // Patches of guided sampling need a picture that is larger than they are.
+        // Patches of guided sampling need an image that is larger than they are.
         let mut t = sized(on_nodes(), vec![stage], 48);
         let mut edited = 0;
         while !t.is_done() {

@@ -20,7 +20,7 @@ const FPS: f64 = 10.0;
 /// Radius of the ball.
 const RADIUS: f64 = 0.6;
 
-/// Pictures of a scene, drawn beforehand, camera by camera at every time.
+/// Images of a scene, drawn beforehand, camera by camera at every time.
 struct Drawn {
     cameras: Vec<Camera>,
     pictures: Vec<Picture>,

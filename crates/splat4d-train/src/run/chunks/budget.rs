@@ -18,15 +18,15 @@ use std::sync::Arc;
 const PROBES: f64 = 0.06;
 /// Seconds that timing steps takes where only the length is asked for.
 const PREDICTION: f64 = 6.0;
-/// Fewest Gaussians of a chunk that a memory limit may leave: with fewer nothing can be told in the pictures.
+/// Fewest Gaussians of a chunk that a memory limit may leave: with fewer nothing can be told in the images.
 const FEWEST: usize = 1000;
 /// By how much the number of Gaussians falls from try to try.
 const LESS: f64 = 0.8;
-/// Least memory for decoded pictures, bytes; less makes runs slower, and no picture worse.
+/// Least memory for decoded images, bytes; less makes runs slower, and no image worse.
 const PICTURES: u64 = 64 << 20;
 /// Shortest chunk, in overlaps: in a shorter one there is hardly a frame that is not shared.
 const SHORTEST: usize = 3;
-/// Share of the time that is kept for putting the take together, and for what training takes beside its steps.
+/// Share of the time that is kept for putting the take together, and for what training takes next to its steps.
 const JOIN: f64 = 0.1;
 
 /// A take in chunks before it is begun.
@@ -72,7 +72,8 @@ impl Outlook {
     /// does after training takes as long as `finish` steps at its end. `timed`: steps are timed even without `minutes`.
     /// `None`: the take is learnt at once.
     ///
-    /// Errors: what the recipe asks for cannot be had in chunks, or not within these limits; pictures that cannot be read.
+    /// Errors: what the recipe asks for cannot be had in chunks, or not within these limits; images that cannot be
+    /// read.
     pub fn new(
         capture: &Arc<Capture>,
         recipe: &Recipe,
@@ -110,7 +111,8 @@ impl Outlook {
     }
 }
 
-/// A capture with as many pictures to train on as the longest chunk has; those of the beginning, which are listed in any case.
+/// A capture with as many images to train on as the longest chunk has; those of the beginning, which are listed in
+/// any case.
 fn longest(capture: &Capture, plan: &ChunkPlan) -> Capture {
     let longest = (0..plan.len()).map(|c| plan.frames(c).len()).max().unwrap_or(0);
     let frames = plan.take[0]..plan.take[0] + longest;
@@ -118,7 +120,8 @@ fn longest(capture: &Capture, plan: &ChunkPlan) -> Capture {
     Capture { train, ..capture.clone() }
 }
 
-/// The recipe and plan within the recipe's memory limit: less memory for pictures first, then fewer Gaussians in chunks that are
+/// The recipe and plan within the recipe's memory limit: less memory for images first, then fewer Gaussians in
+/// chunks that are
 /// shorter by as much, so that a frame keeps as many.
 fn within_memory(capture: &Capture, mut recipe: Recipe, mut plan: ChunkPlan) -> Result<(Recipe, ChunkPlan, u64)> {
     let estimate = |recipe: &Recipe, plan: &ChunkPlan| memory_estimate(&longest(capture, plan), recipe);

@@ -175,7 +175,7 @@ impl Chunked {
         let wanted = of_frames(&self.recipe, self.plan.frames(chunk));
         let file = folder.join("recipe.toml");
         let made = Recipe::from_toml(&read_text(&file)?).map_err(|e| e.at(file.display()))?;
-        // Stages count the steps of a chunk anew.
+        // Stages count the steps of a chunk again.
         let made = made.with(|r| r.run.iterations = wanted.run.iterations);
         if recipe_print(&made, "") != recipe_print(&wanted, "") {
             return Err(other("recipe".into()));
@@ -184,7 +184,8 @@ impl Chunked {
     }
 
     /// How well chunks meet, by cameras that stand still: those that training never saw, where there are any. `None`: there
-    /// is no such camera, or no time. Before each cut `go_on` is asked; it hears how many are done. Errors: chunks or pictures that
+    /// is no such camera, or no time. Before each cut `go_on` is asked; it hears how many are done. Errors: chunks
+    /// or images that
     /// cannot be read.
     pub fn seams(&self, go_on: &mut dyn FnMut(usize) -> bool, listen: &mut dyn FnMut(&Event)) -> Result<Option<Seams>> {
         let antialias = if self.recipe.appearance.antialias { Antialias::On } else { Antialias::Off };

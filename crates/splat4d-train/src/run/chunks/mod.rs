@@ -274,7 +274,8 @@ impl Chunked {
         Ok(format!("{part} {}", identity::file_print(&bytes)))
     }
 
-    /// Does whatever there is to do until all is done, beside any number of other workers. `finished` hears of every part
+    /// Does whatever there is to do until all is done, next to any number of other workers. `finished` hears of
+    /// every part
     /// that this worker has finished.
     ///
     /// Errors: those of training, and of `finished`.
@@ -346,7 +347,7 @@ impl Chunked {
         self.pacing.map(|pacing| (pacing, [now, pacing.due(now, share)]))
     }
 
-    /// The pictures of some frames of the take, as the recipe opens them.
+    /// The images of some frames of the take, as the recipe opens them.
     fn capture(&self, frames: Vec<Range<usize>>) -> Result<Capture> {
         open_frames(&self.source, &self.recipe, frames, &self.lenses)
             .map_err(|e| e.remedy("The run needs its capture where it was when it was begun"))

@@ -245,7 +245,7 @@ fn medians(
     write_atomically(&folder.join("capture.json"), all.to_string().as_bytes())
 }
 
-/// A training picture, pixel by pixel.
+/// A training image, pixel by pixel.
 fn bytes(opened: &OpenCapture, i: usize) -> Result<Vec<u8>> {
     use crate::capture::frames::Frames;
     let mut picture = Picture::default();
@@ -270,7 +270,7 @@ fn write_png(path: &Path, data: &[u8], view: &Camera, color: ExtendedColorType) 
     write_atomically(path, &out)
 }
 
-/// Leaves of a scene the Gaussians that stand where pictures are calm.
+/// Leaves of a scene the Gaussians that stand where images are calm.
 fn calm_only(scene: &mut Scene<f32>, capture: &Capture, folder: &Path) -> Result<()> {
     let mut views: Vec<(Camera, Vec<u8>)> = Vec::new();
     for (rig, camera) in capture.cameras.iter().enumerate() {

@@ -1,4 +1,4 @@
-//! The tie of a chunk to a finished neighbour: where they overlap, their pictures are to be alike.
+//! The tie of a chunk to a finished neighbour: where they overlap, their images are to be alike.
 
 use super::shared::read_file;
 use crate::Result;
@@ -30,7 +30,8 @@ impl Neighbour {
     }
 }
 
-/// λ‖I − I'‖₁, the mean over pixels and channels of the difference to the neighbour's picture I', as the camera exposes both.
+/// λ‖I − I'‖₁, the mean over pixels and channels of the difference to the neighbour's image I', as the camera
+/// exposes both.
 /// Source: render-space consistency of overlapping chunks; no gradient goes to the neighbour.
 pub(super) struct Tie {
     weight: f64,

@@ -1,4 +1,4 @@
-//! One chunk: a run on its frames, whose scene has the shared layer beside the one that learns.
+//! One chunk: a run on its frames, whose scene has the shared layer next to the one that learns.
 
 use super::shared::{self, Shared};
 use super::tie::{Neighbour, Tie};

@@ -9,7 +9,7 @@ const SHARE: f64 = 0.6;
 
 #[test]
 fn other_images_of_the_future_make_the_same_tensors() {
-    // Masks of motion, exposures, clocks, growth and pruning: whatever looks at pictures is switched on.
+    // Masks of motion, exposures, clocks, growth and pruning: whatever looks at images is switched on.
     let settings = [
         "motion=spacetime init=auto densify.interval=5",
         "motion=control control_nodes=12 exposure=true refine.times=true",
@@ -36,7 +36,7 @@ fn other_images_of_the_future_make_the_same_tensors() {
             picture.save(path).unwrap();
         }
         assert!(first == train("second"), "{changes}");
-        // The test would see it: other pictures of the observed part make another scene.
+        // The test would see it: other images of the observed part make another scene.
         let seen = &capture.frames[capture.train[0]].image;
         let mut picture = image::open(seen).unwrap().to_rgb8();
         picture.pixels_mut().for_each(|p| p.0 = [255 - p.0[1], p.0[0] / 2, 17]);

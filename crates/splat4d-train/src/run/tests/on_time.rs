@@ -94,7 +94,7 @@ fn a_resumed_run_keeps_its_time_and_its_past() {
     let options = TrainOptions { clock: Stopwatch::of(|| 0.0), ..TrainOptions::default() };
     resume_with(&run, &options, &AtomicBool::new(false), &mut |_| {}).unwrap();
     assert!(place.scene("crashed") == place.scene("whole") && saved(&place, "crashed").run.replans == whole);
-    // On a clock that flies the rest is planned anew, behind the plans that are there.
+    // On a clock that flies the rest is planned again, behind the plans that are there.
     let run = crashed("late");
     let late = Arc::new(AtomicUsize::new(0));
     let clock = Stopwatch::of(move || late.fetch_add(1, Ordering::Relaxed) as f64 * STEP);

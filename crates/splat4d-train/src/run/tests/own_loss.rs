@@ -9,7 +9,7 @@ const STEPS: &str = "iterations=20";
 /// The step within which the loss fails, after a checkpoint at half the steps.
 const FAILS: usize = 14;
 
-/// Pulls pictures towards black, and fails once.
+/// Pulls images towards black, and fails once.
 struct Darker {
     fails: Option<Arc<AtomicBool>>,
 }

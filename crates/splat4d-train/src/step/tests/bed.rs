@@ -14,13 +14,14 @@ use splat4d::layers::{Evaluation, Scene};
 use splat4d::scene::{Rows, Space, Time};
 use std::sync::Arc;
 
-/// A capture and its decoded pictures.
+/// A capture and its decoded images.
 pub(super) struct Bed {
     _place: Place,
     frames: Arc<Dataset>,
 }
 
-/// What shows where no Gaussian is: on the pictures' mean colour, the default, little of their error is there to begin with.
+/// What shows where no Gaussian is: on the images' mean colour, the default, little of their error is there to begin
+/// with.
 const BLACK: [f32; 3] = [0.0; 3];
 
 /// The result of a short training.

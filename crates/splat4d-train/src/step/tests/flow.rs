@@ -125,7 +125,7 @@ fn computed_flow_is_cached_in_the_run() {
 fn flow_that_runs_backwards_is_refused_by_file_and_frame() {
     let place = Place::new();
     let all = recipe(&["lambda_flow=1"]);
-    // Pictures of noise, each the one before moved by three pixels to the right.
+    // Images of noise, each the one before moved by three pixels to the right.
     let capture = place.open(&recipe(&[]));
     let marker = capture.root.join("capture.json");
     let mut json: Value = serde_json::from_slice(&std::fs::read(&marker).unwrap()).unwrap();

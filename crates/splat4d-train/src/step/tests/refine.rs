@@ -19,7 +19,7 @@ use std::sync::Arc;
 
 const CAMERAS: usize = 7;
 const MOMENTS: usize = 9;
-/// Sides of the pictures: for clocks, and for what is a matter of pixels.
+/// Sides of the images: for clocks, and for what is a matter of pixels.
 const SIZE: usize = 24;
 const FINE: usize = 48;
 /// Seconds of a frame.
@@ -27,7 +27,7 @@ const FRAME: f64 = 0.1;
 /// Radius of the ring of cameras.
 const EXTENT: f64 = 4.0;
 
-/// The made-up capture with other poses and times than it has.
+/// The synthetic capture with other poses and times than it has.
 struct Disturbed {
     made: Made,
     cameras: Vec<Camera>,
@@ -170,8 +170,9 @@ fn run(frames: Disturbed, line: &str) -> Left {
     }
 }
 
-/// Slow paths and no splits in time: in pictures of 24 pixels a model that follows motion as fast as the default's explains a
-/// wrong clock or pose by motion. In real pictures it finds both better than slow ones do (docs/refine.md).
+/// Slow paths and no splits in time: in images of 24 pixels a model that follows motion as fast as the default's
+/// explains a
+/// wrong clock or pose by motion. In real images it finds both better than slow ones do (docs/refine.md).
 const SLOW: &str = "adc.split_in_time=0 adc.full_at=0 spacetime.velocity_lr_init=0.005 life.width_lr=0.01";
 
 #[test]

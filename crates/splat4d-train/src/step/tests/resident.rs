@@ -63,7 +63,7 @@ fn gradients_of_the_whole_chain_equal_the_cpus() {
             let stepped = trainer.step().unwrap().unwrap();
             let expected = cpu.step().unwrap().unwrap().measured[0];
             assert!(stepped.notices.is_empty(), "{line}: {:?}", stepped.notices);
-            // Upkeep may have waited for it already.
+            // Maintenance may have waited for it already.
             let later = trainer.settle().unwrap();
             let measured = stepped.measured.iter().chain(&later).copied().next().expect("the step is done");
             assert_eq!(measured.iteration, step);

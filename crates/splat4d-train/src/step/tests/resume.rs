@@ -16,7 +16,7 @@ fn check(lines: &[&str]) {
             let p = trainer.progress;
             let length = lengths[p.stage];
             let around = [0, 1, length / 2, length - 1].contains(&p.stage_step);
-            // Where the run was planned anew, places are passed over, and stayed at.
+            // Where the run was planned again, places are passed over, and stayed at.
             let anywhere = !recipe.run.replans.rows().is_empty() && p.iteration.is_multiple_of(3);
             if p.iteration > 0 && (around || anywhere) {
                 kept.push((p.iteration, saved(&trainer)));

@@ -1,4 +1,4 @@
-//! Importance scores of Gaussians: how much of the training pictures each is, at instants that its life serves well.
+//! Importance scores of Gaussians: how much of the training images each is, at instants that its life serves well.
 //!
 //! Source: 4DGS-1K (Yuan et al. 2025, §4.1); the volume as LightGaussian (Fan et al. 2024).
 
@@ -73,7 +73,7 @@ pub struct Scores {
     pub views: usize,
 }
 
-/// Scores all Gaussians of `scene` by the views of `frames`; no picture is loaded. `progress` hears of views done and
+/// Scores all Gaussians of `scene` by the views of `frames`; no image is loaded. `progress` hears of views done and
 /// in all. The same bits for any number of threads.
 ///
 /// Errors: there is no frame.

@@ -40,7 +40,7 @@ pub enum Temporal {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Spatial {
-    /// Σ over pixels of α T: how much of the pictures it is (4DGS-1K).
+    /// Σ over pixels of α T: how much of the images it is (4DGS-1K).
     #[default]
     Share,
     /// Σ over pixels and channels of the squared change that its removal alone would make. Neighbours of one colour

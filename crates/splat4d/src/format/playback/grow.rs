@@ -1,6 +1,6 @@
 //! Files of takes that are not finished: sections are appended, and a new index behind them; then the header names the new
 //! index. Whoever read the old header goes on with the old index, of which nothing was touched. What is finished is written
-//! anew as any other file, its index in front.
+//! again as any other file, its index in front.
 
 use super::index::broken;
 use super::write::GENERATOR;
@@ -146,7 +146,8 @@ pub fn finish(source: &mut (impl Read + Seek), meta: Meta, poster: Option<&[u8]>
     Ok(index.file_len)
 }
 
-/// What the first picture needs: the first tier of its pages, what colours them, the rest of them; then time goes on. Palettes
+/// What the first image needs: the first tier of its pages, what colours them, the rest of them; then time goes on.
+/// Palettes
 /// come before the first page that names them, masks behind their page, labels behind everything. Equal ones stand by their bytes, so that who added
 /// what when does not show.
 fn order(index: &Index) -> Vec<usize> {

@@ -38,7 +38,7 @@ pub enum Kind {
     Labels,
     /// Feature channels of the Gaussians of a page.
     Features,
-    /// A picture.
+    /// An image.
     Poster,
     /// Where the file comes from.
     Provenance,
@@ -236,7 +236,7 @@ impl Index {
         self.of_pages(Kind::Masks)
     }
 
-    /// Pages that have a section of this kind beside them, and these sections, by page.
+    /// Pages that have a section of this kind next to them, and these sections, by page.
     pub(crate) fn of_pages(&self, kind: Kind) -> Vec<(u32, usize)> {
         let sections = self.sections.iter().enumerate().filter(|(_, e)| e.kind == kind);
         let mut all: Vec<(u32, usize)> = sections.filter_map(|(i, e)| Some((e.page?, i))).collect();

@@ -65,15 +65,15 @@ pub struct Meta {
 pub struct Viewpoint {
     /// The eye.
     pub position: [f64; 3],
-    /// The point in the middle of the picture.
+    /// The point in the middle of the image.
     pub target: [f64; 3],
-    /// Upwards in the picture.
+    /// Upwards in the image.
     pub up: [f64; 3],
     /// Vertical field of view, degrees.
     pub fov_y: f64,
 }
 
-/// A camera of the capture; its pictures are without distortion.
+/// A camera of the capture; its images are without distortion.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct NamedCamera {
     /// As the capture calls it.
@@ -121,9 +121,9 @@ pub struct PathKey {
     pub at: f64,
     /// The eye.
     pub position: [f64; 3],
-    /// The point in the middle of the picture.
+    /// The point in the middle of the image.
     pub target: [f64; 3],
-    /// Upwards in the picture.
+    /// Upwards in the image.
     pub up: [f64; 3],
     /// Vertical field of view, degrees.
     pub fov_y: f64,

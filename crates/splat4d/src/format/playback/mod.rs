@@ -100,7 +100,7 @@ pub struct Primitive {
     pub base_color: [f32; 3],
     /// SH coefficients k = 1 … 15 of channel c at 3(k − 1) + c; those above the scene's degree are not read.
     pub sh_rest: [f32; 45],
-    /// How much it adds to pictures; any unit. Decides tiers and how much the palette cares.
+    /// How much it adds to images; any unit. Decides tiers and how much the palette cares.
     pub importance: f32,
     /// Number of its label in [`Meta::labels`]; none: it has none.
     pub label: Option<u8>,
@@ -126,6 +126,6 @@ pub struct Draft {
     pub meta: Meta,
     /// Spans of time.
     pub nodes: Vec<Node>,
-    /// A JPEG or PNG picture.
+    /// A JPEG or PNG image.
     pub poster: Option<Vec<u8>>,
 }

@@ -17,7 +17,7 @@ const TIME_WEIGHT: f64 = 4.0;
 const SIZE_WEIGHT: f64 = 0.35;
 /// Standard deviations of its tails at which a life counts as over: o·σ is 1/255 at 3.3 of an opaque Gaussian.
 const TAILS: f64 = 3.0;
-/// Cells along the longest side of a block's box, within which Morton order is told apart.
+/// Cells along the longest side of a block's box, within which Morton order is distinguished.
 const CELLS: f64 = (1u32 << 10) as f64;
 const _: () = assert!(MORTON_BITS >= 10);
 

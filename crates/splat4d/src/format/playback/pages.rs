@@ -59,7 +59,7 @@ pub struct PagesDraft<'a> {
     pub palette: Option<&'a Palette>,
     /// Of every layer.
     pub tiers: &'a [u16],
-    /// A JPEG or PNG picture.
+    /// A JPEG or PNG image.
     pub poster: Option<&'a [u8]>,
 }
 

@@ -19,7 +19,7 @@ use crate::scene::{Camera, Time};
 /// A file that version 1.0 of the writer made from [`tiny`], byte for byte.
 const GOLDEN: &[u8] = include_bytes!("../../../tests/data/tiny.s4d");
 
-/// A Gaussian of a made-up scene. One in three lives for ever.
+/// A Gaussian of a synthetic scene. One in three lives for ever.
 fn primitive(r: Rng) -> Primitive {
     let three = |first: u64, by: f64| std::array::from_fn(|k| (by * r.normal(first + k as u64)) as f32);
     let width = if r.below(0, 3) == 0 { f64::INFINITY } else { (r.uniform(1) - 0.5).max(0.0) };
@@ -231,7 +231,7 @@ fn a_block_is_alive_whenever_one_of_its_gaussians_is_seen() {
     assert!(dead * 20 > total, "the order makes blocks that can be culled by life: {dead} of {total}");
 }
 
-/// A picture from in front at time t.
+/// An image from in front at time t.
 fn picture(scene: &Scene<f32>, t: f64) -> Vec<f32> {
     let camera = Camera::with_fov_y(Se3::look_at([0.5, -1.0, -4.0], [0.0; 3], scene.up), 0.8, 96, 80);
     let (mut instant, mut image) = (Evaluation::default(), Image::default());
@@ -280,7 +280,7 @@ fn floats(draft: &Draft) -> Scene<f32> {
 
 #[test]
 fn images_of_the_file_are_those_of_the_floats() {
-    // Made-up coefficients are noise, the worst case for a palette: here they have an entry each, like degree 0 to 2.
+    // Synthetic coefficients are noise, the worst case for a palette: here they have an entry each, like degree 0 to 2.
     for (degree, least) in [(0, 45.0), (2, 40.0)] {
         let draft = made_up(2400, degree, 4);
         let (bytes, summary) = bytes_of(&draft, &WriteConfig::default());
@@ -404,7 +404,7 @@ fn a_file_of_version_1_0_stays_readable() {
     }
 }
 
-/// Writes the golden file anew when `UPDATE_GOLDEN` is set: only for a new version of the format.
+/// Writes the golden file again when `UPDATE_GOLDEN` is set: only for a new version of the format.
 #[test]
 fn golden_file_is_written_only_on_request() {
     if std::env::var_os("UPDATE_GOLDEN").is_some() {

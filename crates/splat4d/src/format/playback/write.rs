@@ -26,7 +26,7 @@ const SMALLEST_TIER: usize = 4096;
 pub(super) const GENERATOR: &str = concat!("splat4d ", env!("CARGO_PKG_VERSION"));
 /// Bytes of a palette's ranges, before its planes.
 const RANGE_BYTES: usize = 12;
-/// A poster up to this size comes before everything else; a larger one would only delay the first picture.
+/// A poster up to this size comes before everything else; a larger one would only delay the first image.
 const SMALL_POSTER: usize = 64 << 10;
 /// The palette takes a Gaussian's importance for at least and at most this many times the mean.
 const WEIGHTS: [f32; 2] = [0.01, 100.0];
@@ -263,7 +263,7 @@ pub fn write(draft: &Draft, config: &WriteConfig, out: &mut dyn Write) -> Result
         .enumerate()
         .try_for_each(|(i, n)| check(n, &draft.meta).map_err(|e| e.at(format!("node {i}"))))?;
     let (palette, entries) = palette(draft, config);
-    // First what the first picture needs: the important Gaussians of the clip's start in their base colours, what
+    // First what the first image needs: the important Gaussians of the clip's start in their base colours, what
     // colours them, the rest of them; then time goes on.
     let start = draft.meta.clip[0];
     let mut pieces = pieces(draft, config);
@@ -327,7 +327,7 @@ fn runs(entry: &Entry) -> (usize, usize) {
     }
 }
 
-/// Deflates a section where that makes it smaller; pictures are compressed already.
+/// Deflates a section where that makes it smaller; images are compressed already.
 fn pack(mut entry: Entry, body: Vec<u8>, level: u32) -> (Entry, Vec<u8>) {
     entry.bytes = u32::try_from(body.len()).expect("a section has less than 4 GiB");
     let mut stored = body;

@@ -51,7 +51,7 @@ const MOST_META: usize = 4 << 20;
 const CODES: usize = 256;
 /// Fourth byte of a quaternion whose largest part is w.
 const LARGEST_W: u8 = 252;
-/// Centroids in a row of their picture.
+/// Centroids in a row of their image.
 const ROW_OF_CENTROIDS: usize = 64;
 
 /// The files of the scene in a `.sog` file, which is a zip: `meta.json`, then what it names, and nothing else.
@@ -68,7 +68,7 @@ pub fn unzip(bytes: &[u8]) -> Result<Files<'_>> {
     let take = |name: &str, most: usize| archive.file(&format!("{folder}{name}"), most);
     let meta = take(META, MOST_META).expect("it is one of the names")?;
     let wanted = files_of(&meta)?;
-    // Pictures are compressed before they are zipped.
+    // Images are compressed before they are zipped.
     let packed = wanted.iter().filter_map(|n| archive.packed(&format!("{folder}{n}"))).sum();
     let most = pictures::most_bytes(count_of(&parse(&meta)?, packed)?);
     let mut files = Files::from([(META.to_owned(), meta)]);
@@ -80,7 +80,7 @@ pub fn unzip(bytes: &[u8]) -> Result<Files<'_>> {
     Ok(files)
 }
 
-/// The number of Gaussians. Errors: none is stated, or more than `bytes` of pictures can hold.
+/// The number of Gaussians. Errors: none is stated, or more than `bytes` of images can hold.
 fn count_of(meta: &Value, bytes: usize) -> Result<usize> {
     let count = meta["count"].as_u64().and_then(|n| usize::try_from(n).ok());
     let count = count.ok_or_else(|| damaged("its meta.json has no `count`"))?;
@@ -90,7 +90,7 @@ fn count_of(meta: &Value, bytes: usize) -> Result<usize> {
     Ok(count)
 }
 
-/// Names of the pictures that a `meta.json` speaks of: what a folder's reader must fetch.
+/// Names of the images that a `meta.json` speaks of: what a folder's reader must fetch.
 ///
 /// Errors: not JSON, or another version.
 pub fn files_of(meta: &[u8]) -> Result<Vec<String>> {
@@ -102,7 +102,7 @@ pub fn files_of(meta: &[u8]) -> Result<Vec<String>> {
 
 /// Reads a scene from its files.
 ///
-/// Errors: no `meta.json`, another version, a missing or too small picture, numbers that are none.
+/// Errors: no `meta.json`, another version, a missing or too small image, numbers that are none.
 pub fn read(files: &Files<'_>) -> Result<(Params, Warnings)> {
     let Some(meta) = files.get(META) else {
         return Err(damaged("it has no meta.json"));

@@ -1,24 +1,24 @@
-//! Lossless WebP pictures, decoded no further than their use bears out.
+//! Lossless WebP images, decoded no further than their use bears out.
 
 use super::damaged;
 use crate::Result;
 use image_webp::WebPDecoder;
 use std::io::Cursor;
 
-/// Pixels a picture may have for each one needed: writers round sides up, some to powers of two.
+/// Pixels an image may have for each one needed: writers round sides up, some to powers of two.
 const SLACK: usize = 4;
-/// Pixels that any picture may have: a palette of 65,536 entries of 15 coefficients.
+/// Pixels that any image may have: a palette of 65,536 entries of 15 coefficients.
 const ALWAYS: usize = 1 << 20;
 
-/// Bytes of a picture beside its pixels: WebP's chunks, EXIF, colour profiles.
+/// Bytes of an image next to its pixels: WebP's chunks, EXIF, colour profiles.
 const MOST_CHUNKS: usize = 1 << 20;
 
-/// Longest file of a picture of a scene of `count` Gaussians: lossless WebP never takes more than its RGBA pixels.
+/// Longest file of an image of a scene of `count` Gaussians: lossless WebP never takes more than its RGBA pixels.
 pub(super) fn most_bytes(count: usize) -> usize {
     4 * ALWAYS.max(SLACK.saturating_mul(count)) + MOST_CHUNKS
 }
 
-/// Which pixels a picture must hold.
+/// Which pixels an image must hold.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Needs {
     /// One a Gaussian.
@@ -37,7 +37,7 @@ pub(super) struct Picture {
 }
 
 impl Picture {
-    /// Decodes a picture. Errors: not WebP, lossy, damaged, fewer pixels than needed, or absurdly many.
+    /// Decodes an image. Errors: not WebP, lossy, damaged, fewer pixels than needed, or absurdly many.
     pub(super) fn open(bytes: &[u8], needs: Needs) -> Result<Self> {
         let broken = |e| damaged(format!("the image cannot be decoded ({e})"));
         let mut decoder = WebPDecoder::new(Cursor::new(bytes)).map_err(broken)?;
@@ -60,7 +60,7 @@ impl Picture {
         Ok(Self { width, height, pixels, channels })
     }
 
-    /// Red, green, blue, alpha of pixel i; alpha is 255 where the picture has none.
+    /// Red, green, blue, alpha of pixel i; alpha is 255 where the image has none.
     #[inline]
     pub(super) fn pixel(&self, i: usize) -> [u8; 4] {
         let p = &self.pixels[i * self.channels..][..self.channels];

@@ -51,7 +51,7 @@ const ANTIALIASED: u8 = 1;
 /// Flag: vendors' extensions are present.
 const EXTENDED: u8 = 2;
 
-/// Metadata of a file, besides its Gaussians.
+/// Metadata of a file, in addition to its Gaussians.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SpzInfo {
     /// 2, 3 or 4.

@@ -11,7 +11,7 @@ use crate::scene::{Camera, Splats, Time};
 use std::collections::VecDeque;
 use std::time::Instant;
 
-/// Frames that are under way at most, as on a screen with three pictures.
+/// Frames that are under way at most, as on a screen with three images.
 const FRAMES: usize = 3;
 /// The step of which the frames are a view, as far as room for pairs goes.
 const VIEW: u32 = 1;
@@ -25,7 +25,7 @@ struct Film<'a> {
 
 impl GpuRenderer {
     /// Draws frames of a scene, which takes the place of whatever is kept, as planes on the GPU: seconds from the first submission to the end of the last.
-    /// `None`: a picture must be drawn in bands. Errors: a driver that failed.
+    /// `None`: an image must be drawn in bands. Errors: a driver that failed.
     pub fn film(
         &mut self,
         layers: &[KeptLayer<'_>],

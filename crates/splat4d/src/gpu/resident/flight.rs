@@ -1,8 +1,10 @@
 //! Steps under way: begun without a wait, and done some steps later, when the GPU has written their record (record.wgsl).
 //!
 //! Where a view has more pairs than there is room for, the GPU stops: nothing that follows is applied, neither of that step nor of
-//! those behind it, which may have been begun already. Who reads the record gives more room, or cuts pictures into more bands, and
-//! begins anew from that very view on. A step is a function of what it was begun with, so that neither the room nor the moment at
+//! those behind it, which may have been begun already. Who reads the record gives more room, or cuts images into
+//! more bands, and
+//! begins again from that very view on. A step is a function of what it was begun with, so that neither the room nor
+//! the moment at
 //! which its record is read changes a bit.
 
 use super::{KeptPass, STEP_WORDS, Tables, VIEW_WORDS};
@@ -18,7 +20,7 @@ use crate::{Error, ErrorKind, Result};
 use std::collections::VecDeque;
 
 /// Steps that are under way at most: enough that a hiccup of the CPU of some steps' length is not seen, few enough that what they
-/// hold (a picture each, where pictures are not kept) is little.
+/// hold (an image each, where images are not kept) is little.
 pub(in crate::gpu) const AHEAD: usize = 8;
 /// What stops steps because a number is none (record.wgsl).
 const NOT_FINITE: u32 = u32::MAX;
@@ -67,7 +69,7 @@ pub(in crate::gpu) struct Flights {
     done: Vec<KeptStepped>,
     /// Memory of records that nobody uses now.
     spare: Vec<Grown>,
-    /// Steps that were begun anew for want of room.
+    /// Steps that were begun again for want of room.
     #[cfg(test)]
     pub again: usize,
 }
@@ -232,7 +234,7 @@ impl GpuRenderer {
         pass.write_uniforms(&self.gpu, across * down);
         self.write_uniforms(&shot, bands[0], across, way)?;
         self.write_loss(&loss);
-        // A stage is timed once in a submission, and of pictures in bands none is.
+        // A stage is timed once in a submission, and of images in bands none is.
         let clock = if bands.len() == 1 { self.clock } else { StageClock::Off };
         let mut recorder = Recorder::new(&self.gpu, &self.queries, clock);
         tables.answer(&self.gpu, &self.buffers, &self.upload, &mut recorder)?;
@@ -289,7 +291,7 @@ impl GpuRenderer {
         Back { frame: self.frame(), kernels, pairs }
     }
 
-    /// Waits for the oldest step, which is begun anew while there is too little room for it.
+    /// Waits for the oldest step, which is begun again while there is too little room for it.
     fn land(&mut self) -> Result<()> {
         loop {
             let Some(flight) = self.flights.under_way.pop_front() else { return Ok(()) };
@@ -334,7 +336,7 @@ impl GpuRenderer {
         match self.make_room_for_pairs(wanted) {
             Ok(_) => {}
             Err(e) if e.kind() == ErrorKind::Memory => {
-                // Pictures can be sent again.
+                // Images can be sent again.
                 self.pictures.shrink();
                 self.make_room_for_pairs(wanted)?;
             }

@@ -225,7 +225,7 @@ fn tunings_change_no_bit() {
     }
 }
 
-/// Pictures of few pairs, then of more than there was room for, at a first view and at a later one.
+/// Images of few pairs, then of more than there was room for, at a first view and at a later one.
 fn far_and_near() -> [Vec<Camera>; 3] {
     let [far, near] = [camera([0.0, 0.0, -80.0], 16, 16), camera([0.0, 0.0, -4.0], 150, 110)];
     [vec![far.clone(), far.clone()], vec![far.clone(), near.clone()], vec![near, far]]
@@ -258,7 +258,7 @@ fn steps_under_way_room_bands_and_pages_change_no_bit() {
         assert!(stepped(&mut r, &steps) == expected, "room that runs out changes bits, {ahead} steps under way");
         assert!(r.flights.again > before, "the first room was too little");
     }
-    // Fewer pairs at once than a picture has: bands.
+    // Fewer pairs at once than an image has: bands.
     stepped(&mut r, &[(&then, 0.01)]);
     let near = r.stats().pairs;
     poor(&mut r);
@@ -294,7 +294,7 @@ fn a_non_finite_value_stops_later_steps_and_its_step_is_reported() {
         assert_eq!(wrong, Some(2), "{done:?}");
         assert!(numbers.params[0].iter().any(|x| !x.is_finite()));
     }
-    // It starts anew as if nothing had been.
+    // It starts again as if nothing had been.
     let steps = &steps[..2];
     let (a, b) = (stepped(&mut r, steps), stepped(&mut own_renderer().expect("it was there"), steps));
     assert!(a == b && a.0.iter().all(|s| s.bad.is_none()));

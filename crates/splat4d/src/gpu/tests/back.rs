@@ -1,4 +1,4 @@
-//! The way back: each kernel against its twin, then all of it against the CPU's, which is checked against finite
+//! The backward pass: each kernel against its twin, then all of it against the CPU's, which is checked against finite
 //! differences (render/tests.rs).
 
 use super::*;
@@ -12,7 +12,7 @@ const VECTOR: f64 = 1e-4;
 /// Of the whole chain, where a splat at the α cut-off may be drawn by one side only.
 const CHAIN: f64 = 2e-3;
 
-/// A gradient to a picture: of both signs, different in all planes.
+/// A gradient to an image: of both signs, different in all planes.
 fn gradient(seed: u64, channels: usize, camera: &Camera) -> Planes<f32> {
     let mut out = Planes::new(channels, camera.height, camera.width);
     let rng = Rng::new(seed, "gradient", channels as u64);
@@ -344,7 +344,7 @@ fn the_backward_pass_repeats_bit_for_bit_in_bands() {
     };
     assert!(first.background == second.background && all(&first, &first_sh) == all(&second, &second_sh));
     assert!(r.timings().back_total > 0.0 && r.timings().back_wait > 0.0);
-    // Less room than one picture's pairs: bands, whose records are made one after the other.
+    // Less room than one image's pairs: bands, whose records are made one after the other.
     r.most_pairs = pairs / 3;
     (r.buffers, r.groups) = (Buffers::new(), None);
     let (_, bands, bands_sh) = back(&mut r, &shot, &pulled.all());

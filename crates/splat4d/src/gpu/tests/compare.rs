@@ -3,16 +3,16 @@
 use super::*;
 use crate::render::{Comparison, PartGrads, Target};
 
-/// Largest difference of a gradient to a picture from that in f64, of the root of the mean square of all.
+/// Largest difference of a gradient to an image from that in f64, of the root of the mean square of all.
 const PICTURE: f64 = 1e-4;
-/// Largest relative difference of a mean over the picture.
+/// Largest relative difference of a mean over the image.
 const VALUE: f64 = 1e-5;
 /// Largest relative difference of gradients to Gaussians, as vectors: the same lists on both ways.
 const VECTOR: f64 = 1e-4;
 /// A camera's matrix without the identity, row by row, and its offsets.
 const RESPONSE: [f32; 12] = [0.2, 0.03, -0.02, 0.01, -0.1, 0.04, -0.03, 0.02, 0.05, 0.02, 0.0, -0.03];
 const DSSIM: f64 = 0.2;
-/// The background: nothing of 8 bits, of which a picture may be made, because where both are equal L1 has no gradient.
+/// The background: nothing of 8 bits, of which an image may be made, because where both are equal L1 has no gradient.
 const BEHIND: [f32; 3] = [0.21, 0.507, 0.903];
 
 /// The truth, and the weights of its pixels: numbers of 8 bits, or any.
@@ -32,7 +32,8 @@ fn truth(seed: u64, camera: &Camera, eight: bool) -> (Planes<f32>, Planes<f32>) 
     (color, weight)
 }
 
-/// The definition: value and gradient to the drawn picture and to the response, every window summed up where it is needed.
+/// The definition: value and gradient to the drawn image and to the response, every window summed up where it is
+/// needed.
 fn defined(drawn: &Planes<f32>, target: &Target<'_>) -> (Comparison, Vec<f64>) {
     let (h, w) = (drawn.height as i64, drawn.width as i64);
     let pixels = (h * w) as usize;
@@ -139,7 +140,7 @@ fn value_and_gradient_equal_the_definition_and_the_way_through_the_cpu() {
             let what = format!("camera {i}, {weighted}, {response:?}, {eight}");
             let (got, d, d_sh) = compared(&mut r, &shot, &target);
             let d_picture: Vec<f32> = read(&r.gpu, &r.buffers.d_planes, 3 * truth.pixels());
-            // The same through the CPU: the picture comes down, its gradient goes up.
+            // The same through the CPU: the image comes down, its gradient goes up.
             let mut image = Image::default();
             r.render(&shot, &mut image).expect("it is drawn");
             let (expected, d_expected) = defined(&image.color, &target);
@@ -187,14 +188,14 @@ fn comparison_repeats_bit_for_bit_at_any_budget_and_images_are_uploaded_once() {
     (r.buffers, r.groups) = (Buffers::new(), None);
     r.make_room_for_pairs(1000).expect("a little room");
     assert!(first == bits(compared(&mut r, &shot, &target(0))), "room changes no bit");
-    // A budget that holds two pictures: the third is sent whenever it is wanted.
+    // A budget that holds two images: the third is sent whenever it is wanted.
     let one = r.pictures.bytes();
     r.pictures.budget = 2 * one;
     for picture in [1, 2, 0, 1, 2] {
         assert!(first == bits(compared(&mut r, &shot, &target(picture))));
     }
     assert_eq!((r.pictures.sent, r.pictures.bytes()), (4, 3 * one));
-    // Pictures of another size end the time of the old ones.
+    // Images of another size end the time of the old ones.
     let small = super::camera([0.0, 0.5, -4.0], 50, 35);
     let (other, _) = truth(84, &small, false);
     let half = Target { truth: &other, weight: None, picture: 1, dssim: DSSIM, response: None };

@@ -1,4 +1,4 @@
-//! Whole pictures against the CPU's.
+//! Whole images against the CPU's.
 
 use super::*;
 use crate::render::RenderStats;
@@ -147,7 +147,7 @@ fn absurd_values_are_not_rendered() {
     let camera = camera([0.0, 0.5, -4.0], 90, 70);
     let scene = spoilt(&[f32::NAN, f32::INFINITY, f32::NEG_INFINITY]);
     compare(&mut r, &shot(&scene.splats(), &camera), "NaN and infinities");
-    // Numbers of which squares overflow mean nothing on either side, but they end, and in a finite picture.
+    // Numbers of which squares overflow mean nothing on either side, but they end, and in a finite image.
     let scene = spoilt(&[1e38, -1e38, 1e30, -1e30, 1e-38]);
     let mut image = Image::default();
     r.render(&shot(&scene.splats(), &camera), &mut image).expect("it is drawn");

@@ -66,7 +66,7 @@ fn projection_equals_the_cpus() {
             assert!(close(colors[j][3], p.depth, RELATIVE, RELATIVE), "depth {j}");
         }
         assert!(seen > n / 20, "the test must see something: {seen}");
-        // Only a splat on the very edge of the picture or of the α cut-off may be judged otherwise.
+        // Only a splat on the very edge of the image or of the α cut-off may be judged otherwise.
         assert!(doubtful <= 2, "{doubtful} splats are visible on one side only");
     }
 }
@@ -334,7 +334,7 @@ fn least_distance(shape: &[f32; 8], tile: [usize; 2], side: usize, size: [usize;
 #[test]
 fn lists_of_tiles_are_complete_and_in_the_cpus_order() {
     let Some(mut r) = renderer() else { return };
-    // The last has rows twice over: equal depths are told apart by the splats' numbers.
+    // The last has rows twice over: equal depths are distinguished by the splats' numbers.
     let mut twins = Scenery::new(6, 400, 1.0, 0.1);
     for j in 200..400 {
         let mean: [f32; 3] = twins.out.read(j - 200, 0);

@@ -143,7 +143,7 @@ fn gradients(layers: &[Layer<f64>]) -> (Vec<Grads<f64>>, Vec<f64>) {
     e.activate(&mut d);
     for (i, mut d_out) in d_outs(&e).into_iter().enumerate() {
         match i {
-            // Half comes from a picture and half from a loss on splats.
+            // Half comes from an image and half from a loss on splats.
             0 => {
                 d_out.data_mut().iter_mut().for_each(|x| *x *= 0.5);
                 e.add_gradient(0, &mut d_out.clone(), &mut None, &mut None);

@@ -361,7 +361,7 @@ fn gradients_run_through_the_history() {
             }
         }
         assert!(met > 30, "only {met} numbers matter");
-        // Where earlier frames are constants, less is learnt from the same picture.
+        // Where earlier frames are constants, less is learnt from the same image.
         let stopped = FilteredSpec { stop_gradient: true, ..spec };
         let (p, model) = filled::<f64>(&Spec::Filtered(stopped), 3);
         let q = At { p: &p, of: Space::Gaussians, rows: Rows::All, t: Time(t) };

@@ -21,7 +21,7 @@ pub(super) const RIGHT: usize = 2;
 /// The life's exponent stops at −30: e⁻³⁰ is seen by nobody, and in f32 products with it do not become subnormal.
 const FAINTEST: f64 = 60.0;
 
-/// Parameters of a slice besides the row: see [`super::Native4dSpec`].
+/// Parameters of a slice in addition to the row: see [`super::Native4dSpec`].
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Frame<F> {
     /// κ, scene units a second.

@@ -1,4 +1,4 @@
-//! A Gaussian of space and time as its slice: mean, covariance, velocity and life, and the way back to scales and
+//! A Gaussian of space and time as its slice: mean, covariance, velocity and life, and the backward pass to scales and
 //! quaternions. In f64, a row at a time: for edits and for conversions.
 
 use super::Native4dSpec;
@@ -72,7 +72,7 @@ impl Sliced {
 }
 
 /// Scales and axes (columns, a rotation) of BBᵀ by one-sided Jacobi rotations of B's rows, so that small scales keep their
-/// digits beside large ones (Demmel and Veselić 1992). The last axis is the one closest to t, and points forward.
+/// digits next to large ones (Demmel and Veselić 1992). The last axis is the one closest to t, and points forward.
 fn principal(b: [[f64; 4]; 4]) -> ([f64; 4], [[f64; 4]; 4]) {
     let mut rows = b;
     // Row i of `turns`: which sum of B's rows `rows[i]` is.

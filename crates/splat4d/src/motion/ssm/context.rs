@@ -22,7 +22,7 @@ pub(crate) fn width(e: Equivariance) -> usize {
     }
 }
 
-/// Takes the nodes' surroundings anew, from where they are at rest. Whoever moves nodes by other means than training
+/// Takes the nodes' surroundings again, from where they are at rest. Whoever moves nodes by other means than training
 /// calls it.
 ///
 /// Shapes: `node_context` [nodes, 3 | 21 | 15]. Lengths are in units of the cloud's radius or of the neighbours' distance,
@@ -70,7 +70,7 @@ fn length(v: &[[f64; 3]]) -> f64 {
 /// The context of sixteen nodes.
 #[derive(Clone, Debug)]
 pub(crate) struct Around<F> {
-    /// Scalars that the network sees beside the embedding: a position, or offsets in the frame.
+    /// Scalars that the network sees next to the embedding: a position, or offsets in the frame.
     pub scalars: Vec<Lane<F>>,
     /// Vectors [`VECTORS`], 3 that vector neurons see.
     pub vectors: Vec<Lane<F>>,

@@ -13,7 +13,7 @@ use std::ops::Range;
 
 /// Octaves in which a node sees its own position (without equivariance): down to 0.4 radii of the cloud.
 const PLACE_OCTAVES: usize = 5;
-/// Numbers of a tick of the clock beside γ: the impulses at the first and the last tick.
+/// Numbers of a tick of the clock next to γ: the impulses at the first and the last tick.
 const IMPULSES: usize = 2;
 
 /// Where the weights lie, and in which tables.

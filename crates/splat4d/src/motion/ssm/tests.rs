@@ -6,7 +6,7 @@ use super::*;
 use crate::math::quat;
 use crate::motion::skin::POSE_COLUMNS;
 
-/// Nodes of a made-up cloud; two blocks, the second not full.
+/// Nodes of a synthetic cloud; two blocks, the second not full.
 const NODES: usize = 27;
 const TIMES: [f64; 4] = [0.0, 0.31, 0.77, 1.0];
 

@@ -3,7 +3,7 @@
 use super::*;
 use crate::math::Rng;
 
-/// Bins that the picture's edges cut.
+/// Bins that the image's edges cut.
 const INSIDE: [usize; 2] = [29, 21];
 
 /// Round and thin splats all over a bin, with the rows that their ellipses reach.

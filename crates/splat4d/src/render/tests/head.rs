@@ -54,7 +54,7 @@ fn images_with_a_head_equal_the_oracle() {
     }
 }
 
-/// A 1x1 convolution is a matrix product a pixel: the picture of the nine channels, multiplied by hand.
+/// A 1x1 convolution is a matrix product a pixel: the image of the nine channels, multiplied by hand.
 #[test]
 fn the_network_is_a_matrix_product_a_pixel() {
     let (s, view) = (Headed::new(20, 0.3), camera(33, 21));
@@ -165,7 +165,7 @@ fn every_gradient_of_a_head_equals_finite_differences() {
         };
         close((at(1e-6) - at(-1e-6)) / 2e-6, d.camera[k], &format!("pose {k}"));
     }
-    // A picture without a head leaves no gradient of one behind.
+    // An image without a head leaves no gradient of one behind.
     renderer.render(&shot(&s.scene.splats(), &view, BACKGROUND, extra), &mut out);
     renderer.backward(
         &shot(&s.scene.splats(), &view, BACKGROUND, extra),

@@ -17,7 +17,7 @@ const STEPS: usize = 120;
 /// The permitted loss, dB.
 const BOUND: f64 = 0.1;
 
-/// The truth's pictures in every frame of the made-up capture.
+/// The truth's images in every frame of the synthetic capture.
 struct Drawn {
     frames: Made,
     pictures: Vec<Picture>,
@@ -96,7 +96,7 @@ fn a_flickering_copy_of_the_backdrop_goes_and_the_image_stays() {
     let pictures = (0..frames.len()).map(picture).collect();
     let frames = Arc::new(Drawn { frames, pictures });
 
-    // Every Gaussian of the truth lasts; besides, faint copies of it come and go.
+    // Every Gaussian of the truth lasts; in addition, faint copies of it come and go.
     let parent = (0..TRUTH * (1 + REPEATS)).map(|j| (j % TRUTH) as u32).collect::<Vec<_>>();
     let copies = RowEdit { space: Space::Gaussians, born: vec![splat4d::scene::Born::Clone; parent.len()], parent };
     let mut repeated = truth.clone();

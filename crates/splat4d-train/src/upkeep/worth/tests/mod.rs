@@ -15,7 +15,7 @@ use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LIFE, LifeKind, Params, Part, Rows, SH, Splats, Time};
 
-/// Cameras, moments and pixels across of the made-up capture; ten frames a second.
+/// Cameras, moments and pixels across of the synthetic capture; ten frames a second.
 const CAPTURE: (usize, usize, usize) = (3, 9, 40);
 
 /// A layer of Gaussians around the origin, with lives of random lengths about random moments of the clip.
@@ -194,7 +194,7 @@ fn pruning_goes_by_rank_over_all_layers_and_leaves_one() {
     assert!(prune(&s, &scores, 0.5).iter().all(|e| e.space == Space::Gaussians));
 }
 
-/// The rows that a life leaves draw the very picture of all rows: what it hides is below the blend's cut-off.
+/// The rows that a life leaves draw the very image of all rows: what it hides is below the blend's cut-off.
 #[test]
 fn interval_buckets_lose_nothing() {
     let (s, made) = (scene(400), made());

@@ -5,7 +5,7 @@ use crate::layers::Layer;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::{GEOMETRY, LIFE, SH};
 
-/// A made-up file in memory.
+/// A synthetic file in memory.
 fn pages(n: usize, degree: usize, seed: u64) -> Pages {
     let config = WriteConfig { kmeans_rounds: 1, ..WriteConfig::default() };
     read_pages(&bytes_of(&made_up(n, degree, seed), &config).0).unwrap()
@@ -193,7 +193,7 @@ fn coarse_codes_leave_their_low_bits_alone() {
         assert!(page.words.iter().all(|w| [0, 255].contains(&(w[6] >> 24)) || (w[6] >> 24) % 8 == 1));
         assert!(page.words.iter().any(|w| w[6] >> 24 == 255));
     }
-    // Made-up numbers are noise: what is saved is what the low bits would have cost.
+    // Synthetic numbers are noise: what is saved is what the low bits would have cost.
     let stored = |file: &[u8]| -> u32 { Index::parse(file, None).unwrap().pages().map(|(_, e)| e.stored).sum() };
     let (few, all) = (stored(&file), stored(&written(&pages, Depths::default())));
     assert!(100 * few < 80 * all, "{few} bytes instead of {all}");

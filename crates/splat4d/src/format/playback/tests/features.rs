@@ -7,7 +7,7 @@ use crate::math::sh::dc_to_rgb;
 use crate::scene::SH;
 use crate::scene::features::{key, row};
 
-/// A made-up file whose Gaussians of the first node have three channels or, every fourth, none.
+/// A synthetic file whose Gaussians of the first node have three channels or, every fourth, none.
 fn featured(n: usize) -> Draft {
     let mut draft = made_up(n, 1, 7);
     draft.meta.features = vec![[-1.0, 2.0], [0.5, 0.5], [0.0, 10.0]];

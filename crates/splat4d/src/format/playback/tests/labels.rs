@@ -4,7 +4,7 @@ use super::hostile::{reseal, survive};
 use super::*;
 use crate::scene::labels;
 
-/// A made-up file whose Gaussians of the first two nodes have one of three labels or none.
+/// A synthetic file whose Gaussians of the first two nodes have one of three labels or none.
 fn labelled(n: usize) -> Draft {
     let mut draft = made_up(n, 1, 7);
     draft.meta.labels = vec!["floor".into(), "hand".into(), "ball".into()];
@@ -34,7 +34,7 @@ fn labels_come_back_through_drafts_and_pages() {
     let scene = read(&bytes).unwrap();
     assert_eq!(scene.labels, draft.meta.labels);
     assert_eq!(counts(&scene), [75, 75, 75, 175]);
-    // Each Gaussian has its own: they are told apart by their colours.
+    // Each Gaussian has its own: they are distinguished by their colours.
     let own = |color: [f32; 3]| draft.nodes[0].primitives.iter().find(|p| p.base_color == color).map(|p| p.label);
     assert!(draft.nodes[0].primitives.iter().all(|p| own(p.base_color) == Some(p.label)));
     let pages = read_pages(&bytes).unwrap();

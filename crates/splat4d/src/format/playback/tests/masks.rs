@@ -6,7 +6,7 @@ use crate::play::Player;
 use crate::scene::KeyMasks;
 use std::sync::Arc;
 
-/// A made-up file all of whose pages but the second have random masks.
+/// A synthetic file all of whose pages but the second have random masks.
 fn masked(n: usize, keys: usize, seed: u64) -> Pages {
     let mut pages = read_pages(&bytes_of(&made_up(n, 1, seed), &WriteConfig::default()).0).unwrap();
     for (i, layer) in pages.layers.iter_mut().enumerate().filter(|(i, _)| *i != 1) {
