@@ -252,7 +252,7 @@ mod tests {
     fn mistakes_are_reported_with_their_line() {
         for (text, words) in [
             ("", "empty"),
-            ("camera,x,y,time\n", "names none"),
+            ("camera,x,y,time\n", "contains no points"),
             ("camera,x,y,tim\n", "`tim`"),
             ("x,x,y,time\n", "twice"),
             ("x,y,time\n1,2,0\n", "neither"),

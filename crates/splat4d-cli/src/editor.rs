@@ -729,9 +729,9 @@ mod tests {
             (json!({"do": "delete", "select": "all"}), "nothing"),
             (json!({"do": "delete", "select": "all", "path": "/etc/passwd"}), "path"),
             (json!({"do": "explode"}), "explode"),
-            (json!({"do": "merge", "scene": "../other.ply", "name": "x"}), "beside"),
-            (json!({"do": "merge", "scene": "/etc/passwd", "name": "x"}), "beside"),
-            (json!({"do": "delete", "select": "not mask('../../m.png', cam)"}), "beside"),
+            (json!({"do": "merge", "scene": "../other.ply", "name": "x"}), "folder of the list"),
+            (json!({"do": "merge", "scene": "/etc/passwd", "name": "x"}), "folder of the list"),
+            (json!({"do": "delete", "select": "not mask('../../m.png', cam)"}), "folder of the list"),
             (json!({"do": "floaters", "strength": 0.5}), "run folder"),
             (json!("delete"), "known"),
         ] {

@@ -281,7 +281,7 @@ mod tests {
             let meta = format!(r#"{{"version": 2, "count": 1, "means": {{"files": ["{name}"]}}}}"#);
             std::fs::write(folder.path().join(sog::META), meta).unwrap();
             let error = Source::open(folder.path()).err().map(|e| e.to_string()).unwrap_or_default();
-            assert!(error.contains("elsewhere"), "{name}: {error}");
+            assert!(error.contains("outside its folder"), "{name}: {error}");
         }
     }
 

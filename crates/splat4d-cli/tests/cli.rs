@@ -206,7 +206,7 @@ fn a_capture_becomes_a_run_and_everything_follows() {
     assert_eq!((&told["finished"], &told["iteration"]), (&json!(true), &json!(20)));
     assert!(told["scene"]["gaussians"].as_u64().unwrap() > 10);
     let told = splat4d(&["info", str(&capture)]).run().ok();
-    assert!(told.contains("4 fixed") && told.contains("16 at 4 moments") && told.contains("cam0"), "{told}");
+    assert!(told.contains("4 fixed") && told.contains("16 at 4 times") && told.contains("cam0"), "{told}");
 
     // render
     let frames = work.path().join("frames");

@@ -185,7 +185,7 @@ fn own() -> String {
         "name": "a", "width": WIDTH, "height": HEIGHT, "fx": 8.0, "fy": 8.0, "cx": 4.0, "cy": 3.0,
         "world_to_camera": POSE, "images": "images/%d.png", "time_offset": 0.01,
     });
-    json!({"fps": 30, "cameras": [camera]}).to_string()
+    json!({"version": 1, "fps": 30, "cameras": [camera]}).to_string()
 }
 
 fn transforms() -> String {

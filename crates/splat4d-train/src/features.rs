@@ -370,7 +370,7 @@ mod tests {
         let cases: [(&[usize], &[f32], &str); 4] = [
             (&[SIDE, SIDE, 3], &broken, "channel 1 at pixel (7, 5) is NaN"),
             (&[SIDE, SIDE, 2], &sound[..2 * n], "has 2 channels, others 3"),
-            (&[SIDE, 20, 3], &sound[..60 * SIDE], "20x32, its picture 32x32"),
+            (&[SIDE, 20, 3], &sound[..60 * SIDE], "20x32, its image 32x32"),
             (&[SIDE, SIDE], &sound[..n], "is [height, width, channels]"),
         ];
         for (shape, values, words) in cases {

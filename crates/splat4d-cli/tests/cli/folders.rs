@@ -180,8 +180,8 @@ fn no_output_replaces_what_a_capture_reads_from_elsewhere() {
     let info = serde_json::json!({"version": "0", "capture": str(&capture.canonicalize().unwrap())});
     std::fs::write(run.join("run.json"), info.to_string()).unwrap();
     let camera = at("camera.json");
-    let lens =
-        r#"{"width": 8, "height": 6, "fx": 8, "fy": 8, "cx": 4, "cy": 3, "position": [0, 1, 4], "look_at": [0, 0, 0]}"#;
+    let lens = r#"{"width": 8, "height": 6, "fx": 8, "fy": 8, "cx": 4, "cy": 3,
+        "world_to_camera": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]}"#;
     std::fs::write(&camera, lens).unwrap();
     let image = |file: &Path| {
         let said = splat4d(&["render", str(&run), "--camera", str(&camera), "-o", str(file)]).run().refused();

@@ -414,7 +414,7 @@ fn what_cannot_be_imported_is_explained() {
         }
     }
     let alone = refused(&far, &[]);
-    assert!(alone.contains("30 degrees"), "{alone}");
+    assert!(alone.contains("20 degrees"), "{alone}");
     // Clocks that are told to be so far apart that nothing is shared.
     let path = take.join("import.toml");
     let text = std::fs::read_to_string(&path).unwrap();

@@ -150,7 +150,7 @@ mod tests {
         assert!(align(&mixed).unwrap_err().to_string().contains("do not agree"));
         assert!(align(&same[..2]).unwrap_err().to_string().contains("only 2"));
         let still = [(cameras()[0], cameras()[1]); 3];
-        assert!(align(&still).unwrap_err().to_string().contains("one place"));
+        assert!(align(&still).unwrap_err().to_string().contains("same position"));
     }
 
     #[test]

@@ -70,7 +70,7 @@ fn the_section_shows_before_after_images_and_settings() {
         "2.75x",
         "21.0x less than the source",
         "2.0x less",
-        "within the 0.40 dB",
+        "within the limit of 0.40 dB",
         "&lt;orb&gt;",
         "together",
         "1,500",
@@ -104,7 +104,7 @@ fn the_guard_warns_where_too_much_is_lost() {
     let failed = Guard { loss_db: 0.7, limit_db: 0.4, passed: false };
     let mut out = String::new();
     guard(&mut out, &Compressed { guard: Some(failed), ..Compressed::default() });
-    assert!(out.contains("class=\"warn\"") && out.contains("more than the 0.40 dB"), "{out}");
+    assert!(out.contains("class=\"warn\"") && out.contains("more than the limit of 0.40 dB"), "{out}");
 }
 
 #[test]

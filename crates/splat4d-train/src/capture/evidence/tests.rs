@@ -388,7 +388,7 @@ fn wrong_focal_lengths_are_named_without_points() {
         let found = warned(&capture);
         let named = found.iter().find(|w| w.contains("Focal lengths are probably wrong")).cloned().unwrap_or_default();
         let times: f64 = named.split("they are ").nth(1).and_then(|s| s.split(' ').next()?.parse().ok()).unwrap_or(0.0);
-        assert!((times * factor - 1.0).abs() < 0.2, "{factor}: {found:?}");
+        assert!((times * factor - 1.0).abs() < 0.2, "{factor}: {found:?} {:?}", capture.check_poses());
     }
 }
 

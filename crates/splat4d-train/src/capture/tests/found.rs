@@ -215,7 +215,7 @@ fn unreadable_images_are_named_by_their_format() {
         (b"II*\0\x08\0\0\0", &["TIFF", "Convert"]),
         (b"BM\x36\0\0\0", &["BMP", "Convert"]),
         (b"P6\n8 8\n255\n", &["PNM", "Convert"]),
-        (b"", &["empty", "delete it"]),
+        (b"", &["is empty", "write it again"]),
         (b"version https://git-lfs.github.com/spec/v1\n", &["Git LFS", "git lfs pull"]),
         (b"<!DOCTYPE html>", &["web page", "Download"]),
     ];

@@ -348,7 +348,7 @@ fn captures_that_cannot_be_tracked_are_refused_with_those_that_can() {
     staggered.moments[3].1 = 2;
     for bad in [moving, staggered] {
         let text = program.check(&bad).unwrap_err().to_string();
-        assert!(text.contains("3 fixed cameras") && text.contains("spacetime, deform-mlp"), "{text}");
+        assert!(text.contains("3 fixed, synchronised cameras") && text.contains("spacetime, deform-mlp"), "{text}");
     }
     let with = |knob: &str| {
         let (program, plan) = plan(5, 4, false, &[knob]);
