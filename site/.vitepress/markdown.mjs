@@ -49,7 +49,7 @@ const REFERENCES = [
   // `train --minutes` of `--minutes M` under `train`.
   [/(^|\/)cli[a-z-]*\.md$/, (section, cell) => cell.match(/--[\w-]+/)?.[0].replace(/^/, `${section} `)],
   // `Scene.at` of `at(t: float) -> Gaussians` under `Scene`.
-  [/(^|\/)python-api\.md$/, (section, cell) => cell.match(/^\w+/)?.[0].replace(/^/, `${section}.`)],
+  [/(^|\/)python-api(-scenes)?\.md$/, (section, cell) => cell.match(/^\w+/)?.[0].replace(/^/, `${section}.`)],
 ];
 
 /** A plugin: every setting, option and member is a row with an anchor of its own. */

@@ -57,6 +57,7 @@ const REFERENCE = [
   ['Python', [
     ['docs/python', 'Python'],
     ['docs/python-api', 'Python API'],
+    ['docs/python-api-scenes', 'Python API: scenes'],
   ]],
   ['docs/player', 'JavaScript: the player'],
   ['Captures', [

@@ -217,15 +217,48 @@ fn broken(shown: &str) -> String {
     format!("{}(\n    {}\n{}", &shown[..open], inside.trim_end_matches(", "), &shown[close..])
 }
 
+/// The page of scenes, which follow each other in the stub, and the first of them and the first after them.
+const SCENES: (&str, &str, &str) = ("docs/python-api-scenes.md", "\n## Camera\n", "\n## Frame\n");
+
+/// The class that is written in Python: its words and how it is made.
+fn motion() -> String {
+    let code = read(&root().join(PACKAGE).join("python/splat4d/motion.py"));
+    let words = code.split_once("class Motion:\n    \"\"\"").expect("there is the class").1;
+    let words = words.split_once("\"\"\"").expect("its words end").0.replace("\n    ", "\n");
+    let made = code.split_once("def __init__(\n        self,\n").expect("it is made").1;
+    let made = made.split_once("    ) -> None").expect("its arguments end").0.replace("\n        ", "\n    ");
+    format!("\n## Motion\n\n{}\n\n```python\nMotion(\n    {}\n)\n```\n", words.trim(), made.trim())
+}
+
+/// The pages: file and text.
+fn pages() -> [(&'static str, String); 2] {
+    let text = document();
+    let (file, first, after) = SCENES;
+    let (start, rest) = text.split_once(first).expect("the stub has cameras");
+    let (scenes, end) = rest.split_once(after).expect("the stub has captures");
+    let head = format!(
+        "# Python API: scenes\n\nCameras, Gaussians and scenes of the package `splat4d`. Functions, captures and runs: \
+         [Python API](python-api.md).\n\nThis file is generated: `{AGAIN}`.\n"
+    );
+    let start = start.replacen("\n## ", "\nCameras, Gaussians and scenes: [scenes](python-api-scenes.md).\n\n## ", 1);
+    [
+        ("docs/python-api.md", format!("{start}{}{after}{end}", motion())),
+        (file, format!("{head}{first}{}\n", scenes.trim_end())),
+    ]
+}
+
 #[test]
 fn every_public_name_of_the_package_is_on_the_page_with_words() {
-    let text = document();
-    let path = root().join("docs/python-api.md");
-    if std::env::var_os("UPDATE_GOLDEN").is_some() {
-        std::fs::write(&path, &text).expect("docs/ can be written");
+    let pages = pages();
+    for (file, text) in &pages {
+        let path = root().join(file);
+        if std::env::var_os("UPDATE_GOLDEN").is_some() {
+            std::fs::write(&path, text).expect("docs/ can be written");
+        }
+        let found = std::fs::read_to_string(&path).unwrap_or_default();
+        assert!(found == *text, "{file} is out of date. Write it again with\n    {AGAIN}");
     }
-    let found = std::fs::read_to_string(&path).unwrap_or_default();
-    assert!(found == text, "docs/python-api.md is out of date. Write it again with\n    {AGAIN}");
+    let text = pages.map(|(_, text)| text).concat();
     let init = read(&root().join(PACKAGE).join("python/splat4d/__init__.py"));
     let all = init.split_once("__all__").expect("it names what is public").1;
     let names: Vec<&str> = all.split('"').skip(1).step_by(2).filter(|n| !n.starts_with('_')).collect();

@@ -254,7 +254,7 @@ mod tests {
             ("", "empty"),
             ("camera,x,y,time\n", "contains no points"),
             ("camera,x,y,tim\n", "`tim`"),
-            ("x,x,y,time\n", "twice"),
+            ("x,x,y,time\n", "duplicate"),
             ("x,y,time\n1,2,0\n", "neither"),
             ("camera,x,y,time\nfront,1,0\n", "line 2: 3 fields"),
             ("camera,x,y,time\nfront,1,nan,0\n", "`nan`"),

@@ -203,9 +203,10 @@ fn panoptic() -> String {
 }
 
 fn poses_bounds() -> Vec<u8> {
-    let row = [1.0, 0.0, 0.0, 0.0, 6.0, 0.0, 1.0, 0.0, 0.0, 8.0, 0.0, 0.0, 1.0, 4.0, 8.0, 0.5, 9.0f32];
+    // Two cameras side by side.
+    let row = |x: f32| [1.0, 0.0, 0.0, x, 6.0, 0.0, 1.0, 0.0, 0.0, 8.0, 0.0, 0.0, 1.0, 4.0, 8.0, 0.5, 9.0];
     let mut out = Vec::new();
-    npy::write_f32(&[2, 17], &[row, row].concat(), &mut out).expect("memory takes all bytes");
+    npy::write_f32(&[2, 17], &[row(0.0), row(0.5)].concat(), &mut out).expect("memory takes all bytes");
     out
 }
 

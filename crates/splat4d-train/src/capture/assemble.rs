@@ -2,6 +2,7 @@
 
 use super::account::Severity;
 use super::account::{Aspect, Remark, first_names};
+use super::options::Lenses;
 use super::pose::{SAME_POSE, same_pose};
 use super::{
     Capture, CaptureKind, CaptureOptions, Exif, Extent, FlowFile, Frame, HoldOut, PointCloud, RawFrame, Rig, Split,
@@ -92,7 +93,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         downscale: options.downscale,
         convention: take.convention,
         poses: options.poses,
-        lenses: borders::Lenses::default(),
+        lenses: Lenses::default(),
         account: take.account.remarks,
         warnings: take.warnings,
         notes: take.notes,

@@ -12,7 +12,7 @@
 
 use super::account::Severity;
 use super::account::{Aspect, Remark};
-use super::options::Borders;
+use super::options::{Borders, Lens100};
 use super::{Capture, CaptureOptions, Frame, panorama, picture};
 use rayon::prelude::*;
 use splat4d::scene::Lens;
@@ -47,13 +47,6 @@ const LARGEST: f64 = 0.6;
 
 /// Images that are decoded at a time after the first: most lenses have no border, and one image says so.
 const AT_ONCE: usize = 4;
-
-/// A lens: size, orientation and intrinsics of its images, in hundredths of a pixel.
-type Lens100 = Vec<i64>;
-
-/// What the lenses of a take recorded, as far as they were looked at.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Lenses(BTreeMap<Lens100, Option<Arc<Vec<u8>>>>);
 
 /// Finds the borders of a capture's images and gives them to its frames; says so in the account. `firsts`: the first image of
 /// cameras of which only a part of the frames is listed.

@@ -51,7 +51,6 @@ mod tracks;
 mod transforms;
 
 pub use account::{Aspect, Remark, Severity};
-pub use borders::Lenses;
 pub use convention::{Convention, Poses};
 pub use depth::{DepthFile, DepthKind};
 pub use evidence::{Agreement, PoseCheck};
@@ -59,7 +58,7 @@ pub(crate) use flow::{FlowFile, to_picture as flow_picture};
 pub use lens::Distortion;
 pub use n3dv::{about_rows, rows_of};
 pub use options::{
-    Borders, CaptureOptions, CaptureSettings, Exif, FlowSource, HoldOut, MAX_POINTS, Sequence, Text, Times,
+    Borders, CaptureOptions, CaptureSettings, Exif, FlowSource, HoldOut, Lenses, MAX_POINTS, Sequence, Text, Times,
     Unregistered,
 };
 pub use points::PointCloud;

@@ -1,11 +1,19 @@
 //! Options of a capture in addition to where it lies.
 
-use super::borders::Lenses;
 use super::convention::Poses;
 use crate::settings::{Value, choices, settings};
 use splat4d::{Error, Result};
+use std::collections::BTreeMap;
 use std::ops::Range;
 use std::str::FromStr;
+use std::sync::Arc;
+
+/// A lens: size, orientation and intrinsics of its images, in hundredths of a pixel.
+pub(super) type Lens100 = Vec<i64>;
+
+/// What the lenses of a take recorded, as far as they were looked at.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Lenses(pub(super) BTreeMap<Lens100, Option<Arc<Vec<u8>>>>);
 
 /// Which frames are kept from training and used to measure.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -378,18 +378,21 @@ fn an_identity_pose_that_cannot_be_compared_is_not_checked() {
 }
 
 #[test]
-fn wrong_focal_lengths_are_named_without_points() {
-    for factor in [0.5, 0.7, 1.5, 2.0, 3.0] {
+fn focal_lengths_are_only_judged_where_matches_can_judge_them() {
+    let focal = |factor: f64| {
         let mut capture = photos(false);
         for frame in &mut capture.frames {
             let k = &mut frame.source.intrinsics;
             (k.fx, k.fy) = (k.fx * factor, k.fy * factor);
         }
-        let found = warned(&capture);
-        let named = found.iter().find(|w| w.contains("Focal lengths are probably wrong")).cloned().unwrap_or_default();
-        let times: f64 = named.split("they are ").nth(1).and_then(|s| s.split(' ').next()?.parse().ok()).unwrap_or(0.0);
-        assert!((times * factor - 1.0).abs() < 0.2, "{factor}: {found:?} {:?}", capture.check_poses());
-    }
+        let check = capture.check_poses();
+        let all = check.more.into_iter().chain([check.finding]);
+        all.filter(|f| f.what.to_lowercase().contains("focal lengths are")).collect::<Vec<_>>()
+    };
+    assert!(focal(1.0).iter().all(|f| f.severity == Severity::Note), "what is right is not called wrong");
+    // The matches of this scene fit half the length as well.
+    let vague = focal(1.5);
+    assert!(vague.iter().any(|f| f.aspect == Some(Aspect::NotChecked)), "{vague:?}");
 }
 
 #[test]

@@ -75,7 +75,7 @@ fn tables_and_arrays_say_the_same() {
 fn wrong_tracks_are_refused_by_point_and_frame() {
     let message = |text: &str| open(&sample(text)).unwrap_err().to_string();
     let head = "point,frame,x,y\n";
-    let out = format!("({}, 4), outside of the {WIDTH}x{HEIGHT} picture", WIDTH + 1);
+    let out = format!("({}, 4), outside of the {WIDTH}x{HEIGHT} image", WIDTH + 1);
     let rows = format!("{head}3,1,{},4\n", WIDTH + 1);
     assert_says(&message(&rows), &["cam01", "tracks.csv", "point 3, frame 1", &out]);
     assert_says(&message(&format!("{head}3,1,nan,4\n")), &["line 2", "\"nan\" is no x"]);
