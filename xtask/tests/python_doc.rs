@@ -35,7 +35,7 @@ fn document() -> String {
 
 /// Documentation comments of Rust code by the name that Python has: `open`, `Scene`, `Scene.at`.
 fn comments(code: &str, words: &mut BTreeMap<String, String>) {
-    let (mut comment, mut owner, mut renamed) = (String::new(), String::new(), None);
+    let (mut comment, mut owner, mut renamed, mut attribute) = (String::new(), String::new(), None, false);
     for line in code.lines() {
         let bare = line.trim();
         if let Some(text) = bare.strip_prefix("///") {
@@ -56,7 +56,9 @@ fn comments(code: &str, words: &mut BTreeMap<String, String>) {
             Some(name.split(|c: char| !c.is_alphanumeric() && c != '_').next().unwrap_or_default().to_owned())
         };
         let mut name = None;
-        if let Some(of) = named("struct ").filter(|_| outside) {
+        if attribute {
+            // Its arguments look like fields.
+        } else if let Some(of) = named("struct ").filter(|_| outside) {
             name = Some(of.clone());
             owner = of;
         } else if let Some(of) = named("impl ").filter(|_| outside) {
@@ -72,10 +74,12 @@ fn comments(code: &str, words: &mut BTreeMap<String, String>) {
         {
             words.entry(name).or_insert_with(|| comment.trim().to_owned());
         }
-        // Attributes stand between a comment and its item.
-        if !bare.starts_with("#[") && !bare.starts_with("hold_out=") {
+        // Attributes, which may have several lines, stand between a comment and its item.
+        attribute |= bare.starts_with("#[");
+        if !attribute {
             comment.clear();
         }
+        attribute &= !bare.ends_with(']');
     }
 }
 

@@ -171,7 +171,8 @@ fn made(layout: &str) -> TempDir {
             put("depth.exr", &exr());
             put("depth.png", &depth_png());
             put("depth.npy", &floats(&[6, 8]));
-            let depth = format!("\"depth\":\"depth.{ending}\",\"name\"");
+            let scale = if ending == "png" { "\"depth_scale\":0.001," } else { "" };
+            let depth = format!("\"depth\":[\"depth.{ending}\",\"depth.{ending}\"],{scale}\"name\"");
             put("capture.json", own().replacen("\"name\"", &depth, 1).as_bytes());
         }
     }

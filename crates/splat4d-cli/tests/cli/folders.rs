@@ -157,6 +157,14 @@ fn no_output_replaces_what_a_capture_reads_from_elsewhere() {
     let (images, masks, points) = (at("photos"), at("cut"), at("sets/points.ply"));
     std::fs::rename(capture.join("images"), &images).unwrap();
     std::fs::rename(capture.join("masks"), &masks).unwrap();
+    // All is foreground: a capture without any could not be opened.
+    for camera in std::fs::read_dir(&masks).unwrap() {
+        for mask in std::fs::read_dir(camera.unwrap().path()).unwrap() {
+            let path = mask.unwrap().path();
+            let (width, height) = image::image_dimensions(&path).unwrap();
+            image::GrayImage::from_pixel(width, height, image::Luma([255])).save(&path).unwrap();
+        }
+    }
     write_ply(&points, 0.0);
     let text = std::fs::read_to_string(capture.join("capture.json")).unwrap();
     let absolute = format!("\"{}/cam", masks.display());
@@ -183,14 +191,14 @@ fn no_output_replaces_what_a_capture_reads_from_elsewhere() {
     let lens = r#"{"width": 8, "height": 6, "fx": 8, "fy": 8, "cx": 4, "cy": 3,
         "world_to_camera": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]}"#;
     std::fs::write(&camera, lens).unwrap();
-    let image = |file: &Path| {
+    let refused = |file: &Path| {
         let said = splat4d(&["render", str(&run), "--camera", str(&camera), "-o", str(file)]).run().refused();
         assert!(said.contains("is a file of a folder of the capture's images"), "{said}");
     };
-    image(&images.join("cam1/0000.png"));
-    image(&masks.join("cam1/0000.png"));
+    refused(&images.join("cam1/0000.png"));
+    refused(&masks.join("cam1/0000.png"));
     #[cfg(unix)]
-    image(&at("pool/0.png"));
+    refused(&at("pool/0.png"));
     let [inside, around, new] = [images.join("cam1/new"), images.clone(), at("photos/cam2/frames")];
     for (words, how) in [
         (&["train", str(&capture), "-o", str(&inside)][..], "lies inside a folder of the capture's images"),

@@ -436,7 +436,9 @@ fn what_cannot_be_imported_is_explained() {
     let own = at("own");
     std::fs::create_dir(&own).unwrap();
     std::fs::write(own.join("capture.json"), "{}").unwrap();
-    assert!(splat4d(&["import", str(&films), "-o", str(&own)]).run().refused().contains("a capture already"));
+    assert!(
+        splat4d(&["import", str(&films), "-o", str(&own)]).run().refused().contains("a capture of another program")
+    );
     // So do their images, and a calibration that the capture would contain.
     let own = at("photos");
     std::fs::create_dir_all(own.join("images/cam06")).unwrap();
