@@ -330,7 +330,7 @@ fn clear(capture: &Path, folder: &Path, noted: bool) -> Result<()> {
     let listed = written(capture);
     // A folder that was filled before there was a list goes by its note; one of which anything is listed by the list.
     let inside = |file: &PathBuf| folder.strip_prefix(capture).is_ok_and(|own| file.starts_with(own));
-    let noted = noted && !listed.iter().any(|file| inside(file));
+    let noted = noted && !listed.iter().any(inside);
     let ours = |path: &PathBuf| noted || path.strip_prefix(capture).is_ok_and(|file| listed.contains(file));
     if let Some(foreign) = there.iter().find(|path| !ours(path)) {
         return Err(Error::input("there is no record that splat4d wrote this image, which would be replaced")
