@@ -1,6 +1,6 @@
 //! Ctrl-C: the first asks to stop (training saves a checkpoint), the second ends the program at once.
 //!
-//! Work that does not ask whether it should stop ([`ends`]) is ended after a moment: all files are written under temporary names,
+//! Work that does not ask whether it should stop (`ends`) is ended after a moment: all files are written under temporary names,
 //! and locks of dead processes are taken over, so that the same command goes on.
 
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -1,6 +1,6 @@
 //! What a reader did not find, did not read, assumed or could not check: `info` prints it in one block.
 
-/// How bad a [`Finding`] is.
+/// How bad a [`Finding`](super::Finding) is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Severity {
     /// Worth knowing.

@@ -183,7 +183,7 @@ pub struct Stage {
     pub probes: Vec<Box<dyn ProbeLoss<f32>>>,
     /// Losses on raw parameters.
     pub params: Vec<Box<dyn ParamLoss<f32>>>,
-    /// Maintenance between steps, in any order: it runs in that of [`Order`](crate::maintenance::Order).
+    /// Maintenance between steps, in any order: it runs in that of [`Order`](crate::upkeep::Order).
     pub upkeep: Vec<Box<dyn Upkeep>>,
     /// Noise on positions after every step; none: positions only learn.
     pub noise: Option<Noise>,

@@ -152,7 +152,7 @@ macro_rules! registry {
             $($(#[$doc])* #[serde(rename = $name)] $variant $(($spec))?,)*
             $($(#[$w_doc])* #[serde(rename = $w_name)] $w_variant($w_spec),)*
             /// A model from outside this library; it can be built from a file where it is
-            /// [registered](super::register).
+            /// [registered](register).
             #[serde(skip)]
             Custom(String),
         }
