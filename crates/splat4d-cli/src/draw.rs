@@ -149,7 +149,7 @@ impl<'a> Painter<'a> {
         }
     }
 
-    /// The same for images of this channel. `views`: the training images' cameras, which alone can tell of uncertainty.
+    /// The same for images of this channel. `views`: the training images' cameras, from which uncertainty is computed.
     ///
     /// Errors: a scene without labels, or without training images to be certain by.
     pub fn of_channel(

@@ -9,7 +9,6 @@ use numpy::PyUntypedArrayMethods;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use splat4d::Result;
-use splat4d::math::Real;
 use splat4d::motion::still::{activate, activate_backward};
 use splat4d::motion::{At, Cache, Motion, Phase, Spec, Still, Tape};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
@@ -384,10 +383,6 @@ impl Motion for PyMotion {
             self.hook.raised.raise(error);
             0.0
         })
-    }
-
-    fn resize(&self, p: &mut Params, row: usize, factor: f64) {
-        p[GEOMETRY].add(row, LOG_SCALE, [f32::of(factor.ln()); 3]);
     }
 
     fn scratch_bytes(&self, _p: &Params, rows: usize) -> u64 {

@@ -14,7 +14,7 @@ const GAP: f64 = TAU / 3.0 + 0.1;
 const ARC_SHARE: f64 = 0.85;
 /// Share of the cameras that must have the middle in front of them.
 const FACING: f64 = 0.8;
-/// Longer side of an orbit image when nothing is told, pixels.
+/// Longer side of an orbit image by default, pixels.
 const LONG_SIDE: usize = 960;
 /// Vertical field of view where there is no camera to copy: 45°.
 const FOV_Y: f64 = PI / 4.0;

@@ -19,7 +19,7 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 
-/// The file that a capture is told by.
+/// The file by which a capture is recognised.
 const CAPTURE: &str = "capture.json";
 /// What an import writes into its folder, in addition to its corrections.
 const WRITTEN: [&str; 5] = [CAPTURE, "points.ply", "images", "masks", "import"];

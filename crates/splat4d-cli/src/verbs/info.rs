@@ -161,7 +161,7 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
     if let Some(found) = shipped::contents(path)? {
         return Ok(of_shipped(path, &found));
     }
-    // What lies next to images is told also where this recipe would not look at it.
+    // What lies next to images is noted even where this recipe does not use it.
     let all = recipe.clone().with(|r| (r.loss.depth, r.loss.flow, r.loss.tracks) = (1.0, 1.0, 1.0));
     let mut capture = open_capture(path, &all)?;
     let priors = priors(&capture);

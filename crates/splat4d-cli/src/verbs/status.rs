@@ -174,7 +174,7 @@ fn whole(path: &Path, run: &Run) -> PartStatus {
     PartStatus { part: "all".into(), state, iterations: read.iterations.or(planned), ..read }
 }
 
-/// What the folder of a part tells of it.
+/// Reads the status of a part from its folder.
 fn begun(folder: &Path) -> PartStatus {
     let run = Run::is(folder).then(|| Run::open(folder).ok()).flatten();
     let number = |key: &str| run.as_ref()?.number(key).filter(|n| *n >= 0.0);

@@ -1,4 +1,4 @@
-//! `import` on the bundled capture's images, of which nothing but the images is told.
+//! `import` on the bundled capture's images, without any other information.
 
 use crate::sample::splat4d;
 use crate::{json_of, str};

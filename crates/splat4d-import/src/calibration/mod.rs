@@ -31,7 +31,7 @@ use tree::Tree;
 pub struct Calibrated {
     /// What it is called; the first is its name, others are what its video may be called too.
     pub names: Vec<String>,
-    /// Pixels across and down of the images that it was calibrated with, where that is told.
+    /// Pixels across and down of the images that it was calibrated with, where the file states it.
     pub size: Option<[usize; 2]>,
     /// Pixels; the first pixel's centre is at 0.5.
     pub intrinsics: Intrinsics,

@@ -247,7 +247,7 @@ pub fn fixed(pictures: &dyn Pictures, look: &Look, progress: &mut Progress<'_>) 
         Vec::new()
     };
     let mut out = Vec::with_capacity(count);
-    // A few at a time, so that progress is told and few images are in memory.
+    // A few at a time, so that progress is shown and few images are in memory.
     const TOGETHER: usize = 4;
     for part in (0..count).collect::<Vec<_>>().chunks(TOGETHER) {
         progress.phase("features", part[0], count);

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use splat4d::Error;
 use splat4d::math::Se3;
 use splat4d::math::se3::{norm, sub};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
 /// Cameras and points that are asked, at most, evenly chosen.
 const CAMERAS: usize = 24;
@@ -211,6 +211,13 @@ const GRID: usize = 24;
 const AGREE: f64 = 0.03;
 const UNIT: (f64, f64) = (0.4, 1.5);
 
+/// What is looked up in a depth map: pixels, and for each the unit that asks and the depth that it expects.
+struct Asked<'a> {
+    frame: &'a Frame,
+    pixels: Vec<[f64; 2]>,
+    expected: Vec<(usize, f64)>,
+}
+
 /// The factor at which metric depth maps of neighbouring views agree with each other; `None`: with none, or with several. Factors
 /// next to 1 are within what is right.
 fn by_views(capture: &Capture) -> Option<f64> {
@@ -242,39 +249,46 @@ fn by_views(capture: &Capture) -> Option<f64> {
             }
         }
     }
-    let share = |factor: f64| {
-        let mut by_map = BTreeMap::<*const Frame, (&Frame, Vec<[f64; 2]>, Vec<f64>)>::new();
-        for (frame, other, ray) in &samples {
-            let world = frame.source.cam_from_world.inverse().apply(ray.map(|v| v * factor));
-            let (camera, pose) = (&other.source, &other.source.cam_from_world);
-            if let Some(pixel) = pixel_of(camera, &Distortion::new(camera.lens), pose, world) {
-                let at = by_map.entry(std::ptr::from_ref(*other)).or_insert((other, Vec::new(), Vec::new()));
-                at.1.push(pixel);
-                at.2.push(pose.apply(world)[2] / factor);
-            }
-        }
-        let (mut agree, mut seen) = (0, 0);
-        for (other, pixels, z) in by_map.into_values() {
-            let Some(Ok(depths)) = other.depth.as_ref().map(|d| depth::at(d, &other.source, &pixels)) else { continue };
-            let known = depths.iter().zip(&z).filter(|(d, _)| **d > 0.0);
-            for (d, z) in known {
-                seen += 1;
-                agree += usize::from((z / f64::from(*d) - 1.0).abs() <= AGREE);
-            }
-        }
-        if seen < IN_MAP { 0.0 } else { f64::from(agree as u32) / f64::from(seen as u32) }
-    };
-    let stated = share(1.0);
-    let mut best = (1.0, 0.0);
+    // The stated unit first.
+    let mut factors = vec![1.0];
     let mut power = FACTORS[0];
     while power <= FACTORS[1] * 1.001 {
-        for factor in [power, 2.0 * power, 5.0 * power].into_iter().filter(|f| f.max(1.0 / f) >= SAME_UNIT) {
-            let found = share(factor);
-            if found > best.1 {
-                best = (factor, found);
+        factors.extend([power, 2.0 * power, 5.0 * power].into_iter().filter(|f| f.max(1.0 / f) >= SAME_UNIT));
+        power *= 10.0;
+    }
+    // By map: pixels that any unit asks for, with the unit and the depth that it expects there. Every map is decoded once.
+    let mut asked: Vec<Asked<'_>> = Vec::new();
+    for (frame, other, ray) in &samples {
+        let (camera, pose) = (&other.source, &other.source.cam_from_world);
+        let (lens, world_from_cam) = (Distortion::new(camera.lens), frame.source.cam_from_world.inverse());
+        let at = asked.iter().position(|a| std::ptr::eq(a.frame, *other)).unwrap_or_else(|| {
+            asked.push(Asked { frame: other, pixels: Vec::new(), expected: Vec::new() });
+            asked.len() - 1
+        });
+        for (unit, factor) in factors.iter().enumerate() {
+            let world = world_from_cam.apply(ray.map(|v| v * factor));
+            if let Some(pixel) = pixel_of(camera, &lens, pose, world) {
+                asked[at].pixels.push(pixel);
+                asked[at].expected.push((unit, pose.apply(world)[2] / factor));
             }
         }
-        power *= 10.0;
+    }
+    let mut counts = vec![(0u32, 0u32); factors.len()];
+    for Asked { frame, pixels, expected } in asked {
+        let Some(Ok(depths)) = frame.depth.as_ref().map(|d| depth::at(d, &frame.source, &pixels)) else { continue };
+        for (d, (unit, z)) in depths.iter().zip(expected).filter(|(d, _)| **d > 0.0) {
+            counts[unit].0 += u32::from((z / f64::from(*d) - 1.0).abs() <= AGREE);
+            counts[unit].1 += 1;
+        }
+    }
+    let share =
+        |(agree, seen): (u32, u32)| if (seen as usize) < IN_MAP { 0.0 } else { f64::from(agree) / f64::from(seen) };
+    let stated = share(counts[0]);
+    let mut best = (1.0, 0.0);
+    for (factor, found) in factors.iter().zip(counts.iter().map(|c| share(*c))).skip(1) {
+        if found > best.1 {
+            best = (*factor, found);
+        }
     }
     match () {
         () if stated.max(best.1) < UNIT.0 => None,
