@@ -54,34 +54,13 @@ fn pieces(picture: &mut Planes<f32>) -> impl IndexedParallelIterator<Item = [&mu
 }
 
 /// Shows the colours of a piece in place.
-struct Respond<'a> {
-    row: &'a [f32; COLUMNS],
-    colors: [&'a mut [f32]; 3],
-}
-
-impl Kernel for Respond<'_> {
-    type Out = ();
-
-    #[inline(always)]
-    fn run<const FMA: bool>(self) {
-        let Self { row, colors } = self;
-        let [(r, r_rest), (g, g_rest), (b, b_rest)] = colors.map(<[f32]>::as_chunks_mut::<LANES>);
-        for ((r, g), b) in r.iter_mut().zip(g).zip(b) {
-            // By value, so that LLVM need not ask whether the channels overlap.
-            let x = [*r, *g, *b];
-            let shown = |c: usize| -> [f32; LANES] {
-                let m = [row[3 * c], row[3 * c + 1], row[3 * c + 2]];
-                each(|l| x[c][l] + m[0] * x[0][l] + m[1] * x[1][l] + m[2] * x[2][l] + row[OFFSET + c])
-            };
-            [*r, *g, *b] = [shown(0), shown(1), shown(2)];
-        }
-        for ((r, g), b) in r_rest.iter_mut().zip(g_rest).zip(b_rest) {
-            [*r, *g, *b] = shown(row, [*r, *g, *b]);
-        }
+fn respond(row: &[f32; COLUMNS], [r, g, b]: [&mut [f32]; 3]) {
+    for ((r, g), b) in r.iter_mut().zip(g).zip(b) {
+        [*r, *g, *b] = shown(row, [*r, *g, *b]);
     }
 }
 
-/// The VJP of [`Respond`] in a piece, in place. Returns the sum of the gradients to the row.
+/// The VJP of [`respond`] in a piece, in place. Returns the sum of the gradients to the row.
 struct RespondBackward<'a> {
     row: &'a [f32; COLUMNS],
     drawn: [&'a [f32]; 3],
@@ -170,13 +149,13 @@ impl Exposure {
 
     /// Turns the colours `color` into those that camera `rig` shows.
     pub(crate) fn respond(&self, rig: usize, color: &mut Planes<f32>) {
-        let (row, simd) = (self.response(rig), Simd::detect());
-        pieces(color).for_each(|colors| dispatch(simd, Respond { row: &row, colors }));
+        let row = self.response(rig);
+        pieces(color).for_each(|colors| respond(&row, colors));
     }
 
     /// Writes the colours that camera `rig` shows of what was drawn.
     pub(crate) fn show(&self, rig: usize, drawn: &Planes<f32>, out: &mut Planes<f32>) {
-        let (row, simd) = (self.response(rig), Simd::detect());
+        let row = self.response(rig);
         if (out.channels, out.height, out.width) != (drawn.channels, drawn.height, drawn.width) {
             out.reset(drawn.channels, drawn.height, drawn.width);
         }
@@ -185,7 +164,7 @@ impl Exposure {
                 let first = piece * PIECE;
                 out.copy_from_slice(&drawn.plane(c)[first..first + out.len()]);
             }
-            dispatch(simd, Respond { row: &row, colors });
+            respond(&row, colors);
         });
     }
 
