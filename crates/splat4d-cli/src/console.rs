@@ -7,6 +7,7 @@ use serde_json::{Value, json};
 use splat4d::text;
 use splat4d_train::event::Event;
 use splat4d_train::path_text::in_command;
+use splat4d_workflow::events::Listener;
 use std::cell::RefCell;
 use std::io::{IsTerminal, Write};
 use std::path::Path;
@@ -47,6 +48,21 @@ struct State {
     warnings: Vec<String>,
     /// What `--json` would print, for a program that wants the objects themselves; none: it is printed.
     objects: Option<Vec<Value>>,
+}
+
+impl Listener for Console {
+    fn on_event(&self, event: &splat4d_workflow::events::Event<'_>) {
+        use splat4d_workflow::events::Event;
+        match *event {
+            Event::Phase { name, done, total } => self.phase(name, done, total),
+            Event::PhaseEnded => self.clear(),
+            Event::Result(text) => self.say(text),
+            Event::Record(value) => self.emit(value),
+            Event::Warning(text) => self.warn(text),
+            Event::Written(path) => self.written(path),
+            _ => {}
+        }
+    }
 }
 
 impl Console {

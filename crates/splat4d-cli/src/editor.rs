@@ -327,7 +327,7 @@ impl Editor {
         let baking = Baking { poster: false, ..Baking::default() };
         let packed = pack_scene(scene, &self.source, &self.title, &baking, console);
         console.clear();
-        Ok(packed.map_err(|e| e.downcast::<Error>().unwrap_or_else(|e| Error::input(e.to_string())))?.bytes)
+        Ok(packed?.bytes)
     }
 
     fn save(&self, steps: Vec<Step>) -> Result<Value> {

@@ -202,7 +202,7 @@ pub(crate) fn playback_by(run: &Path, deadline: &Deadline, console: &Console) ->
         not_empty(&source.scene, run)?;
         let title = Run::open(run)?.name();
         let baking = Baking { deadline: deadline.clone(), ..Baking::default() };
-        bake_into(&source, &title, &run.join(playable::FILE), &baking, console)
+        Ok(bake_into(&source, &title, &run.join(playable::FILE), &baking, console)?)
     });
     console.clear();
     match baked {

@@ -1,7 +1,8 @@
 //! The `splat4d` command: trains, measures, renders, compresses and plays dynamic 3D scenes.
 //!
-//! Each command is a file in `verbs`. Exit codes: 0 done, 1 failed, 2 bad input. This is a library only because the
-//! studies and the Python package share its console, run folders and measurements; its interface is not public.
+//! Each command is a file in `verbs`. Exit codes: 0 done, 1 failed, 2 bad input. What commands do beyond parsing
+//! and printing moves to `splat4d-workflow`. This is a library only because the studies and the Python package share its
+//! console and measurements; its interface is not public.
 //!
 //! # Code map
 //!
@@ -9,13 +10,9 @@
 //!
 //! | module | content |
 //! |---|---|
-//! | `camera_file.rs`, `console.rs`, `video.rs` | camera files, output, films |
-//! | `paths/` | orbits, data-set cameras and key-framed camera paths |
-//! | `run_folder.rs` | run folders |
-//! | `source.rs`, `source/` | scenes of other programs that are folders or archives |
+//! | `console.rs`, `video.rs`, `device.rs` | output, films, the choice of the device |
 //! | `raw.rs`, `asked.rs` | channel values as files; files of queried points and their results |
 //! | `measure.rs`, `measure/` | how scenes and files play, for `compress`, the studies and `bench --playback` |
-//! | `baking.rs`, `baking/` | the playback file at the end of a run |
 //! | `comparing.rs` | runs and results of other programs, for `compare` |
 //! | `report/`, `report/compress/` | `report.html`, drawn without a library |
 //! | `film.rs` | the playback file of a long capture, which grows during training |
@@ -27,39 +24,32 @@
 #![allow(missing_docs)] // nobody outside the workspace reads it
 
 mod asked;
-mod baking;
-mod camera_file;
 mod chunked;
 mod comparing;
 mod compressing;
 pub mod console;
-mod deadline;
 mod device;
-pub mod draw;
 mod editing;
 mod editor;
-pub mod files;
 mod film;
 pub mod finish;
 pub mod interrupt;
 mod labelling;
 pub mod measure;
-pub mod paths;
-mod playable;
 mod predicting;
 mod raw;
 pub mod report;
-pub mod run_folder;
-pub mod sequence;
 mod serving;
-pub mod source;
 pub mod texts;
 pub mod verbs;
 mod video;
 
+pub use splat4d_workflow::{draw, files, paths, run_folder, sequence, source};
+
 use clap::{Parser, Subcommand};
 use console::{Console, Loudness};
 use splat4d::Error;
+use splat4d_workflow::{baking, camera_file, deadline, playable};
 use std::ffi::OsString;
 use std::process::ExitCode;
 

@@ -1,5 +1,6 @@
 //! Films: mp4 through the `ffmpeg` program, animated PNG (plays in every browser, needs nothing), or a folder of PNGs.
 
+use crate::draw::Rgb;
 use crate::files::{self, cannot_write};
 use anyhow::{Context, bail};
 use splat4d::Error;
@@ -19,29 +20,6 @@ const INSTEAD: &str =
     "Install ffmpeg, or write an animated .png or a folder of images instead (-o NAME.png, -o FOLDER).";
 /// Most bytes kept of what ffmpeg says.
 const STDERR_BYTES: usize = 64 << 10;
-
-/// An image of 8-bit samples, rows from the top.
-#[derive(Clone, Debug)]
-pub(crate) struct Rgb {
-    pub width: usize,
-    pub height: usize,
-    /// width·height·3 bytes.
-    pub data: Vec<u8>,
-}
-
-impl Rgb {
-    /// The bytes of a PNG file.
-    pub(crate) fn png(&self) -> Vec<u8> {
-        let mut bytes = Vec::new();
-        let mut encoder = png::Encoder::new(&mut bytes, self.width as u32, self.height as u32);
-        encoder.set_color(png::ColorType::Rgb);
-        encoder.set_depth(png::BitDepth::Eight);
-        encoder.set_compression(png::Compression::Fast);
-        let write = |e: png::Encoder<'_, &mut Vec<u8>>| e.write_header()?.write_image_data(&self.data);
-        write(encoder).expect("an image in memory can be encoded");
-        bytes
-    }
-}
 
 /// Whether the `ffmpeg` program can be called.
 pub(crate) fn have_ffmpeg() -> bool {

@@ -7,8 +7,8 @@ use pyo3::prelude::*;
 use serde_json::Value;
 use splat4d_cli::console::{Console, Loudness};
 use splat4d_cli::finish::{self, Measure};
-use splat4d_cli::run_folder;
-use splat4d_cli::source::read_scene;
+use splat4d_workflow::run_folder;
+use splat4d_workflow::source::read_scene;
 use std::path::PathBuf;
 
 /// A run: a folder with its recipe, checkpoints, scene and scores.

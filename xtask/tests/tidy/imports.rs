@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 /// The allowed order of a crate's top modules: a module may import those before it. The
 /// code map of the crate (`lib.rs`) lists them in the same order.
-const ORDER: [(&str, &[&str]); 8] = [
+const ORDER: [(&str, &[&str]); 9] = [
     (
         "crates/splat4d",
         &[
@@ -87,25 +87,33 @@ const ORDER: [(&str, &[&str]); 8] = [
         ],
     ),
     (
-        "crates/splat4d-cli",
+        "crates/splat4d-workflow",
         &[
+            "events",
             "files",
-            "interrupt",
             "deadline",
             "camera_file",
-            "console",
-            "video",
-            "device",
             "paths",
             "run_folder",
             "sequence",
             "source",
             "draw",
+            "baking",
+            "playable",
+            "converting",
+            "exporting",
+        ],
+    ),
+    (
+        "crates/splat4d-cli",
+        &[
+            "interrupt",
+            "console",
+            "video",
+            "device",
             "raw",
             "asked",
             "measure",
-            "baking",
-            "playable",
             "serving",
             "comparing",
             "report",

@@ -2,9 +2,10 @@
 
 use super::{Forecast, Work};
 use crate::console::Console;
+use crate::draw::Rgb;
 use crate::draw::{Painter, color_rgb};
 use crate::report::predict::ModelScores;
-use crate::video::{Film, Rgb, have_ffmpeg};
+use crate::video::{Film, have_ffmpeg};
 use splat4d::format::npy::Npy;
 use splat4d::layers::Scene;
 use splat4d::math::se3::{add, norm, scale, sub};

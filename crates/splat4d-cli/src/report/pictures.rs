@@ -1,8 +1,8 @@
 //! Images inside the page: held-out views next to their truth and error, as small JPEGs in data URIs.
 
+use crate::draw::Rgb;
 use crate::draw::color_rgb;
 use crate::files::{self, base64};
-use crate::video::Rgb;
 use image::RgbImage;
 use image::codecs::jpeg::JpegEncoder;
 use image::imageops::{FilterType, resize};

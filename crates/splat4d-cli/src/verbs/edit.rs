@@ -1,6 +1,5 @@
 //! `edit`: a list of edits replayed on any scene, and single edits from the command line.
 
-use super::convert;
 use crate::baking::title;
 use crate::console::Console;
 use crate::editing::{self, Bring};
@@ -9,6 +8,7 @@ use crate::source::{Source, not_empty};
 use serde_json::json;
 use splat4d::edit::{Context, Edits, Expr, Step, count, replay};
 use splat4d::{Error, Result};
+use splat4d_workflow::converting::{self, Conversion};
 use std::path::{Path, PathBuf};
 
 /// Moments of the clip for which --count tells how many can be seen.
@@ -89,7 +89,7 @@ impl Args {
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     // What cannot be written is better known before the work.
     if let Some(output) = &args.output {
-        convert::check_output(output)?;
+        converting::check_output(output)?;
     }
     let list = args.edits.as_deref().map(editing::read).transpose()?.unwrap_or_default();
     let edits = editing::with_steps(list, args.steps());
@@ -132,7 +132,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         console.written(path);
     }
     let output = args.output.clone().expect("clap asks for an output where nothing is counted");
-    convert::write(&convert::Args::plain(args.scene.clone(), output), source, console)
+    Ok(converting::write(&Conversion::new(args.scene.clone(), output), source, console)?)
 }
 
 /// How many a selection holds, and of them how many can be seen when.

@@ -1,7 +1,7 @@
 //! `render`: images and films of a run, a scene file or a plain 3DGS .ply.
 
 use crate::console::Console;
-use crate::device::Device;
+use crate::device::{self, Device};
 use crate::draw::{Channel, Painter};
 use crate::paths::{self, Clock, Route, parse_size, shots};
 use crate::raw::RawFormat;
@@ -10,6 +10,7 @@ use crate::source::{Source, not_empty};
 use crate::video::{self, Film};
 use crate::{camera_file, files};
 use clap::ValueEnum;
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use splat4d::scene::Planes;
 use splat4d::{Error, format};
 use splat4d_train::output::OutputFolder;
@@ -86,7 +87,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "N", value_parser = fps, help_heading = "Time")]
     fps: Option<f64>,
     /// Channel to render
-    #[arg(long, value_enum, default_value = "color", help_heading = "Image")]
+    #[arg(long, value_parser = channels(), default_value = "color", help_heading = "Image")]
     channel: Channel,
     /// Colour behind the scene, 0 to 1 [default: the scene's, or the camera file's]
     #[arg(long, value_name = "R,G,B", value_parser = color, help_heading = "Image")]
@@ -111,6 +112,12 @@ pub(crate) struct Args {
 }
 
 type Color = [f32; 3];
+
+/// Reads the name of a channel.
+fn channels() -> impl TypedValueParser<Value = Channel> {
+    let values = Channel::ALL.map(|channel| PossibleValue::new(channel.name()).help(channel.about()));
+    PossibleValuesParser::new(values).map(|name| Channel::named(&name).expect("it is one of the names"))
+}
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let path = args.source.as_ref().or(args.model.as_ref()).expect("clap asks for a source");
@@ -204,7 +211,9 @@ fn channel<'a>(
 ) -> anyhow::Result<Painter<'a>> {
     let views = if args.channel == Channel::Uncertainty { source.views()? } else { Vec::new() };
     let mut phase = |done, of| console.phase("evaluating the training images", done, of);
-    let painter = painter.of_channel(args.channel, &views, &mut phase)?.on(args.device, console);
+    let painter = painter
+        .of_channel(args.channel, &views, &mut phase)?
+        .on(|config, wanted| device::open(args.device, config, wanted, console).backend, console);
     console.clear();
     Ok(painter)
 }

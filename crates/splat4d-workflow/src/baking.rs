@@ -4,13 +4,13 @@
 //! model is sampled once, [`Curve`] gives the segments and the error at every price of a segment, and one comparison of
 //! renders calibrates it. Nothing is sampled twice.
 
-use crate::console::Console;
 use crate::deadline::Deadline;
 use crate::draw::{Painter, color_rgb};
+use crate::events::Listener;
 use crate::files::{self, grouped, human_bytes};
 use crate::paths::{Stage, View};
 use crate::run_folder::Run;
-use crate::source::Source;
+use crate::source::{Source, not_empty};
 use image::codecs::jpeg::JpegEncoder;
 use serde_json::{Value, json};
 use splat4d::bake::{self, Bakery, Curve, Cut, Options, Shown};
@@ -21,6 +21,7 @@ use splat4d::format::playback::{
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::render::{Antialias, RenderConfig};
 use splat4d::scene::{Camera, GEOMETRY, Time};
+use splat4d::{Error, Result};
 use std::path::Path;
 
 /// Cameras that stand still and times at which baked and model are compared; every one costs two renders.
@@ -42,7 +43,7 @@ const PATH_KEYS: usize = 16;
 const PATH_STEP: f64 = 0.75;
 
 /// A file is to be so like its model, dB: what is lost by baking then hides behind what training leaves.
-pub(crate) const LIKE: f64 = 40.0;
+pub const LIKE: f64 = 40.0;
 /// What a cut aims at beyond that, dB.
 const MARGIN: f64 = 0.3;
 /// A file may have the bytes of the learned scene and so many for each second of the clip: 12 Mbit/s, the rate of a
@@ -75,7 +76,7 @@ const AGAIN: f64 = 1.3;
 
 /// Settings of baking and packing a scene.
 #[derive(Clone, Debug)]
-pub(crate) struct Baking {
+pub struct Baking {
     pub options: Options,
     /// Split by this error, pixels, whatever it costs. None: by bytes and likeness.
     pub tolerance: Option<f64>,
@@ -102,7 +103,7 @@ impl Default for Baking {
 }
 
 /// Bytes that the file of a scene may have: those of its tables in 32-bit floats, and a rate for its clip.
-pub(crate) fn budget(scene: &Scene<f32>) -> u64 {
+pub fn budget(scene: &Scene<f32>) -> u64 {
     let numbers =
         |l: &splat4d::layers::Layer| l.params.keys().map(|k| l.params[k].rows() * l.params[k].width()).sum::<usize>();
     let learned = 4 * scene.layers.iter().map(numbers).sum::<usize>();
@@ -111,7 +112,7 @@ pub(crate) fn budget(scene: &Scene<f32>) -> u64 {
 }
 
 /// A baked scene as a file's bytes, and what became of it.
-pub(crate) struct Packed {
+pub struct Packed {
     pub bytes: Vec<u8>,
     pub baked: bake::Baked,
     summary: playback::Summary,
@@ -121,18 +122,18 @@ pub(crate) struct Packed {
 }
 
 /// Bakes a scene and packs it, without a look at how well. The options' cameras are the source's.
-pub(crate) fn pack(source: &Source, title: &str, baking: &Baking, console: &Console) -> anyhow::Result<Packed> {
+pub fn pack(source: &Source, title: &str, baking: &Baking, console: &dyn Listener) -> Result<Packed> {
     pack_scene(&source.scene, source, title, baking, console)
 }
 
 /// The same of another scene in the source's place.
-pub(crate) fn pack_scene(
+pub fn pack_scene(
     scene: &Scene<f32>,
     source: &Source,
     title: &str,
     baking: &Baking,
-    console: &Console,
-) -> anyhow::Result<Packed> {
+    console: &dyn Listener,
+) -> Result<Packed> {
     let views = source.views()?;
     let options = options(scene, baking, &views);
     let kitchen = Kitchen { scene, source, views: &views, title, baking, console };
@@ -177,15 +178,15 @@ struct Kitchen<'a> {
     views: &'a [View],
     title: &'a str,
     baking: &'a Baking,
-    console: &'a Console,
+    console: &'a dyn Listener,
 }
 
 impl Kitchen<'_> {
     /// What segments cost, where they are not cut by a tolerance.
-    fn curve(&self, bakery: &mut Bakery<'_>) -> anyhow::Result<Option<Curve>> {
+    fn curve(&self, bakery: &mut Bakery<'_>) -> Result<Option<Curve>> {
         match self.baking.tolerance {
             Some(_) => Ok(None),
-            None => Ok(bakery.measure(&mut |done, total| self.console.phase("sampling the motion", done, total))?),
+            None => bakery.measure(&mut |done, total| self.console.phase("sampling the motion", done, total)),
         }
     }
 
@@ -202,7 +203,7 @@ impl Kitchen<'_> {
         wanted.max(curve.price_of(self.most(BYTES_A_PRIMITIVE)))
     }
 
-    fn pack(&self, bakery: &Bakery<'_>, curve: Option<&Curve>, price: Option<f64>) -> anyhow::Result<Packed> {
+    fn pack(&self, bakery: &Bakery<'_>, curve: Option<&Curve>, price: Option<f64>) -> Result<Packed> {
         let (scene, console, baking) = (self.scene, self.console, self.baking);
         let cut = match price {
             Some(price) => Cut::Price(price),
@@ -237,14 +238,28 @@ fn mse(psnr: f64) -> f64 {
     10f64.powf(-0.1 * psnr)
 }
 
+/// Bakes a run or a scene file into the file `out`, and writes how well as JSON into `report`; returns the same.
+///
+/// Errors: a name that is not one of a playback file; no scene; an empty one; files of the input in the place of outputs.
+pub fn bake(from: &Path, out: &Path, report: Option<&Path>, baking: &Baking, listener: &dyn Listener) -> Result<Value> {
+    if !files::is_playback(out) && !out.starts_with("/dev") {
+        return Err(Error::input("the name does not end in .s4d").at(out.display()).remedy("Use -o NAME.s4d."));
+    }
+    let source = Source::open(from)?;
+    not_empty(&source.scene, from)?;
+    for file in std::iter::once(out).chain(report) {
+        source.keep(from, file, &[])?;
+    }
+    let value = bake_into(&source, &title(&source, from), out, baking, listener)?;
+    if let Some(path) = report {
+        files::write(path, format!("{value:#}").as_bytes())?;
+        listener.written(path);
+    }
+    Ok(value)
+}
+
 /// Bakes into the file `out` and says how well; returns the report. The options' cameras are the source's.
-pub(crate) fn bake_into(
-    source: &Source,
-    title: &str,
-    out: &Path,
-    baking: &Baking,
-    console: &Console,
-) -> anyhow::Result<Value> {
+pub fn bake_into(source: &Source, title: &str, out: &Path, baking: &Baking, console: &dyn Listener) -> Result<Value> {
     let started = baking.deadline.now();
     let Cooked { packed, likeness, needs } = bake_like(source, title, baking, console)?;
     let Packed { mut bytes, baked, summary, antialias, .. } = packed;
@@ -285,7 +300,7 @@ pub(crate) fn bake_into(
 
 /// What a file that is less like its model than wanted would need.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
-pub(crate) struct Needs {
+pub struct Needs {
     /// dB.
     psnr: f64,
     /// Bytes of such a file, about.
@@ -307,7 +322,7 @@ impl Needs {
 }
 
 /// A file, how like its model it is, and what it would take to be as like it as wanted, where it is not.
-pub(crate) struct Cooked {
+pub struct Cooked {
     pub packed: Packed,
     pub likeness: Option<bake::Likeness>,
     pub needs: Option<Needs>,
@@ -324,7 +339,7 @@ impl Cooked {
 
 /// Bakes and packs a scene within its bytes and time, and compares it with its model. Cuts it again where the first cut was
 /// further off than a comparison can tell, without sampling the model again.
-pub(crate) fn bake_like(source: &Source, title: &str, baking: &Baking, console: &Console) -> anyhow::Result<Cooked> {
+pub fn bake_like(source: &Source, title: &str, baking: &Baking, console: &dyn Listener) -> Result<Cooked> {
     let (scene, deadline) = (&source.scene, &baking.deadline);
     let views = source.views()?;
     let stage = source.stage(&views);
@@ -371,7 +386,7 @@ pub(crate) fn bake_like(source: &Source, title: &str, baking: &Baking, console: 
     Ok(best.expect("one file was packed"))
 }
 
-fn say(report: &bake::Report, likeness: Option<&bake::Likeness>, bytes: u64, seconds: f64, console: &Console) {
+fn say(report: &bake::Report, likeness: Option<&bake::Likeness>, bytes: u64, seconds: f64, console: &dyn Listener) {
     let mut words = format!(
         "{} Gaussians became {} primitives in {} time segments, {} in {seconds:.1} s",
         grouped(report.gaussians),
@@ -413,8 +428,8 @@ fn compare(
     views: &[View],
     antialias: bool,
     deadline: &Deadline,
-    console: &Console,
-) -> anyhow::Result<Option<bake::Likeness>> {
+    console: &dyn Listener,
+) -> Result<Option<bake::Likeness>> {
     if deadline.left() <= 0.0 {
         console.say("the file is not compared with its model: no time is left of --minutes");
         return Ok(None);
@@ -426,20 +441,20 @@ fn compare(
 }
 
 /// Compares what a file shows with what its scene shows, until `go_on` says no; it is given how many renders are done, of how many.
-pub(crate) fn likeness(
+pub fn likeness(
     scene: &Scene<f32>,
     played: &Scene<f32>,
     shots: &[(f64, Camera)],
     antialias: bool,
     go_on: &mut dyn FnMut(usize, usize) -> bool,
-) -> anyhow::Result<Option<bake::Likeness>> {
+) -> Result<Option<bake::Likeness>> {
     let antialias = if antialias { Antialias::On } else { Antialias::Off };
     let mut cpu = device::cpu(RenderConfig { antialias, ..RenderConfig::default() });
-    Ok(bake::compare(scene, Shown::File(played), shots, cpu.as_mut(), go_on)?)
+    bake::compare(scene, Shown::File(played), shots, cpu.as_mut(), go_on)
 }
 
 /// Cameras and times by which a file is compared with its scene: those of the data set, else an orbit.
-pub(crate) fn compared(source: &Source) -> anyhow::Result<Vec<(f64, Camera)>> {
+pub fn compared(source: &Source) -> Result<Vec<(f64, Camera)>> {
     let views = source.views()?;
     Ok(shots(&source.scene, &source.stage(&views), &views))
 }
@@ -494,7 +509,7 @@ impl<'a> Cameras<'a> {
 }
 
 /// Every camera once, by name, spread over the rig where there are too many.
-pub(crate) fn distinct(views: &[View]) -> Vec<&View> {
+pub fn distinct(views: &[View]) -> Vec<&View> {
     let mut seen = std::collections::BTreeSet::new();
     let all: Vec<&View> = views.iter().filter(|v| seen.insert(v.name.as_str())).collect();
     let stride = all.len().div_ceil(NAMED_CAMERAS).max(1);
@@ -502,7 +517,7 @@ pub(crate) fn distinct(views: &[View]) -> Vec<&View> {
 }
 
 /// Properties that a file states of its Gaussians as a whole.
-pub(crate) struct Outline {
+pub struct Outline {
     pub clip: [f64; 2],
     pub sh_degree: usize,
     /// Least and greatest corner of the means.
@@ -516,7 +531,7 @@ impl Outline {
     }
 
     /// Of pages that are to be written.
-    pub(crate) fn of_pages(pages: &Pages) -> Self {
+    pub fn of_pages(pages: &Pages) -> Self {
         let tables = pages.layers.iter().map(|l| &l.params[GEOMETRY]);
         let means = tables.flat_map(|t| (0..t.rows()).map(|row| t.read::<3>(row, 0).map(f64::from)));
         let sh_degree = pages.palette.as_ref().map_or(0, |p| p.degree);
@@ -525,7 +540,7 @@ impl Outline {
 }
 
 /// Metadata of the scene, as the file states it.
-pub(crate) fn meta(scene: &Scene<f32>, outline: &Outline, stage: &Stage, views: &[&View]) -> Meta {
+pub fn meta(scene: &Scene<f32>, outline: &Outline, stage: &Stage, views: &[&View]) -> Meta {
     let look = |share: f64| {
         let camera = stage.orbit(share);
         let fov = 2.0 * (0.5 * camera.height as f64 / camera.intrinsics.fy).atan();
@@ -564,7 +579,7 @@ fn bounds(means: impl Iterator<Item = [f64; 3]>) -> Option<[[f64; 3]; 2]> {
 }
 
 /// The first view at the clip's start as a JPEG that is small enough.
-pub(crate) fn poster(scene: &Scene<f32>, stage: &Stage, antialias: bool) -> Option<Vec<u8>> {
+pub fn poster(scene: &Scene<f32>, stage: &Stage, antialias: bool) -> Option<Vec<u8>> {
     let mut painter = Painter::new(scene, scene.background, antialias, false);
     let camera = stage.orbit(0.0);
     POSTERS.iter().find_map(|&(side, quality)| {
@@ -579,7 +594,7 @@ pub(crate) fn poster(scene: &Scene<f32>, stage: &Stage, antialias: bool) -> Opti
 }
 
 /// Title of the scene for people: the capture's name, or the file's.
-pub(crate) fn title(source: &Source, path: &Path) -> String {
+pub fn title(source: &Source, path: &Path) -> String {
     let stem = || path.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
     source.run.as_ref().map_or_else(stem, Run::name)
 }

@@ -23,7 +23,7 @@ const SMALL_SWAY: f64 = 0.1;
 
 /// Middle, distance, height and arc of an orbit.
 #[derive(Clone, Debug)]
-pub(crate) struct Stage {
+pub struct Stage {
     /// Point that is looked at.
     pub center: [f64; 3],
     /// Upwards (unit).
@@ -42,7 +42,7 @@ pub(crate) struct Stage {
 
 impl Stage {
     /// From the training cameras. Panics: no view.
-    pub(crate) fn of_views(views: &[View], up: [f64; 3]) -> Self {
+    pub fn of_views(views: &[View], up: [f64; 3]) -> Self {
         assert!(!views.is_empty(), "a stage needs at least one view");
         let cameras = distinct(views);
         let center = look_at_point(&cameras);
@@ -62,7 +62,7 @@ impl Stage {
     }
 
     /// Around a cloud: its middle and the radius that holds most of it.
-    pub(crate) fn of_cloud(center: [f64; 3], extent: f64, up: [f64; 3]) -> Self {
+    pub fn of_cloud(center: [f64; 3], extent: f64, up: [f64; 3]) -> Self {
         let template = Camera::with_fov_y(Se3::IDENTITY, FOV_Y, 800, 600);
         let distance = extent.max(1e-6) / (0.5 * FOV_Y).tan();
         let (height, radius) = (0.35 * distance, 0.94 * distance);
@@ -70,12 +70,12 @@ impl Stage {
     }
 
     /// Whether the orbit goes all around.
-    pub(crate) fn full(&self) -> bool {
+    pub fn full(&self) -> bool {
         self.reach >= PI
     }
 
     /// The camera `share` (0 to 1) of the way; it ends where it began.
-    pub(crate) fn orbit(&self, share: f64) -> Camera {
+    pub fn orbit(&self, share: f64) -> Camera {
         let turn = if self.full() { TAU * share } else { self.reach * (TAU * share).sin() };
         let angle = self.azimuth + turn;
         let (e1, e2) = basis(self.up);

@@ -8,16 +8,16 @@ use splat4d::scene::{Camera, Intrinsics};
 use splat4d::{Error, Result};
 use std::path::{Path, PathBuf};
 
-pub(crate) use orbit::Stage;
+pub use orbit::Stage;
 
 /// Reads key frames and says what is wrong with them.
-pub(crate) fn check_keys(text: &str) -> Result<()> {
+pub fn check_keys(text: &str) -> Result<()> {
     keys::Track::parse(text, [0.0, 1.0, 0.0]).map(drop)
 }
 
 /// One frame of a film.
 #[derive(Clone, Debug)]
-pub(crate) struct Shot {
+pub struct Shot {
     /// From where.
     pub camera: Camera,
     /// When, seconds on the scene clock.
@@ -39,7 +39,7 @@ pub struct View {
 
 /// A route through space.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) enum Route {
+pub enum Route {
     /// Around the scene, or to and fro within the arc of the training cameras.
     Orbit,
     /// The views that were kept from training, one frame each.
@@ -69,7 +69,7 @@ impl std::str::FromStr for Route {
 
 /// Which moments are shown, and how fast.
 #[derive(Clone, Debug)]
-pub(crate) struct Clock {
+pub struct Clock {
     /// First second of the scene that is shown.
     pub from: f64,
     /// Last second of the scene that is shown.
@@ -89,7 +89,7 @@ const ORBIT_SECONDS: f64 = 6.0;
 /// Longest film of an orbit unless slow motion is asked for, seconds.
 const ORBIT_SECONDS_MAX: f64 = 20.0;
 /// Seconds of an orbit's film of a clip that plays for so long.
-pub(crate) fn orbit_seconds(playing: f64) -> f64 {
+pub fn orbit_seconds(playing: f64) -> f64 {
     playing.clamp(ORBIT_SECONDS, ORBIT_SECONDS_MAX)
 }
 
@@ -119,7 +119,7 @@ impl Clock {
 }
 
 /// All frames of a film. `size` overrides the cameras' own; `stage` is the place for orbits.
-pub(crate) fn shots(
+pub fn shots(
     route: &Route,
     clock: &Clock,
     views: &[View],
@@ -196,7 +196,7 @@ pub(crate) fn shots(
 }
 
 /// Frames a second that a key frame file asks for.
-pub(crate) fn fps_of(file: &Path) -> Result<Option<f64>> {
+pub fn fps_of(file: &Path) -> Result<Option<f64>> {
     Ok(keys::Track::read(file, [0.0, 1.0, 0.0])?.fps)
 }
 
@@ -215,7 +215,7 @@ fn known_cameras(views: &[View]) -> String {
 }
 
 /// The same view on another raster: the vertical field of view is kept.
-pub(crate) fn resized(camera: &Camera, [width, height]: [usize; 2]) -> Camera {
+pub fn resized(camera: &Camera, [width, height]: [usize; 2]) -> Camera {
     let k = &camera.intrinsics;
     let scale = height as f64 / camera.height as f64;
     // The principal point keeps its offset from the middle.

@@ -2,41 +2,36 @@
 //! scene baked in memory.
 
 use crate::baking::{Baking, pack, title};
-use crate::console::Console;
+use crate::events::Listener;
 use crate::files::{self, cannot_read};
 use crate::run_folder::Run;
 use crate::source::{Source, not_empty};
 use splat4d::Result;
-use splat4d::format::playback::{self, EXTENSION, HEADER_BYTES, Index, MAGIC, OLD_EXTENSION};
+use splat4d::format::playback::{self, HEADER_BYTES, Index, MAGIC};
 use splat4d_serve::Content;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 /// Name of a run's playback file.
-pub(crate) const FILE: &str = "scene.s4d";
+pub const FILE: &str = "scene.s4d";
 /// Its name in runs of versions before 0.1.
 const OLD_FILE: &str = "scene.splat4d";
 
-/// Whether a path is named as a playback file.
-pub(crate) fn is_named(path: &Path) -> bool {
-    path.extension().is_some_and(|e| [EXTENSION, OLD_EXTENSION].iter().any(|known| e.eq_ignore_ascii_case(known)))
-}
-
 /// Path of a run's playback file, which may be missing.
-pub(crate) fn of_run(run: &Path) -> PathBuf {
+pub fn of_run(run: &Path) -> PathBuf {
     let old = run.join(OLD_FILE);
     if old.is_file() && !run.join(FILE).is_file() { old } else { run.join(FILE) }
 }
 
 /// A playback file and what people call it.
-pub(crate) struct Playable {
+pub struct Playable {
     pub title: String,
     pub content: Content,
 }
 
 impl Playable {
     /// Opens a run or a file, baking it where it must be. Errors: no scene; a damaged playback file.
-    pub(crate) fn open(path: &Path, console: &Console) -> anyhow::Result<Self> {
+    pub fn open(path: &Path, console: &dyn Listener) -> Result<Self> {
         if let Some(file) = ready(path)? {
             let index = index(&file)?;
             let stem = || path.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
@@ -53,7 +48,7 @@ impl Playable {
     }
 
     /// The whole file. Errors: damaged anywhere.
-    pub(crate) fn bytes(&self) -> Result<Vec<u8>> {
+    pub fn bytes(&self) -> Result<Vec<u8>> {
         match &self.content {
             Content::File(path) => {
                 let bytes = files::read(path)?;
@@ -107,7 +102,7 @@ mod tests {
     fn playback_files_are_known_by_both_extensions() {
         for (name, named) in [("a.s4d", true), ("A.S4D", true), ("a.splat4d", true), ("a.splat", false), ("s4d", false)]
         {
-            assert_eq!(is_named(Path::new(name)), named, "{name}");
+            assert_eq!(files::is_playback(Path::new(name)), named, "{name}");
         }
         let run = tempfile::tempdir().unwrap();
         assert_eq!(of_run(run.path()), run.path().join("scene.s4d"));

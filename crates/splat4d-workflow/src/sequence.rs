@@ -27,7 +27,7 @@ const GAUSSIANS: &str = "point_cloud.ply";
 
 /// A file name with a place for a number: `frame_%05d.ply`. Names need not be UTF-8.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Pattern {
+pub struct Pattern {
     folder: PathBuf,
     before: OsString,
     digits: usize,
@@ -38,7 +38,7 @@ pub(crate) struct Pattern {
 
 impl Pattern {
     /// The pattern in a path, `None` where there is no `%d` or `%05d` in its file name.
-    pub(crate) fn of(path: &Path) -> Option<Self> {
+    pub fn of(path: &Path) -> Option<Self> {
         let name = path.file_name()?;
         let bytes = name.as_encoded_bytes();
         let percent = bytes.iter().position(|b| *b == b'%')?;
@@ -51,23 +51,23 @@ impl Pattern {
     }
 
     /// Frames of a folder that gave no pattern.
-    pub(crate) fn in_folder(folder: &Path) -> Self {
+    pub fn in_folder(folder: &Path) -> Self {
         let pattern = Self::of(&folder.join(DEFAULT_NAME)).expect("the default name is a pattern");
         Self { whole: true, ..pattern }
     }
 
     /// Numbered files with this ending, as renders are.
-    pub(crate) fn plain(folder: &Path, ending: &str) -> Self {
+    pub fn plain(folder: &Path, ending: &str) -> Self {
         Self::of(&folder.join(format!("%05d.{ending}"))).expect("it is a pattern")
     }
 
     /// The folder of all files.
-    pub(crate) fn folder(&self) -> &Path {
+    pub fn folder(&self) -> &Path {
         if self.folder.as_os_str().is_empty() { Path::new(".") } else { &self.folder }
     }
 
     /// The file of a frame.
-    pub(crate) fn file(&self, frame: usize) -> PathBuf {
+    pub fn file(&self, frame: usize) -> PathBuf {
         self.folder.join(self.name(frame))
     }
 
@@ -86,12 +86,12 @@ impl Pattern {
     }
 
     /// Whether a file of this name would be taken for a frame.
-    pub(crate) fn takes(&self, name: &OsStr) -> bool {
+    pub fn takes(&self, name: &OsStr) -> bool {
         self.number(name).is_some() || self.whole && number_in(name).is_some()
     }
 
     /// Whether it is one of the first `count` frames.
-    pub(crate) fn writes(&self, name: &OsStr, count: usize) -> bool {
+    pub fn writes(&self, name: &OsStr, count: usize) -> bool {
         self.number(name).is_some_and(|n| n < count as u64 && self.name(n as usize) == name)
     }
 }
@@ -108,7 +108,7 @@ fn part(name: &OsStr, from: usize, to: usize) -> Option<OsString> {
 }
 
 /// What is read of a command that writes frames: none of it may be the folder of the frames. Renders may lie in their run.
-pub(crate) struct Read<'a> {
+pub struct Read<'a> {
     /// The scene.
     pub path: &'a Path,
     /// Its run.
@@ -118,13 +118,7 @@ pub(crate) struct Read<'a> {
 /// Takes a folder for the first `count` frames of these patterns.
 ///
 /// Errors: another process has it; it is what is read; it holds frames of another sequence, or such as splat4d has no record of.
-pub(crate) fn take(
-    patterns: &[&Pattern],
-    count: usize,
-    read: &Read<'_>,
-    command: &str,
-    force: bool,
-) -> Result<OutputFolder> {
+pub fn take(patterns: &[&Pattern], count: usize, read: &Read<'_>, command: &str, force: bool) -> Result<OutputFolder> {
     let origin = read.run.map(Run::origin).unwrap_or_default();
     let mut inputs: Vec<Input<'_>> = origin.inputs().collect();
     let sources = Pattern::of(read.path).filter(|_| !read.path.exists());
@@ -147,7 +141,7 @@ pub(crate) fn take(
 
 /// The frames that a folder or a pattern stands for, by their numbers.
 #[derive(Debug)]
-pub(crate) struct Frames {
+pub struct Frames {
     /// In the order of their numbers.
     pub files: Vec<PathBuf>,
     /// Frames from the first to each, by the numbers.
@@ -159,7 +153,7 @@ pub(crate) struct Frames {
 /// The frames that a folder or a pattern stands for, in the order of their numbers.
 ///
 /// Errors: none are there, two have one number, or a folder holds several kinds.
-pub(crate) fn frames(path: &Path) -> Result<Frames> {
+pub fn frames(path: &Path) -> Result<Frames> {
     let pattern = Pattern::of(path);
     let folder = pattern.as_ref().map_or(path, Pattern::folder);
     let mut found: Vec<(u64, OsString)> = Vec::new();
@@ -238,7 +232,7 @@ fn folders(folder: &Path) -> Vec<(u64, OsString)> {
 }
 
 /// The file of the newest iteration below an output folder, its folder of results, or one iteration.
-pub(crate) fn newest(folder: &Path) -> Option<(PathBuf, Option<u64>)> {
+pub fn newest(folder: &Path) -> Option<(PathBuf, Option<u64>)> {
     let iterations = |results: &Path| {
         let entries = std::fs::read_dir(results).ok()?;
         let number = |name: &str| name.strip_prefix(ITERATION)?.parse::<u64>().ok();
@@ -268,7 +262,7 @@ fn only_scene(folder: &Path, endings: &[&str]) -> Option<PathBuf> {
 }
 
 /// Endings of files that may be frames: those of one moment, of the kinds that `--frames` writes.
-pub(crate) fn endings() -> Vec<&'static str> {
+pub fn endings() -> Vec<&'static str> {
     dialect::extensions(|d| !d.moves && d.is_written())
 }
 

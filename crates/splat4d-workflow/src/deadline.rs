@@ -4,7 +4,7 @@ use splat4d_train::run::Stopwatch;
 
 /// When a command is to be done.
 #[derive(Clone, Debug)]
-pub(crate) struct Deadline {
+pub struct Deadline {
     clock: Stopwatch,
     /// Seconds of the clock.
     end: f64,
@@ -19,27 +19,27 @@ impl Default for Deadline {
 
 impl Deadline {
     /// At so many minutes of a clock; none: never.
-    pub(crate) fn of(clock: Stopwatch, minutes: Option<f64>) -> Self {
+    pub fn of(clock: Stopwatch, minutes: Option<f64>) -> Self {
         Self { clock, end: minutes.map_or(f64::INFINITY, |m| 60.0 * m) }
     }
 
     /// The end of what may take this share of what is left.
-    pub(crate) fn part(&self, share: f64) -> Self {
+    pub fn part(&self, share: f64) -> Self {
         Self { clock: self.clock.clone(), end: self.now() + share * self.left().max(0.0) }
     }
 
     /// Whether there is one.
-    pub(crate) fn is_set(&self) -> bool {
+    pub fn is_set(&self) -> bool {
         self.end.is_finite()
     }
 
     /// Seconds of the clock so far.
-    pub(crate) fn now(&self) -> f64 {
+    pub fn now(&self) -> f64 {
         self.clock.seconds()
     }
 
     /// Seconds that are left; infinite where there is no end, negative where it is over.
-    pub(crate) fn left(&self) -> f64 {
+    pub fn left(&self) -> f64 {
         self.end - self.now()
     }
 }

@@ -20,9 +20,9 @@ use std::path::{Path, PathBuf};
 /// Files that mark a folder as a run.
 const MARKERS: [&str; 4] = ["recipe.toml", "run.json", "scene.safetensors", "checkpoints"];
 /// File of results that `compress` leaves next to the file that it writes, for the report and for machines.
-pub(crate) const COMPRESS: &str = "compress.json";
+pub const COMPRESS: &str = "compress.json";
 /// File that holds the settings `compress` was asked for.
-pub(crate) const ORDER: &str = "compress.toml";
+pub const ORDER: &str = "compress.toml";
 /// Files and folders of a run that no output of another command may replace; what is baked, rendered or reported is made again.
 const KEPT: [&str; 9] = [
     "recipe.toml",
@@ -92,7 +92,7 @@ impl Run {
     }
 
     /// Whether a file is one that a run cannot do without.
-    pub(crate) fn needs(file: &Path) -> bool {
+    pub fn needs(file: &Path) -> bool {
         let real = file.canonicalize().or_else(|_| std::path::absolute(file)).unwrap_or_else(|_| file.to_owned());
         let is_kept = |path: &Path| {
             path.parent().is_some_and(Self::is) && path.file_name().is_some_and(|n| KEPT.iter().any(|k| n == *k))
@@ -179,7 +179,7 @@ impl Run {
     }
 
     /// The setting `table.field` of the recipe, as text.
-    pub(crate) fn recipe_text(&self, knob: &str) -> Option<String> {
+    pub fn recipe_text(&self, knob: &str) -> Option<String> {
         self.recipe().ok()?.get(knob).map(|v| v.as_str().map_or_else(|| v.to_string(), str::to_owned))
     }
 
@@ -201,22 +201,22 @@ impl Run {
     }
 
     /// A held-out score.
-    pub(crate) fn score(&self, key: &str) -> Option<f64> {
+    pub fn score(&self, key: &str) -> Option<f64> {
         self.results.as_ref()?.get(key).and_then(Value::as_f64)
     }
 
     /// A held-out score of the still baseline.
-    pub(crate) fn baseline(&self, key: &str) -> Option<f64> {
+    pub fn baseline(&self, key: &str) -> Option<f64> {
         self.all_results.get("still").and_then(|b| b.get(key)).and_then(Value::as_f64)
     }
 
     /// The capture it was trained on.
-    pub(crate) fn capture(&self) -> Option<PathBuf> {
+    pub fn capture(&self) -> Option<PathBuf> {
         self.info.get("capture").and_then(Value::as_str).map(of_text)
     }
 
     /// What it was trained on.
-    pub(crate) fn origin(&self) -> Origin {
+    pub fn origin(&self) -> Origin {
         let opened = || {
             let (root, recipe) = (self.capture()?, self.recipe().ok()?);
             // Also masks and maps that the recipe does not look at.
@@ -226,7 +226,7 @@ impl Run {
     }
 
     /// Warnings and notes about the run: those of the capture's reader, and those since, in that order.
-    pub(crate) fn findings(&self) -> Vec<String> {
+    pub fn findings(&self) -> Vec<String> {
         let mut out: Vec<String> = Vec::new();
         for key in ["warnings", "notes"] {
             for entry in self.info.get(key).and_then(Value::as_array).into_iter().flatten() {
@@ -242,7 +242,7 @@ impl Run {
     }
 
     /// The folder of the newest held-out images.
-    pub(crate) fn pictures(&self) -> Option<PathBuf> {
+    pub fn pictures(&self) -> Option<PathBuf> {
         let test = self.path.join("test");
         let told = self.iteration.map(|n| test.join(format!("ours_{n}")));
         told.filter(|p| p.is_dir()).or_else(|| {
@@ -285,7 +285,7 @@ impl Run {
 }
 
 /// The cameras in a file such as `cameras.json`; `None`: it is JSON of another kind.
-pub(crate) fn views_in(file: &Path) -> Result<Option<Vec<View>>> {
+pub fn views_in(file: &Path) -> Result<Option<Vec<View>>> {
     let value = crate::camera_file::json(&read_text(file)?).map_err(|e| e.at(file.display()))?;
     let list = value.as_array().map(Vec::as_slice).unwrap_or_default();
     let views: Option<Vec<View>> = list.iter().map(read_view).collect();
@@ -293,7 +293,7 @@ pub(crate) fn views_in(file: &Path) -> Result<Option<Vec<View>>> {
 }
 
 /// The images that a run uses as views, held-out ones marked.
-pub(crate) fn views_of(capture: &Capture) -> Vec<View> {
+pub fn views_of(capture: &Capture) -> Vec<View> {
     let view = |i: usize| {
         let frame = &capture.frames[i];
         View {
@@ -315,7 +315,7 @@ pub fn cameras_json(capture: &Capture) -> Value {
 }
 
 /// One of them.
-pub(crate) fn view_json(id: usize, view: &View) -> Value {
+pub fn view_json(id: usize, view: &View) -> Value {
     let world = view.camera.cam_from_world.inverse();
     let k = &view.camera.intrinsics;
     json!({
@@ -364,19 +364,19 @@ pub fn usual_folder(capture: &str) -> PathBuf {
 
 /// The folder of a capture, and what it reads from elsewhere: none of it is an output.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(crate) struct Origin {
+pub struct Origin {
     capture: Option<PathBuf>,
     elsewhere: BTreeSet<PathBuf>,
 }
 
 impl Origin {
     /// Of an opened capture.
-    pub(crate) fn of(capture: &Capture) -> Self {
+    pub fn of(capture: &Capture) -> Self {
         Self { capture: Some(capture.root.clone()), elsewhere: capture.elsewhere.clone() }
     }
 
     /// All of it.
-    pub(crate) fn inputs(&self) -> impl Iterator<Item = Input<'_>> {
+    pub fn inputs(&self) -> impl Iterator<Item = Input<'_>> {
         let what =
             |path: &PathBuf| if path.is_dir() { "a folder of the capture's images," } else { "a file of the capture," };
         let elsewhere = self.elsewhere.iter().map(move |path| Input::new(path, what(path)));
@@ -485,13 +485,13 @@ pub struct Beside<'a> {
 }
 
 /// The newest of each, by name.
-pub(crate) fn beside(results: &Value) -> Vec<Beside<'_>> {
+pub fn beside(results: &Value) -> Vec<Beside<'_>> {
     let entries = results.as_object().into_iter().flatten();
     entries.filter_map(|(name, entry)| newest(entry).map(|(step, scores)| Beside { name, step, scores })).collect()
 }
 
 /// The entry `ours_N` with the largest N.
-pub(crate) fn newest(results: &Value) -> Option<(usize, &Value)> {
+pub fn newest(results: &Value) -> Option<(usize, &Value)> {
     results.as_object()?.iter().filter_map(|(k, v)| Some((step_of(k)?, v))).max_by_key(|e| e.0)
 }
 
@@ -499,7 +499,7 @@ fn step_of(name: &str) -> Option<usize> {
     name.strip_prefix("ours_")?.parse().ok()
 }
 
-pub(crate) fn view_scores(entry: &Value) -> Vec<ViewScore> {
+pub fn view_scores(entry: &Value) -> Vec<ViewScore> {
     let psnr = entry.get("PSNR").and_then(Value::as_object);
     let mut views: Vec<ViewScore> = psnr
         .into_iter()

@@ -1,7 +1,7 @@
 //! Anything that holds a scene: a run folder, a scene file (`.safetensors`, checkpoints too), a playback file
 //! (`.s4d`), a file or folder of another program's Gaussians, or a sequence of such files.
 
-pub(crate) mod bundle;
+pub mod bundle;
 
 use crate::files::{self, either};
 use crate::paths::{Stage, View};
@@ -49,7 +49,7 @@ pub struct Source {
 
 /// Refuses an output that would replace what is read (the scene, a file of its run's capture, or one of `others`) or what any run
 /// needs, and one in a folder that another process owns.
-pub(crate) fn keep(path: &Path, run: Option<&Run>, output: &Path, others: &[&Path]) -> Result<()> {
+pub fn keep(path: &Path, run: Option<&Run>, output: &Path, others: &[&Path]) -> Result<()> {
     // A new file replaces nothing: the capture need not be opened.
     let origin = run.filter(|_| output.is_file()).map(Run::origin).unwrap_or_default();
     let mut inputs = vec![Input { may_hold: run.is_some(), ..Input::new(path, "what is read,") }];
@@ -120,7 +120,7 @@ impl Source {
     }
 
     /// Leaves out Gaussians whose numbers are not finite: files of other programs have such, and no writer takes them.
-    pub(crate) fn finite(mut self) -> Self {
+    pub fn finite(mut self) -> Self {
         let all = self.scene.len();
         let dropped = self.scene.drop_non_finite();
         self.warnings.counted(dropped, all, "contain NaN or infinity and were left out");
@@ -134,7 +134,7 @@ impl Source {
     }
 
     /// Refuses an output that would replace what was read.
-    pub(crate) fn keep(&self, path: &Path, output: &Path, others: &[&Path]) -> Result<()> {
+    pub fn keep(&self, path: &Path, output: &Path, others: &[&Path]) -> Result<()> {
         keep(path, self.run.as_ref(), output, others)
     }
 
@@ -153,7 +153,7 @@ impl Source {
     }
 
     /// The place for orbits.
-    pub(crate) fn stage(&self, views: &[View]) -> Stage {
+    pub fn stage(&self, views: &[View]) -> Stage {
         if !views.is_empty() {
             return Stage::of_views(views, self.scene.up);
         }
@@ -252,7 +252,7 @@ fn inner_box(scene: &Scene<f32>) -> ([f64; 3], f64) {
 }
 
 /// Middle (medians) and radius of the inner part of all means.
-pub(crate) fn cloud(scene: &Scene<f32>) -> ([f64; 3], f64) {
+pub fn cloud(scene: &Scene<f32>) -> ([f64; 3], f64) {
     let means = means(scene);
     if means.is_empty() {
         return ([0.0; 3], 1.0);

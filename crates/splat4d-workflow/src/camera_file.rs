@@ -16,9 +16,9 @@ use std::path::Path;
 
 const KEYS: [&str; 11] = ["fx", "fy", "cx", "cy", "w", "h", "width", "height", "world_to_camera", "near", "background"];
 /// Longest side of an image that is drawn, pixels.
-pub(crate) const MAX_SIDE: usize = 16_384;
+pub const MAX_SIDE: usize = 16_384;
 /// Most pixels of an image that is drawn: 8K video twice over; about 4 GiB of working memory.
-pub(crate) const MAX_PIXELS: usize = 1 << 26;
+pub const MAX_PIXELS: usize = 1 << 26;
 /// Largest |R Rᵀ − I| that counts as rounding of the file.
 const MAX_SHEAR: f64 = 0.01;
 /// Largest number of a camera that is accepted: sums of squares and cubes of it still fit 32-bit floats.
@@ -27,12 +27,12 @@ const LARGEST: f64 = 1e12;
 const SHORTEST: f64 = 1e-3;
 
 /// Reads the camera and its background, if it tells one.
-pub(crate) fn read(path: &Path) -> Result<(Camera, Option<[f32; 3]>)> {
+pub fn read(path: &Path) -> Result<(Camera, Option<[f32; 3]>)> {
     let text = read_text(path)?;
     parse(&text).map_err(|e| e.at(path.display()))
 }
 
-pub(crate) fn parse(text: &str) -> Result<(Camera, Option<[f32; 3]>)> {
+pub fn parse(text: &str) -> Result<(Camera, Option<[f32; 3]>)> {
     let value = json(text)?;
     let Some(object) = value.as_object() else {
         return Err(Error::input("the camera is not a JSON object { ... }").remedy(known_keys()));
@@ -94,7 +94,7 @@ pub(crate) fn parse(text: &str) -> Result<(Camera, Option<[f32; 3]>)> {
 }
 
 /// Parses JSON; the error says what is usually wrong.
-pub(crate) fn json(text: &str) -> Result<Value> {
+pub fn json(text: &str) -> Result<Value> {
     serde_json::from_str(text).map_err(|e| {
         let remedy = if text.contains("NaN") || text.contains("Infinity") {
             "It contains NaN or Infinity, which JSON does not allow: correct that number."
@@ -108,7 +108,7 @@ pub(crate) fn json(text: &str) -> Result<Value> {
 }
 
 /// A rigid `cam_from_world` from a row-major 4x4 (nested, or 16 numbers in a row).
-pub(crate) fn pose(value: &Value) -> Result<Se3> {
+pub fn pose(value: &Value) -> Result<Se3> {
     let wrong = || {
         Error::input("\"world_to_camera\" is not a 4x4 matrix of finite numbers")
             .remedy("Write four rows of four numbers, [[r, r, r, t], ...], the last one 0, 0, 0, 1.")
@@ -140,7 +140,7 @@ pub(crate) fn pose(value: &Value) -> Result<Se3> {
 }
 
 /// A list of numbers that 32-bit floats can compute with.
-pub(crate) fn numbers(value: &Value) -> Option<Vec<f64>> {
+pub fn numbers(value: &Value) -> Option<Vec<f64>> {
     value.as_array()?.iter().map(|v| v.as_f64().filter(|x| x.abs() <= LARGEST)).collect()
 }
 

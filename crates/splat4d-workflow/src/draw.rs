@@ -1,10 +1,8 @@
 //! The seam to the renderer: a scene, a camera and a time become an image for people.
 
-use crate::console::Console;
-use crate::device::Device;
+use crate::events::Listener;
 use crate::paths::View;
 use crate::source::cloud;
-use crate::video::Rgb;
 use rayon::prelude::*;
 use splat4d::channels::{self, Witness};
 use splat4d::device;
@@ -17,7 +15,7 @@ use splat4d::{Error, Result};
 use splat4d_train::labels::best;
 
 /// Channel of the rendering that is shown.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Channel {
     /// Colour over the background
     Color,
@@ -42,6 +40,20 @@ pub enum Channel {
 }
 
 impl Channel {
+    /// All of them.
+    pub const ALL: [Self; 10] = [
+        Self::Color,
+        Self::Alpha,
+        Self::Depth,
+        Self::Flow,
+        Self::Velocity,
+        Self::Normal,
+        Self::Label,
+        Self::Feature,
+        Self::Life,
+        Self::Uncertainty,
+    ];
+
     /// Its name.
     pub fn name(self) -> &'static str {
         match self {
@@ -58,9 +70,27 @@ impl Channel {
         }
     }
 
+    /// What it shows.
+    pub fn about(self) -> &'static str {
+        match self {
+            Self::Color => "Colour over the background",
+            Self::Alpha => "Opacity: white is opaque",
+            Self::Depth => "Expected depth: near is bright",
+            Self::Flow => "Motion of pixels to the next frame for this camera: direction as hue, length as saturation",
+            Self::Velocity => "Velocity in the world: x, y, z as red, green, blue around grey",
+            Self::Normal => "Normals in the camera's axes: right, up, towards the camera as red, green, blue",
+            Self::Label => "The most probable label, one colour per label",
+            Self::Feature => "Feature channels: the first three as red, green, blue around grey",
+            Self::Life => "Seconds of the clip in which the visible surface exists: long is bright",
+            Self::Uncertainty => {
+                "Standard deviation of positions that the training images leave open: uncertain is bright"
+            }
+        }
+    }
+
     /// The channel with this name.
     pub fn named(name: &str) -> Option<Self> {
-        <Self as clap::ValueEnum>::value_variants().iter().copied().find(|c| c.name() == name)
+        Self::ALL.into_iter().find(|c| c.name() == name)
     }
 
     /// Whether it is the mean of a number of what a pixel shows.
@@ -69,7 +99,7 @@ impl Channel {
     }
 
     /// Name of a plane of [`Painter::raw`], for files that name them.
-    pub(crate) fn plane(self, c: usize) -> String {
+    pub fn plane(self, c: usize) -> String {
         let names: &[&str] = match self {
             Self::Color => &["R", "G", "B"],
             Self::Alpha => &["A"],
@@ -105,6 +135,29 @@ const WITNESSES: usize = 48;
 /// Pixels that a thread turns into bytes at once: enough to be worth its while.
 const CHUNK: usize = 1 << 14;
 
+/// An image of 8-bit samples, rows from the top.
+#[derive(Clone, Debug)]
+pub struct Rgb {
+    pub width: usize,
+    pub height: usize,
+    /// width·height·3 bytes.
+    pub data: Vec<u8>,
+}
+
+impl Rgb {
+    /// The bytes of a PNG file.
+    pub fn png(&self) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        let mut encoder = png::Encoder::new(&mut bytes, self.width as u32, self.height as u32);
+        encoder.set_color(png::ColorType::Rgb);
+        encoder.set_depth(png::BitDepth::Eight);
+        encoder.set_compression(png::Compression::Fast);
+        let write = |e: png::Encoder<'_, &mut Vec<u8>>| e.write_header()?.write_image_data(&self.data);
+        write(encoder).expect("an image in memory can be encoded");
+        bytes
+    }
+}
+
 /// Draws, on the CPU unless told; memory is reused from image to image.
 pub struct Painter<'a> {
     player: Player<'a>,
@@ -114,7 +167,7 @@ pub struct Painter<'a> {
     backend: Box<dyn Backend>,
     /// Abilities that the scene needs of a device.
     wanted: Wanted,
-    console: Option<&'a Console>,
+    listener: Option<&'a dyn Listener>,
     /// The last image.
     pub image: Image<f32>,
     bytes: Vec<[u8; 4]>,
@@ -139,7 +192,7 @@ impl<'a> Painter<'a> {
             depth,
             backend,
             wanted,
-            console: None,
+            listener: None,
             image,
             bytes: Vec::new(),
             channel: Channel::Color,
@@ -189,15 +242,20 @@ impl<'a> Painter<'a> {
         Ok(self)
     }
 
-    /// The same on another device, where that can draw the scene.
-    pub(crate) fn on(mut self, device: Device, console: &'a Console) -> Self {
-        self.backend = crate::device::open(device, *self.backend.config(), &self.wanted, console).backend;
-        self.console = Some(console);
+    /// The same on another device: `open` gets the limits of the renderer and what the scene needs. A device that fails later is
+    /// reported to `listener`.
+    pub fn on(
+        mut self,
+        open: impl FnOnce(RenderConfig, &Wanted) -> Box<dyn Backend>,
+        listener: &'a dyn Listener,
+    ) -> Self {
+        self.backend = open(*self.backend.config(), &self.wanted);
+        self.listener = Some(listener);
         self
     }
 
     /// The device's name.
-    pub(crate) fn device(&self) -> &str {
+    pub fn device(&self) -> &str {
         self.backend.name()
     }
 
@@ -209,9 +267,9 @@ impl<'a> Painter<'a> {
         let splats = self.player.at(Time(time)).expect("nothing is read for a scene that is in memory");
         let shot = Shot { depth: self.depth, ..Shot::new(&splats, camera, self.background) };
         if let Some(error) = device::draw(&mut self.backend, &shot, &mut self.image)
-            && let Some(console) = self.console
+            && let Some(listener) = self.listener
         {
-            console.warn(&format!("rendering on the CPU: {}", error.cause()));
+            listener.warn(&format!("rendering on the CPU: {}", error.cause()));
         }
     }
 
@@ -238,9 +296,9 @@ impl<'a> Painter<'a> {
         let splats = scene.splats(&self.instant);
         let shot = Shot { extra: Some(&columns), ..Shot::new(&splats, camera, self.background) };
         if let Some(error) = device::draw(&mut self.backend, &shot, &mut self.image)
-            && let Some(console) = self.console
+            && let Some(listener) = self.listener
         {
-            console.warn(&format!("rendering on the CPU: {}", error.cause()));
+            listener.warn(&format!("rendering on the CPU: {}", error.cause()));
         }
         self.field = flow::divided(&self.image.extra);
     }
@@ -284,7 +342,7 @@ impl<'a> Painter<'a> {
 
     /// Draws and takes over the image in 8 bits, without more of it where the device has a way to that; `range` as in
     /// [`rgb`](Self::rgb).
-    pub(crate) fn picture(&mut self, camera: &Camera, time: f64, channel: Channel, range: [f32; 2]) -> Rgb {
+    pub fn picture(&mut self, camera: &Camera, time: f64, channel: Channel, range: [f32; 2]) -> Rgb {
         if channel == Channel::Color {
             let splats = self.player.at(Time(time)).expect("nothing is read for a scene that is in memory");
             let shot = Shot::new(&splats, camera, self.background);
@@ -299,7 +357,7 @@ impl<'a> Painter<'a> {
     }
 
     /// The last image in 8 bits. `range`: nearest and farthest depth of the depth colours.
-    pub(crate) fn rgb(&self, channel: Channel, range: [f32; 2]) -> Rgb {
+    pub fn rgb(&self, channel: Channel, range: [f32; 2]) -> Rgb {
         if channel.is_field() {
             return field_rgb(&self.raw(), channel, range);
         }
@@ -325,7 +383,7 @@ impl<'a> Painter<'a> {
     /// depth and
     /// uncertainty from the least on, of flow and velocity the largest length behind 0, of life the whole clip. `None`:
     /// nothing is seen, or the channel needs no range.
-    pub(crate) fn range(&self) -> Option<[f32; 2]> {
+    pub fn range(&self) -> Option<[f32; 2]> {
         if self.channel == Channel::Life {
             return Some([0.0, (self.scene.clip[1] - self.scene.clip[0]) as f32]);
         }
@@ -423,14 +481,14 @@ fn byte(v: f32) -> u8 {
 }
 
 /// Colour planes in 8 bits.
-pub(crate) fn color_rgb(color: &Planes<f32>) -> Rgb {
+pub fn color_rgb(color: &Planes<f32>) -> Rgb {
     let mut data = Vec::new();
     color_into(color, &mut data);
     Rgb { width: color.width, height: color.height, data }
 }
 
 /// Colour planes in 8 bits, red, green and blue of a pixel side by side; `out`'s memory is reused.
-pub(crate) fn color_into(color: &Planes<f32>, out: &mut Vec<u8>) {
+pub fn color_into(color: &Planes<f32>, out: &mut Vec<u8>) {
     out.resize(3 * color.pixels(), 0);
     let [red, green, blue] = [0, 1, 2].map(|c| color.plane(c).par_chunks(CHUNK));
     out.par_chunks_mut(3 * CHUNK).zip(red).zip(green).zip(blue).for_each(|(((out, red), green), blue)| {

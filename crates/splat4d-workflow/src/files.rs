@@ -1,5 +1,6 @@
 //! Writing files so that nobody ever finds half of one.
 
+use splat4d::format::playback::{EXTENSION, OLD_EXTENSION};
 use splat4d::{Error, Result};
 pub use splat4d_train::files::{open, read, read_text};
 use splat4d_train::output::Staged;
@@ -7,8 +8,7 @@ use std::io::Write;
 use std::path::Path;
 
 /// Remedy when a file cannot be written.
-pub(crate) const WRITE_REMEDY: &str =
-    "Check that the folder exists, that you may write there and that the disk is not full.";
+pub const WRITE_REMEDY: &str = "Check that the folder exists, that you may write there and that the disk is not full.";
 
 /// Writes a file: to a temporary name in the same folder, then renamed. Devices and pipes are written directly.
 pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
@@ -41,7 +41,7 @@ pub fn cannot_read(path: &Path, error: std::io::Error) -> Error {
 }
 
 /// Standard base64 (RFC 4648) with padding, for data URIs.
-pub(crate) fn base64(bytes: &[u8]) -> String {
+pub fn base64(bytes: &[u8]) -> String {
     const ALPHABET: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
     let mut out = String::with_capacity(bytes.len().div_ceil(3) * 4);
     for chunk in bytes.chunks(3) {
@@ -75,7 +75,7 @@ pub fn human_bytes(bytes: u64) -> String {
 }
 
 /// Bytes from `512MiB`, `1.5G`, `800000000`. Both 1 MB and 1 MiB count 2²⁰ bytes: the difference never matters here.
-pub(crate) fn parse_bytes(text: &str) -> Result<u64, String> {
+pub fn parse_bytes(text: &str) -> Result<u64, String> {
     let text = text.trim();
     let split = text.find(|c: char| !(c.is_ascii_digit() || c == '.')).unwrap_or(text.len());
     let (number, unit) = text.split_at(split);
@@ -107,7 +107,7 @@ pub fn human_seconds(seconds: f64) -> String {
 }
 
 /// A choice for people: "a, b or c".
-pub(crate) fn either(words: &[&str]) -> String {
+pub fn either(words: &[&str]) -> String {
     match words {
         [rest @ .., last] if !rest.is_empty() => format!("{} or {last}", rest.join(", ")),
         _ => words.concat(),
@@ -125,6 +125,11 @@ pub fn grouped(n: usize) -> String {
         out.push(c);
     }
     out
+}
+
+/// Whether a path is named as a playback file.
+pub fn is_playback(path: &Path) -> bool {
+    path.extension().is_some_and(|e| [EXTENSION, OLD_EXTENSION].iter().any(|known| e.eq_ignore_ascii_case(known)))
 }
 
 #[cfg(test)]
