@@ -1,8 +1,7 @@
 //! The `splat4d` command: trains, measures, renders, compresses and plays dynamic 3D scenes.
 //!
-//! Each command is a file in `verbs`. Exit codes: 0 done, 1 failed, 2 bad input. What commands do beyond parsing
-//! and printing moves to `splat4d-workflow`. This is a library only because the studies and the Python package share its
-//! console and measurements; its interface is not public.
+//! Each command is a file in `verbs`: it parses, calls `splat4d-workflow` and prints. Exit codes: 0 done, 1 failed, 2 bad input.
+//! This is a library only because the studies and the Python package share its console; its interface is not public.
 //!
 //! # Code map
 //!
@@ -10,46 +9,25 @@
 //!
 //! | module | content |
 //! |---|---|
-//! | `console.rs`, `video.rs`, `device.rs` | output, films, the choice of the device |
-//! | `raw.rs`, `asked.rs` | channel values as files; files of queried points and their results |
-//! | `measure.rs`, `measure/` | how scenes and files play, for `compress`, the studies and `bench --playback` |
-//! | `comparing.rs` | runs and results of other programs, for `compare` |
-//! | `report/`, `report/compress/` | `report.html`, drawn without a library |
-//! | `film.rs` | the playback file of a long capture, which grows during training |
-//! | `labelling.rs`, `chunked.rs`, `compressing.rs`, `predicting.rs`, `predicting/`, `editing.rs`, `editor.rs` | the work of `label`, `train --chunk` and `join`, `compress`, `predict`, `edit`, `view --edit` |
+//! | `interrupt.rs`, `console.rs` | Ctrl-C; output |
+//! | `device.rs`, `measuring.rs`, `serving.rs` | options of several commands: device, evaluation, the player's server |
 //! | `verbs/`, `verbs/info/` | one file per command |
 //! | `verbs/bench/` | pinned scenes, stages, training steps, growth, GPU stages, other programs (`studies/beside/with_gsplat.py`); each time with its lower bound |
 //! | `bin/` | `s4d`, the command's second name: a launcher |
 
 #![allow(missing_docs)] // nobody outside the workspace reads it
 
-mod asked;
-mod chunked;
-mod comparing;
-mod compressing;
 pub mod console;
 mod device;
-mod editing;
-mod editor;
-mod film;
-pub mod finish;
 pub mod interrupt;
-mod labelling;
-pub mod measure;
-mod predicting;
-mod raw;
-pub mod report;
+mod measuring;
 mod serving;
-pub mod texts;
 pub mod verbs;
-mod video;
-
-pub use splat4d_workflow::{draw, files, paths, run_folder, sequence, source};
 
 use clap::{Parser, Subcommand};
 use console::{Console, Loudness};
 use splat4d::Error;
-use splat4d_workflow::{baking, camera_file, deadline, playable};
+
 use std::ffi::OsString;
 use std::process::ExitCode;
 

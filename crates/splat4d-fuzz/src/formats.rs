@@ -14,7 +14,7 @@ use splat4d::math::Rng;
 use splat4d::motion::{Spacetime, SpacetimeSpec};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, LIFE, LifeKind, Params, SH, Time};
-use splat4d_cli::source::Source;
+use splat4d_workflow::source::Source;
 use std::borrow::Cow;
 use std::cell::RefCell;
 use std::io::{Read, Write};

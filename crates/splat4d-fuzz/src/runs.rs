@@ -2,10 +2,10 @@
 
 use crate::Reader;
 use serde_json::json;
-use splat4d_cli::run_folder::{Asked, Run};
 use splat4d_train::output;
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::chunks::Chunked;
+use splat4d_workflow::run_folder::{Asked, Run};
 use std::cell::OnceCell;
 use std::path::Path;
 use tempfile::TempDir;

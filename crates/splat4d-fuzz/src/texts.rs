@@ -5,12 +5,12 @@
 use crate::Reader;
 use splat4d::Error;
 use splat4d::edit::{Edits, Expr};
-use splat4d_cli::texts::{self, Page};
 use splat4d_dynamics::actions::Actions;
 use splat4d_import::calibration;
 use splat4d_import::corrections::{self, Corrections};
 use splat4d_import::video::{self, Selection};
 use splat4d_train::recipe::Recipe;
+use splat4d_workflow::texts::{self, Page};
 use std::cell::RefCell;
 use std::path::Path;
 use tempfile::{NamedTempFile, TempDir};

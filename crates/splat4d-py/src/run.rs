@@ -5,10 +5,9 @@ use crate::plain::plain;
 use crate::scene::Scene;
 use pyo3::prelude::*;
 use serde_json::Value;
-use splat4d_cli::console::{Console, Loudness};
-use splat4d_cli::finish::{self, Measure};
+use splat4d_workflow::evaluating::{self, Measure};
+use splat4d_workflow::events::ignore;
 use splat4d_workflow::run_folder;
-use splat4d_workflow::source::read_scene;
 use std::path::PathBuf;
 
 /// A run: a folder with its recipe, checkpoints, scene and scores.
@@ -61,13 +60,7 @@ impl Run {
     /// Renders the held-out views, compares them with their images, writes `results.json`, `per_view.json` and the
     /// renders, and returns the means.
     fn evaluate(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
-        let measured = py.detach(|| {
-            let run = run_folder::Run::open(&self.path)?;
-            let scene = read_scene(&run.scene_file()?)?;
-            let console = Console::new(Loudness::Quiet, false);
-            finish::scores(&self.path, &scene, &Measure::default(), &console)
-        });
-        measured.or_raise()?;
+        py.detach(|| evaluating::evaluate(&self.path, &Measure::default(), &ignore)).or_raise()?;
         self.results(py)
     }
 

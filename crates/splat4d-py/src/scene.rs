@@ -18,6 +18,7 @@ use splat4d::scene::{Planes, Time};
 use splat4d_workflow::baking::{self, Baking};
 use splat4d_workflow::converting::{self, Conversion};
 use splat4d_workflow::draw::{Channel, Painter, antialias};
+use splat4d_workflow::editing::{EditOptions, edit};
 use splat4d_workflow::events::{Event, Listener};
 use splat4d_workflow::exporting;
 use splat4d_workflow::paths::View;
@@ -398,6 +399,7 @@ impl Scene {
         let text: Option<String> =
             edits.extract().ok().filter(|text: &String| text.contains('\n') || text.contains('='));
         let path: PathBuf = if text.is_some() { PathBuf::new() } else { edits.extract()? };
+        let mut warnings = Vec::new();
         let scene = self.with_file(py, |file, folder| {
             let list = match text {
                 Some(text) => {
@@ -409,9 +411,16 @@ impl Scene {
                 None => path,
             };
             let out = folder.join("edited.safetensors");
-            splat4d_cli::call(&["edit".into(), file.into(), list.into_os_string(), "-o".into(), out.clone().into()])?;
+            let options = EditOptions {
+                scene: file.to_owned(),
+                list: Some(list),
+                output: Some(out.clone()),
+                ..EditOptions::default()
+            };
+            warnings = listening(|listener| edit(&options, listener))?;
             Ok(read_scene(&out)?)
         })?;
+        crate::errors::warn(py, &warnings)?;
         Ok(Self::made(scene, self.views.clone()))
     }
 

@@ -1,7 +1,7 @@
 //! What a run folder holds, read back: `recipe.toml`, `run.json`, `metrics.csv`, `results.json`, `per_view.json`,
 //! `cameras.json`, `scene.safetensors` and checkpoints. Everything but the folder may be missing.
 
-use crate::files::read_text;
+use crate::files::{self, read_text};
 use crate::paths::View;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -307,6 +307,12 @@ pub fn views_of(capture: &Capture) -> Vec<View> {
     let mut used: Vec<usize> = capture.train.iter().chain(&capture.held).copied().collect();
     used.sort_unstable();
     used.into_iter().map(view).collect()
+}
+
+/// Writes `cameras.json` into a run.
+pub fn write_cameras(run: &Path, capture: &Capture) -> Result<()> {
+    let text = serde_json::to_vec(&cameras_json(capture)).expect("cameras are plain data");
+    files::write(&run.join("cameras.json"), &text)
 }
 
 /// `cameras.json` as 3DGS viewers read it (camera-to-world position and rotation), with a few keys more.

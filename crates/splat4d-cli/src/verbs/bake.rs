@@ -1,11 +1,11 @@
 //! `bake`: a run or a scene becomes one file for playback.
 
-use crate::baking::{Baking, bake};
 use crate::console::Console;
-use crate::files::parse_bytes;
 use splat4d::Error;
 use splat4d::bake::{MAX_REPEAT, Options, SEGMENT, TOLERANCE};
 use splat4d::format::playback::{MAX_PALETTE, WriteConfig};
+use splat4d_workflow::baking::{Baking, bake};
+use splat4d_workflow::files::parse_bytes;
 use std::path::PathBuf;
 
 const EXAMPLES: &str = "\

@@ -13,14 +13,14 @@ mod stages;
 mod training;
 
 use crate::console::Console;
-use crate::files;
-use crate::paths::parse_size;
 use growth::Axis;
 use roofline::Roofline;
 use rows::Row;
 use scenes::{Name, Pinned, Places};
 use splat4d::render::Simd;
 use splat4d::{Error, ErrorKind, Result};
+use splat4d_workflow::files;
+use splat4d_workflow::paths::parse_size;
 use stages::Way;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -228,7 +228,7 @@ fn on_gpu(_: &[Pinned], _: Way, _: &Args, _: &Console) -> anyhow::Result<Vec<Row
 
 /// Measures how files play.
 fn play(args: &Args, console: &Console) -> anyhow::Result<()> {
-    let rows = playback::measure(&args.playback, args.size.unwrap_or(crate::measure::SIZE), console)?;
+    let rows = playback::measure(&args.playback, args.size.unwrap_or(splat4d_workflow::measure::SIZE), console)?;
     if let Some(path) = &args.save {
         files::write(path, playback::json(&rows).as_bytes())?;
         console.aside(&format!("wrote {}", path.display()));

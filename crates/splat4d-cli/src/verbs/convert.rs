@@ -1,10 +1,10 @@
 //! `convert`: from any scene to the formats of other programs; see [`converting`].
 
 use crate::console::Console;
-use crate::files::either;
 use splat4d::format::dialect;
 use splat4d::format::{DIALECTS, Linear, spz};
 use splat4d_workflow::converting::{self, Conversion, written};
+use splat4d_workflow::files::either;
 use std::path::PathBuf;
 
 const EXAMPLES: &str = "\

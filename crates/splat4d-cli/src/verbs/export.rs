@@ -1,11 +1,7 @@
 //! `export`: moments of a scene as plain 3DGS .ply files, the whole of it as one page with its player, or where its
 //! Gaussians, or points that are asked for, go as JSON or CSV.
 
-use crate::asked::{self, Answer};
 use crate::console::Console;
-use crate::files;
-use crate::sequence;
-use crate::source::{Source, not_empty};
 use serde_json::json;
 use splat4d::Error;
 use splat4d::flow::tracks::{Tracks, every, nearest};
@@ -13,6 +9,10 @@ use splat4d::layers::Scene;
 use splat4d::math::Rng;
 use splat4d::scene::{RowEdit, Space, Time, labels};
 use splat4d_workflow::exporting;
+use splat4d_workflow::files;
+use splat4d_workflow::point_queries::{self, Answer};
+use splat4d_workflow::sequence;
+use splat4d_workflow::source::{Source, not_empty};
 use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
@@ -209,7 +209,8 @@ fn followed(source: &Source, args: &Args, [points, out]: [&PathBuf; 2], console:
     let (scene, json) = (&source.scene, is_json(out)?);
     let (_, times) = sequence::moments(scene, args.fps, [args.from, args.to])?;
     let views = source.views()?;
-    let asked = asked::read(&files::read_text(points)?, &views, scene.clip).map_err(|e| e.at(points.display()))?;
+    let asked =
+        point_queries::read(&files::read_text(points)?, &views, scene.clip).map_err(|e| e.at(points.display()))?;
     if asked.len().saturating_mul(times.len()).saturating_mul(3) > MOST_NUMBERS {
         return Err(Error::input(format!("{} points at {} times are too many", asked.len(), times.len()))
             .remedy("Give fewer points, or fewer times with --fps, --from or --to.")

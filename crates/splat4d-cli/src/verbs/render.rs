@@ -2,18 +2,17 @@
 
 use crate::console::Console;
 use crate::device::{self, Device};
-use crate::draw::{Channel, Painter};
-use crate::paths::{self, Clock, Route, parse_size, shots};
-use crate::raw::RawFormat;
-use crate::sequence::{self, Pattern};
-use crate::source::{Source, not_empty};
-use crate::video::{self, Film};
-use crate::{camera_file, files};
-use clap::ValueEnum;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use splat4d::scene::Planes;
 use splat4d::{Error, format};
 use splat4d_train::output::OutputFolder;
+use splat4d_workflow::draw::{Channel, Painter};
+use splat4d_workflow::paths::{self, Clock, Route, parse_size, shots};
+use splat4d_workflow::raw_values::RawFormat;
+use splat4d_workflow::sequence::{self, Pattern};
+use splat4d_workflow::source::{Source, not_empty};
+use splat4d_workflow::video::{self, Film};
+use splat4d_workflow::{camera_file, files};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -100,7 +99,7 @@ pub(crate) struct Args {
     #[arg(long, conflicts_with = "camera")]
     force: bool,
     /// Format of the raw values
-    #[arg(long, value_enum, default_value = "npy", requires = "raw", help_heading = "Image")]
+    #[arg(long, value_parser = raw_formats(), default_value = "npy", requires = "raw", help_heading = "Image")]
     raw_format: RawFormat,
 
     /// Device that renders
@@ -112,6 +111,13 @@ pub(crate) struct Args {
 }
 
 type Color = [f32; 3];
+
+/// Reads the name of a format of raw values.
+fn raw_formats() -> impl TypedValueParser<Value = RawFormat> {
+    let values = RawFormat::ALL.map(|format| PossibleValue::new(format.ending()).help(format.about()));
+    let named = |name: String| RawFormat::ALL.into_iter().find(|format| format.ending() == name);
+    PossibleValuesParser::new(values).map(move |name| named(name).expect("it is one of the names"))
+}
 
 /// Reads the name of a channel.
 fn channels() -> impl TypedValueParser<Value = Channel> {
@@ -198,7 +204,7 @@ fn raw_array(path: &Path, shape: &[usize], data: &[f32], console: &Console) -> a
 
 /// `--raw view` and `--raw view.npy` mean the same.
 fn stem(prefix: &Path) -> OsString {
-    let ending = RawFormat::value_variants().iter().any(|f| prefix.extension().is_some_and(|e| e == f.ending()));
+    let ending = RawFormat::ALL.iter().any(|f| prefix.extension().is_some_and(|e| e == f.ending()));
     if ending { prefix.with_extension("").into_os_string() } else { prefix.as_os_str().to_owned() }
 }
 

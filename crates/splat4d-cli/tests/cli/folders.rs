@@ -5,9 +5,9 @@ use crate::{TINY, str};
 use splat4d::format::ply;
 use splat4d::scene::params::QUAT;
 use splat4d::scene::{GEOMETRY, LifeKind, Params};
-use splat4d_cli::run_folder::Asked;
 use splat4d_train::output::Owner;
 use splat4d_train::recipe::{MotionName, Recipe};
+use splat4d_workflow::run_folder::Asked;
 use std::path::Path;
 
 /// A file of one Gaussian.

@@ -21,7 +21,7 @@ const MOST_SMALL: usize = 1 << 20;
 const MOST_RATIO: usize = 64;
 
 /// Whether a folder is one of these, and no capture or run.
-pub(crate) fn is_scene(folder: &Path) -> bool {
+pub fn is_scene(folder: &Path) -> bool {
     newest(folder).is_some() || folder.join(levels::LEVELS).is_file()
 }
 

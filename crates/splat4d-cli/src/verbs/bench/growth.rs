@@ -10,7 +10,6 @@ use super::rows::Row;
 use super::scenes::{Pinned, VIEWS, View};
 use super::stages::{Way, simd_name};
 use super::training::{self, Held};
-use crate::report::chart::{self, Series};
 use image::ExtendedColorType;
 use image::codecs::jpeg::JpegEncoder;
 use splat4d::layers::{Layer, Scene};
@@ -25,6 +24,7 @@ use splat4d_train::capture::{Capture, CaptureKind, Convention, Extent, Frame, Im
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::dataset::Dataset;
 use splat4d_train::run::peak_memory;
+use splat4d_workflow::report::chart::{self, Series};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -217,7 +217,7 @@ fn write_pictures(folder: &Path, pictures: &[Planes<f32>]) -> Result<Vec<PathBuf
         JpegEncoder::new_with_quality(&mut file, JPEG_QUALITY)
             .encode(&bytes, picture.width as u32, picture.height as u32, ExtendedColorType::Rgb8)
             .map_err(|e| Error::input(format!("an image cannot be written as JPEG: {e}")))?;
-        crate::files::write(&path, &file)?;
+        splat4d_workflow::files::write(&path, &file)?;
         Ok(path)
     };
     pictures.iter().enumerate().map(write).collect()
@@ -229,7 +229,7 @@ struct Folder(PathBuf);
 impl Folder {
     fn new() -> Result<Self> {
         let path = std::env::temp_dir().join(format!("splat4d-bench-{}", std::process::id()));
-        crate::files::make_folder(&path)?;
+        splat4d_workflow::files::make_folder(&path)?;
         Ok(Self(path))
     }
 }

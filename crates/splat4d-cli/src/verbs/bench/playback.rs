@@ -1,12 +1,12 @@
-//! How scenes and files play, side by side: [`crate::measure`] by hand.
+//! How scenes and files play, side by side: `splat4d_workflow::measure` by hand.
 
 use crate::console::Console;
-use crate::draw::antialias;
-use crate::files::{self, grouped, human_bytes};
-use crate::measure::{Side, Subject, What, in_turns, looks_of};
-use crate::source::{Source, not_empty};
 use serde::Serialize;
 use splat4d::Result;
+use splat4d_workflow::draw::antialias;
+use splat4d_workflow::files::{self, grouped, human_bytes};
+use splat4d_workflow::measure::{Side, Subject, What, in_turns, looks_of};
+use splat4d_workflow::source::{Source, not_empty};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 

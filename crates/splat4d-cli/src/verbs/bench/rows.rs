@@ -1,8 +1,8 @@
 //! What was measured: rows, and the three forms in which they are told.
 
-use crate::files::{self, grouped, human_bytes};
 use serde::{Deserialize, Serialize};
 use splat4d::{Error, Result};
+use splat4d_workflow::files::{self, grouped, human_bytes};
 use std::fmt::Write;
 use std::path::Path;
 

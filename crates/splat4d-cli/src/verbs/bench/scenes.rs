@@ -1,12 +1,12 @@
 //! The pinned scenes: always the same Gaussians from the same places, so that figures of different days compare.
 
-use crate::source::Source;
 use splat4d::layers::{Layer, Scene};
 use splat4d::math::{Rng, Se3, sh};
 use splat4d::motion::{Spacetime, SpacetimeSpec};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Born, Camera, GEOMETRY, LifeKind, Params, RowEdit, SH, Space, Time};
 use splat4d::{Error, Result};
+use splat4d_workflow::source::Source;
 use std::f64::consts::TAU;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -118,7 +118,7 @@ impl Pinned {
             return Ok(Err(Skipped(format!("scene {letter} is skipped: {missing}; name it with {option}"))));
         };
         let source = Source::open(path)?;
-        crate::source::not_empty(&source.scene, path)?;
+        splat4d_workflow::source::not_empty(&source.scene, path)?;
         let views = match name {
             Name::S => around(),
             Name::T => of_the_capture(&source, path, 400)?,

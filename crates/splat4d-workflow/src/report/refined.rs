@@ -7,7 +7,7 @@ use splat4d_train::run::corrected;
 use std::fmt::Write;
 
 /// How far cameras moved, in one line; `None`: nothing was learnt of them.
-pub(crate) fn refined_in_words(refined: &Value) -> Option<String> {
+pub fn refined_in_words(refined: &Value) -> Option<String> {
     let rows = refined["cameras"].as_array()?;
     let number = |row: &Value, key: &str| row[key].as_f64().unwrap_or(0.0).abs();
     let sorted = |key: &str| {

@@ -2,9 +2,9 @@
 //! as `edit`. It writes one file, the list, and reads nothing that a page names but files next to the list.
 
 use crate::baking::{Baking, pack_scene};
-use crate::console::{Console, Loudness};
 use crate::draw::color_rgb;
 use crate::editing::{self, Bring};
+use crate::events::{Listener, ignore};
 use crate::files;
 use crate::source::Source;
 use image::codecs::jpeg::JpegEncoder;
@@ -166,7 +166,7 @@ struct State {
 }
 
 /// Edits one scene by one list.
-pub(crate) struct Editor {
+pub struct Editor {
     source: Source,
     title: String,
     file: PathBuf,
@@ -178,7 +178,7 @@ pub(crate) struct Editor {
 
 impl Editor {
     /// Errors: the list is there and is none, or belongs to another scene, or its folder is not there.
-    pub(crate) fn new(source: Source, title: String, file: &Path) -> Result<Self> {
+    pub fn new(source: Source, title: String, file: &Path) -> Result<Self> {
         let folder = file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
         if !folder.is_dir() {
             return Err(Error::input("its folder does not exist").at(file.display()).remedy("Create the folder"));
@@ -192,7 +192,7 @@ impl Editor {
     }
 
     /// The edited scene as a playback file, as the list has it at the start; none: the list is empty.
-    pub(crate) fn start(&self, console: &Console) -> Result<Option<Vec<u8>>> {
+    pub fn start(&self, console: &dyn Listener) -> Result<Option<Vec<u8>>> {
         if self.listed.steps.is_empty() {
             return Ok(None);
         }
@@ -206,7 +206,7 @@ impl Editor {
     /// Does what a page asks for.
     ///
     /// Errors: what is no question, and those of its work; nothing is changed then.
-    pub(crate) fn answer(&self, asked: Value) -> Result<EditAnswer> {
+    pub fn answer(&self, asked: Value) -> Result<EditAnswer> {
         let ask: Ask = serde_json::from_value(asked)
             .map_err(|e| Error::input(format!("unknown request of the page: {e}")).remedy("Reload the page"))?;
         let told = |told: Value| Ok(EditAnswer { told, scene: None });
@@ -222,7 +222,7 @@ impl Editor {
             Ask::Bake { steps } => {
                 let number = self.bakings.fetch_add(1, Ordering::SeqCst) + 1;
                 let (scene, _) = self.replayed(&steps)?;
-                let bytes = self.bake(&scene, &quiet())?;
+                let bytes = self.bake(&scene, &ignore)?;
                 // Who asked again in the meantime wants to see that.
                 let newest = self.bakings.load(Ordering::SeqCst) == number;
                 if newest {
@@ -246,8 +246,7 @@ impl Editor {
             }
             Ask::Floaters { steps, strength, t } => {
                 let (scene, _) = self.replayed(&steps)?;
-                let console = quiet();
-                let found = Bring::new(&self.source, Some(self.file.as_path()), &console)?.propose(&scene, strength)?;
+                let found = Bring::new(&self.source, Some(self.file.as_path()), &ignore)?.propose(&scene, strength)?;
                 let mut value = held("", &scene, &found.selected, t);
                 value["psnr"] = json!([found.before, found.after]);
                 value["pictures"] = json!(found.pictures);
@@ -311,8 +310,7 @@ impl Editor {
         if first == steps.len() {
             return Ok((scene, done));
         }
-        let console = quiet();
-        let bring = Bring::new(&self.source, Some(self.file.as_path()), &console)?;
+        let bring = Bring::new(&self.source, Some(self.file.as_path()), &ignore)?;
         let (scene, done) = replay_after(done, &steps[first..], (*scene).clone(), &bring, &mut |_, _| {})?;
         let scene = Arc::new(scene);
         let mut state = self.lock();
@@ -323,7 +321,7 @@ impl Editor {
         Ok((scene, done))
     }
 
-    fn bake(&self, scene: &Scene<f32>, console: &Console) -> Result<Vec<u8>> {
+    fn bake(&self, scene: &Scene<f32>, console: &dyn Listener) -> Result<Vec<u8>> {
         let baking = Baking { poster: false, ..Baking::default() };
         let packed = pack_scene(scene, &self.source, &self.title, &baking, console);
         console.clear();
@@ -349,8 +347,7 @@ impl Editor {
 
     fn select(&self, text: &str, scene: &Scene<f32>) -> Result<Selected> {
         self.check(&[Step::Delete { select: text.to_owned() }])?;
-        let console = quiet();
-        select(&Expr::parse(text)?, scene, &Bring::new(&self.source, Some(self.file.as_path()), &console)?)
+        select(&Expr::parse(text)?, scene, &Bring::new(&self.source, Some(self.file.as_path()), &ignore)?)
     }
 
     fn bend(&self, steps: &[Step], select: &str, times: [f64; 2], nodes: usize) -> Result<Value> {
@@ -361,8 +358,8 @@ impl Editor {
         }
         let (scene, _) = self.replayed(steps)?;
         let selected = self.select(select, &scene)?;
-        let (console, own) = (quiet(), has_nodes(&scene, &selected));
-        let bring = Bring::new(&self.source, Some(self.file.as_path()), &console)?;
+        let own = has_nodes(&scene, &selected);
+        let bring = Bring::new(&self.source, Some(self.file.as_path()), &ignore)?;
         let dragging = Dragging::new(&scene, &selected, times, nodes, &bring)?;
         let [places, nodes] = [dragging.places(), dragging.nodes()].map(rounded);
         let mut state = self.lock();
@@ -391,11 +388,6 @@ impl Editor {
         device::draw(&mut bent.backend, &Shot::new(&splats, &camera, scene.background), &mut bent.image);
         Ok(json!({ "nodes": nodes, "picture": jpeg(&bent.image)? }))
     }
-}
-
-/// Says nothing but warnings.
-fn quiet() -> Console {
-    Console::new(Loudness::Quiet, false)
 }
 
 fn draw(scene: &Scene<f32>, camera: &Camera, t: f64, depth: bool, image: &mut Image<f32>) -> Result<()> {
@@ -580,7 +572,7 @@ impl Drawn<'_> {
 }
 
 /// A token that nobody can guess, from the system's randomness.
-pub(crate) fn token() -> Result<String> {
+pub fn token() -> Result<String> {
     let mut bytes = [0; 16];
     getrandom::fill(&mut bytes).map_err(|e| {
         Error::input(format!("the system provides no random numbers ({e})"))

@@ -1,14 +1,14 @@
 //! The work behind `compress`: rounds until size and guard are content, the file, scores, comparison and report.
 
 use crate::baking;
-use crate::console::Console;
 use crate::draw::antialias;
-use crate::finish::{self, Measure};
+use crate::evaluating::{self, Measure};
+use crate::events::{Listener, Recorded};
 use crate::measure::{SIZE, Side, Subject, What, in_turns, looks_of};
 use crate::report::compress::{Compressed, Guard, Step, Tried};
-use crate::run_folder::{self, COMPRESS, ORDER, Run, cameras_json};
+use crate::run_folder::{self, COMPRESS, ORDER, Run};
 use crate::source::{Source, not_empty, read_scene};
-use crate::{files, interrupt, playable, report};
+use crate::{files, playable, report};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 use splat4d::device::Device;
@@ -16,12 +16,13 @@ use splat4d::format::playback::{Meta, PagesDraft, Summary, WriteConfig, write_pa
 use splat4d::layers::Scene;
 use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::capture::{Capture, ImageStore};
-use splat4d_train::compress::{self, Compression, Job};
+use splat4d_train::compress::{self, Compression, Job, Level};
 use splat4d_train::eval::run::{EvalOptions, Scores, assess};
 use splat4d_train::output::{Found, Input, Mixes, OutputFolder, Request};
 use splat4d_train::path_text::in_command;
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::{TrainOptions, checkpoint};
+use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -34,7 +35,7 @@ const GENTLER: f64 = 0.5;
 /// Settings that the user asked for; they lie in [`ORDER`], so that an interrupted compression knows them.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Order {
+pub struct Order {
     /// The run that is compressed.
     #[serde(with = "splat4d_train::path_text")]
     pub source: PathBuf,
@@ -56,6 +57,129 @@ pub(crate) struct Order {
     pub settings: Compression,
 }
 
+/// Default of [`CompressOptions::guard`], dB: less is not seen in a moving image.
+pub const GUARD: f64 = 0.5;
+
+/// Options of [`compress`].
+#[derive(Clone, Debug)]
+pub struct CompressOptions {
+    /// Output folder. `None`: `RUN-compressed`, or `RUN-compressed-2` and so on if it exists.
+    pub output: Option<PathBuf>,
+    /// Replace the run in the output folder once the new run has begun.
+    pub force: bool,
+    /// 0: the plain file; 1: quantised and fine-tuned; 2: also pruned and masked, coarser codes, a smaller palette.
+    pub level: u8,
+    /// Share of the Gaussians to remove, 0 to 0.98. `None`: the level's.
+    pub prune: Option<f64>,
+    /// Score of Gaussians: change, share, both, opacity, light-gaussian, pup or speedy. `None`: change.
+    pub score: Option<String>,
+    /// Coarsen and prune until the file has at most this many bytes.
+    pub max_bytes: Option<u64>,
+    /// Total steps of fine-tuning. `None`: a share of the run's steps, by level.
+    pub fine_tune: Option<usize>,
+    /// Largest loss of training views, dB; beyond it half as much is pruned, at most twice (with `prune`: only a warning). 0:
+    /// no guard.
+    pub guard: f64,
+    /// Also train the unpruned scene for as many steps, and compare with it.
+    pub unpruned: bool,
+    /// Settings of the level to change, as `key=value`.
+    pub set: Vec<String>,
+    /// Evaluate, guard, compare and report.
+    pub eval: bool,
+    /// Image size (width, height) at which playback is timed.
+    pub size: [usize; 2],
+    /// Device that renders during fine-tuning; the CPU does the rest.
+    pub device: Device,
+    /// How held-out views are measured.
+    pub measure: Measure,
+}
+
+impl Default for CompressOptions {
+    fn default() -> Self {
+        Self {
+            output: None,
+            force: false,
+            level: 2,
+            prune: None,
+            score: None,
+            max_bytes: None,
+            fine_tune: None,
+            guard: GUARD,
+            unpruned: false,
+            set: Vec::new(),
+            eval: true,
+            size: SIZE,
+            device: Device::Cpu,
+            measure: Measure::default(),
+        }
+    }
+}
+
+impl CompressOptions {
+    /// The level's settings, then the options, then every `set`.
+    fn settings(&self, iterations: usize) -> Result<Compression> {
+        let mut settings = Compression::level(Level::new(self.level)?, iterations);
+        if let Some(share) = self.prune {
+            if self.level < 2 {
+                return Err(Error::input(format!("--prune belongs to level 2, not to level {}", self.level))
+                    .remedy("Leave --level out."));
+            }
+            settings.prune = share;
+        }
+        if let Some(steps) = self.fine_tune {
+            // As the level shares its own steps.
+            let all = settings.steps();
+            settings.fine_tune = (settings.fine_tune * steps).checked_div(all).unwrap_or(0);
+            settings.quantise = steps - settings.fine_tune;
+        }
+        if let Some(name) = &self.score {
+            settings.set(&format!("spatial={name}")).map_err(|e| e.at("--score"))?;
+        }
+        for assignment in &self.set {
+            settings.set(assignment).map_err(|e| e.at("--set"))?;
+        }
+        if !settings.codec {
+            return Err(
+                Error::input("`codec` = false is for studies: it makes no file").remedy("Use `splat4d lab e03`.")
+            );
+        }
+        Ok(settings)
+    }
+}
+
+/// Makes a trained run smaller and faster to play: prunes, masks, quantises, fine-tunes, measures before and after. Returns the
+/// folder of the result, a run with `scene.s4d` and `report.html`.
+///
+/// Errors: the run is unfinished or its capture has moved; options that do not fit together; `stop` was raised, after a
+/// checkpoint was saved ([`resume`] continues).
+///
+/// ```no_run
+/// use splat4d_workflow::compressing::{CompressOptions, compress};
+/// use splat4d_workflow::events::ignore;
+/// use std::sync::atomic::AtomicBool;
+///
+/// # fn main() -> splat4d::Result<()> {
+/// let options = CompressOptions { max_bytes: Some(500_000), ..CompressOptions::default() };
+/// let small = compress("runs/knight".as_ref(), &options, &AtomicBool::new(false), &ignore)?;
+/// println!("{}", small.join("scene.s4d").display());
+/// # Ok(())
+/// # }
+/// ```
+pub fn compress(run: &Path, options: &CompressOptions, stop: &AtomicBool, listener: &dyn Listener) -> Result<PathBuf> {
+    options.measure.check()?;
+    let work = Work::begin(run, options, listener)?.on(options.device).timed_at(options.size);
+    work.run(options.eval, &options.measure, stop, listener)
+}
+
+/// Continues a compression from its newest checkpoint. Of the options only `eval`, `size`, `device` and `measure` count.
+///
+/// Errors: the folder contains no compression; those of [`compress`].
+pub fn resume(dir: &Path, options: &CompressOptions, stop: &AtomicBool, listener: &dyn Listener) -> Result<PathBuf> {
+    options.measure.check()?;
+    let work = Work::reopen(dir)?.on(options.device).timed_at(options.size);
+    work.run(options.eval, &options.measure, stop, listener)
+}
+
 impl Order {
     fn text(&self) -> String {
         toml::to_string(self).expect("an order is plain data")
@@ -68,7 +192,7 @@ const SAVING: &str = "stopping: a checkpoint is being saved";
 const COMMAND: &str = "compress";
 
 /// A compression in its folder.
-pub(crate) struct Work {
+pub struct Work {
     dir: PathBuf,
     folder: OutputFolder,
     order: Order,
@@ -81,8 +205,39 @@ pub(crate) struct Work {
 }
 
 impl Work {
-    /// A new compression, or what the same order left unfinished. Errors: the folder cannot be written, or is not to be.
-    pub(crate) fn begin(dir: PathBuf, order: Order, force: bool) -> Result<Self> {
+    /// A compression of a run, not started yet, or the unfinished one of the same options in the same folder.
+    ///
+    /// Errors: the run is unfinished; options that do not fit together; the folder cannot be written, or is not to be.
+    pub fn begin(source: &Path, options: &CompressOptions, console: &dyn Listener) -> Result<Self> {
+        let run = Run::open(source)?;
+        if !Run::is_finished(source) {
+            return Err(Error::input("the run is unfinished")
+                .at(source.display())
+                .remedy(format!("Finish it first: splat4d train --resume {}", in_command(source))));
+        }
+        let iterations = run.iteration().or_else(|| run.recipe().ok().map(|r| r.run.iterations)).unwrap_or(1);
+        let order = Order {
+            source: std::path::absolute(source).map_err(|e| files::cannot_read(source, e))?,
+            level: options.level,
+            guard: options.guard,
+            max_bytes: options.max_bytes,
+            unpruned: options.unpruned,
+            asked: options.prune.is_some() || options.set.iter().any(|s| s.trim_start().starts_with("prune")),
+            free: options.set.is_empty() && options.fine_tune.is_none(),
+            settings: options.settings(iterations)?,
+            tried: Vec::new(),
+        };
+        let dir = options.output.clone().unwrap_or_else(|| {
+            let mut name = source.file_name().unwrap_or(OsStr::new("run")).to_owned();
+            name.push("-compressed");
+            let dir = run_folder::free_folder(&source.with_file_name(name));
+            console.say(&format!("the result is written to {}", dir.display()));
+            dir
+        });
+        Self::place(dir, order, options.force)
+    }
+
+    fn place(dir: PathBuf, order: Order, force: bool) -> Result<Self> {
         let asked = order.text();
         let origin = Run::open(&order.source)?.origin();
         let mut inputs = vec![Input::new(&order.source, "the run")];
@@ -98,17 +253,17 @@ impl Work {
     }
 
     /// The same, tuned on this device.
-    pub(crate) fn on(self, device: Device) -> Self {
+    pub fn on(self, device: Device) -> Self {
         Self { device, ..self }
     }
 
     /// The same, with playback timed at this image size (width, height).
-    pub(crate) fn timed_at(self, size: [usize; 2]) -> Self {
+    pub fn timed_at(self, size: [usize; 2]) -> Self {
         Self { size, ..self }
     }
 
     /// The compression in a folder, to continue it. Errors: there is none.
-    pub(crate) fn reopen(dir: &Path) -> Result<Self> {
+    pub fn reopen(dir: &Path) -> Result<Self> {
         let path = dir.join(ORDER);
         if !path.is_file() {
             return Err(Error::input("this folder contains no compression")
@@ -134,8 +289,8 @@ impl Work {
     }
 
     /// Compresses, measures and reports. What fails before the first step leaves nothing behind.
-    pub(crate) fn run(mut self, eval: bool, measure: &Measure, console: &Console) -> anyhow::Result<()> {
-        let done = self.work(eval, measure, console);
+    pub fn run(mut self, eval: bool, measure: &Measure, stop: &AtomicBool, console: &dyn Listener) -> Result<PathBuf> {
+        let done = self.work(eval, measure, stop, &Recorded::new(console));
         if done.is_err() && self.fresh && checkpoint::list(&self.dir).is_empty() {
             self.folder.abandon();
         } else if done.is_ok() {
@@ -143,13 +298,13 @@ impl Work {
         } else {
             self.folder.begun();
         }
-        done
+        done.map(|()| self.dir)
     }
 
     /// Until size and guard are content.
-    fn work(&mut self, eval: bool, measure: &Measure, console: &Console) -> anyhow::Result<()> {
-        let stop = interrupt::flag(SAVING);
-        interrupt::ends(self.kept());
+    fn work(&mut self, eval: bool, measure: &Measure, stop: &AtomicBool, recorded: &Recorded<'_>) -> Result<()> {
+        let console: &dyn Listener = recorded;
+        console.stop_not_polled(&self.kept());
         let source = Source::open(&self.order.source)?;
         not_empty(&source.scene, &self.order.source)?;
         source.scene.without_head("a playback file")?;
@@ -164,22 +319,23 @@ impl Work {
         let before = if eval { Some(original.scores(original.scene, console)?) } else { None };
         self.choose_size(&original, console)?;
         let (file, after) = loop {
-            interrupt::asks(SAVING);
-            let compressed = self.compress(&original, &stop, console)?;
-            interrupt::ends(self.kept());
+            console.stop_polled(SAVING);
+            let compressed = self.compress(&original, stop, console)?;
+            console.stop_not_polled(&self.kept());
             let file = self.write_file(&compressed, console)?;
             let Some(before) = &before else { break (file, None) };
             let scene = read_scene(&self.dir.join("scene.safetensors"))?;
-            let after = finish::scores(&self.dir, &scene, measure, console)?;
+            let after = evaluating::scores(&self.dir, &scene, measure, console)?;
             if !self.refused(before, &after, file.bytes, console)? {
                 break (file, Some(after));
             }
         };
         if let (Some(before), Some(after)) = (before, after) {
-            let told = self.compare(&source, &original, [&before, &after], &stop, console)?;
+            let told = self.compare(&source, &original, [&before, &after], stop, recorded)?;
             say(&told, self.size, console);
-            files::write(&self.dir.join(COMPRESS), serde_json::to_string_pretty(&told)?.as_bytes())?;
-            finish::amend(&self.dir, [("notes".into(), json!(console.warnings()))])?;
+            let text = serde_json::to_string_pretty(&told).expect("results are plain data");
+            files::write(&self.dir.join(COMPRESS), text.as_bytes())?;
+            evaluating::amend(&self.dir, [("notes".into(), json!(recorded.warnings()))])?;
             console.written(&report::write(&Run::open(&self.dir)?)?);
         }
         console.written(&self.dir.join(playable::FILE));
@@ -199,12 +355,13 @@ impl Work {
         original: &Original<'_>,
         [before, after]: [&Scores; 2],
         stop: &AtomicBool,
-        console: &Console,
-    ) -> anyhow::Result<Compressed> {
+        recorded: &Recorded<'_>,
+    ) -> Result<Compressed> {
+        let console: &dyn Listener = recorded;
         let unpruned = if self.order.unpruned {
-            interrupt::asks(SAVING);
+            console.stop_polled(SAVING);
             let trained = self.train_unpruned(original, stop, console)?;
-            interrupt::ends(self.kept());
+            console.stop_not_polled(&self.kept());
             Some(trained)
         } else {
             None
@@ -228,7 +385,7 @@ impl Work {
         Ok(Compressed {
             source: order.source.clone(),
             level: Some(order.level),
-            settings: serde_json::to_value(&order.settings)?,
+            settings: serde_json::to_value(&order.settings).expect("settings are plain data"),
             before: next().scored(before),
             after: next().scored(after),
             plain: (subjects.len() - usize::from(unpruned.is_some()) > 2).then(&mut next),
@@ -240,7 +397,7 @@ impl Work {
                 passed: loss_db <= order.guard,
             }),
             tried: order.tried.clone(),
-            warnings: console.warnings(),
+            warnings: recorded.warnings(),
         })
     }
 
@@ -249,8 +406,8 @@ impl Work {
         &self,
         original: &Original<'_>,
         stop: &AtomicBool,
-        console: &Console,
-    ) -> anyhow::Result<(Scene<f32>, Scores)> {
+        console: &dyn Listener,
+    ) -> Result<(Scene<f32>, Scores)> {
         let settings = Compression {
             prune: 0.0,
             rounds: 1,
@@ -267,7 +424,7 @@ impl Work {
         let done = compress::compress(&job, &folder, &options, stop, &mut |event| console.event(event))?;
         console.clear();
         if done.outcome.interrupted {
-            return Err(self.interrupted(done.outcome.iteration).into());
+            return Err(self.interrupted(done.outcome.iteration));
         }
         let scene = read_scene(&folder.join("scene.safetensors"))?;
         let scores = original.scores(&scene, console)?;
@@ -280,7 +437,7 @@ impl Work {
     }
 
     /// Where the file must stay within a size, the gentlest settings that do.
-    fn choose_size(&mut self, original: &Original<'_>, console: &Console) -> anyhow::Result<()> {
+    fn choose_size(&mut self, original: &Original<'_>, console: &dyn Listener) -> Result<()> {
         let begun = !checkpoint::list(&self.dir).is_empty() || !self.order.tried.is_empty();
         let Some(most) = self.order.max_bytes.filter(|_| !begun) else { return Ok(()) };
         let settings = self.order.settings.clone();
@@ -304,7 +461,7 @@ impl Work {
             files::human_bytes(last.bytes)
         ));
         self.order.settings = chosen;
-        Ok(self.save()?)
+        self.save()
     }
 
     /// One attempt, or the rest of one.
@@ -312,9 +469,9 @@ impl Work {
         &self,
         original: &Original<'_>,
         stop: &AtomicBool,
-        console: &Console,
-    ) -> anyhow::Result<compress::Compressed> {
-        files::write(&self.dir.join("cameras.json"), &serde_json::to_vec(&cameras_json(&original.capture))?)?;
+        console: &dyn Listener,
+    ) -> Result<compress::Compressed> {
+        run_folder::write_cameras(&self.dir, &original.capture)?;
         let job = original.job(&self.order.settings);
         let options = TrainOptions { device: self.device, ..TrainOptions::default() };
         let compressed = compress::compress(&job, &self.dir, &options, stop, &mut |event| {
@@ -323,13 +480,13 @@ impl Work {
         })?;
         console.clear();
         if compressed.outcome.interrupted {
-            return Err(self.interrupted(compressed.outcome.iteration).into());
+            return Err(self.interrupted(compressed.outcome.iteration));
         }
         Ok(compressed)
     }
 
     /// Writes `scene.s4d`.
-    fn write_file(&self, compressed: &compress::Compressed, console: &Console) -> anyhow::Result<Summary> {
+    fn write_file(&self, compressed: &compress::Compressed, console: &dyn Listener) -> Result<Summary> {
         console.phase("writing", 0, 0);
         let source = Source::open(&self.dir)?;
         let views = source.views()?;
@@ -349,7 +506,7 @@ impl Work {
     }
 
     /// Whether size or guard want another attempt; then the order is changed, and the folder is ready for it.
-    fn refused(&mut self, before: &Scores, after: &Scores, bytes: u64, console: &Console) -> anyhow::Result<bool> {
+    fn refused(&mut self, before: &Scores, after: &Scores, bytes: u64, console: &dyn Listener) -> Result<bool> {
         let (Some(was), Some(is)) = (before.train("PSNR"), after.train("PSNR")) else { return Ok(false) };
         let settings = &self.order.settings;
         let (loss, prune) = (was - is, settings.prune);
@@ -371,7 +528,7 @@ impl Work {
         if next == prune || self.order.tried.len() + 1 >= MOST_TRIES {
             if let Some(most) = large {
                 let over = format!("the file has {bytes} bytes, more than {most}");
-                return Err(Error::input(over).remedy("Give a smaller --max-mb.").into());
+                return Err(Error::input(over).remedy("Give a smaller --max-mb."));
             }
             return Ok(false);
         }
@@ -397,7 +554,7 @@ impl Original<'_> {
     }
 
     /// The scores of a scene of this capture, without a trace in any folder.
-    fn scores(&self, scene: &Scene<f32>, console: &Console) -> anyhow::Result<Scores> {
+    fn scores(&self, scene: &Scene<f32>, console: &dyn Listener) -> Result<Scores> {
         let store = Arc::new(ImageStore::new(self.capture.clone(), self.recipe.run.image_memory as usize));
         let options =
             EvalOptions { antialias: self.recipe.appearance.antialias, pictures: false, ..EvalOptions::default() };
@@ -437,7 +594,7 @@ fn steps(run: &Run) -> Vec<Step> {
 }
 
 /// Before and after in a few lines.
-fn say(told: &Compressed, size: [usize; 2], console: &Console) {
+fn say(told: &Compressed, size: [usize; 2], console: &dyn Listener) {
     let fair = told.fair();
     let name = if told.unpruned.is_some() { "unpruned, same additional steps" } else { "before" };
     let line = |name: &str, side: &Side| {

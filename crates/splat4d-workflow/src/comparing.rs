@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 /// Scores of held-out views that are compared: key, digits, whether more is better. The names of other programs are those
 /// of 3DGS' `results.json`, whatever their case.
-pub(crate) const SCORES: [(&str, usize, bool); 8] = [
+pub const SCORES: [(&str, usize, bool); 8] = [
     ("PSNR", 2, true),
     ("PSNR-dynamic", 2, true),
     ("PSNR-foreground", 2, true),
@@ -20,28 +20,28 @@ pub(crate) const SCORES: [(&str, usize, bool); 8] = [
 
 /// One row of the comparison.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Entry {
-    pub(crate) name: String,
+pub struct Entry {
+    pub name: String,
     /// What it shows, in the order of [`SCORES`].
-    pub(crate) scores: Vec<Option<f64>>,
-    pub(crate) motion: Option<String>,
-    pub(crate) steps: Option<usize>,
-    pub(crate) gaussians: Option<usize>,
-    pub(crate) seconds: Option<f64>,
-    pub(crate) bytes: Option<u64>,
+    pub scores: Vec<Option<f64>>,
+    pub motion: Option<String>,
+    pub steps: Option<usize>,
+    pub gaussians: Option<usize>,
+    pub seconds: Option<f64>,
+    pub bytes: Option<u64>,
     /// What was measured, where the results say it: two that differ cannot be compared.
-    pub(crate) capture: Option<String>,
-    pub(crate) views: Vec<ViewScore>,
+    pub capture: Option<String>,
+    pub views: Vec<ViewScore>,
     /// Folder of `gt` and `renders`, where it is kept.
-    pub(crate) pictures: Option<PathBuf>,
-    pub(crate) metrics: Vec<Metrics>,
+    pub pictures: Option<PathBuf>,
+    pub metrics: Vec<Metrics>,
 }
 
 impl Entry {
     /// A run, a folder with `results.json`, or such a file.
     ///
     /// Errors: nothing of that kind; a file that is no JSON; no score that is known.
-    pub(crate) fn open(path: &Path) -> Result<Self> {
+    pub fn open(path: &Path) -> Result<Self> {
         if Run::is(path) {
             let run = Run::open(path)?;
             return Self::of_run(&run).ok_or_else(|| {
@@ -106,7 +106,7 @@ impl Entry {
     }
 
     /// A score by its place in [`SCORES`].
-    pub(crate) fn score(&self, i: usize) -> Option<f64> {
+    pub fn score(&self, i: usize) -> Option<f64> {
         self.scores.get(i).copied().flatten()
     }
 }
@@ -121,7 +121,7 @@ fn scores(entry: &Value) -> Vec<Option<f64>> {
 }
 
 /// Reads all, and gives two of one name a number.
-pub(crate) fn open(paths: &[PathBuf]) -> Result<Vec<Entry>> {
+pub fn open(paths: &[PathBuf]) -> Result<Vec<Entry>> {
     let mut entries: Vec<Entry> = Vec::with_capacity(paths.len());
     for path in paths {
         let mut entry = Entry::open(path)?;
@@ -136,7 +136,7 @@ pub(crate) fn open(paths: &[PathBuf]) -> Result<Vec<Entry>> {
 }
 
 /// Reasons for which the rows should not be compared.
-pub(crate) fn differences(entries: &[Entry]) -> Vec<String> {
+pub fn differences(entries: &[Entry]) -> Vec<String> {
     let mut out = Vec::new();
     let Some(first) = entries.first() else { return out };
     for other in &entries[1..] {
@@ -154,7 +154,7 @@ pub(crate) fn differences(entries: &[Entry]) -> Vec<String> {
 }
 
 /// The place of the best row in each column of [`SCORES`] that at least two rows have.
-pub(crate) fn best(entries: &[Entry]) -> Vec<Option<usize>> {
+pub fn best(entries: &[Entry]) -> Vec<Option<usize>> {
     let of = |(i, (_, _, more)): (usize, &(&str, usize, bool))| {
         let mut all: Vec<(usize, f64)> = (0..entries.len()).filter_map(|e| Some((e, entries[e].score(i)?))).collect();
         if all.len() < 2 {
@@ -167,7 +167,7 @@ pub(crate) fn best(entries: &[Entry]) -> Vec<Option<usize>> {
 }
 
 /// The table as text: a head, and cells by row; columns that no row has are left out.
-pub(crate) fn table(entries: &[Entry]) -> (Vec<String>, Vec<Vec<String>>) {
+pub fn table(entries: &[Entry]) -> (Vec<String>, Vec<Vec<String>>) {
     let number = |n: Option<usize>| n.map(|n| n.to_string()).unwrap_or_default();
     let mut columns: Vec<(String, Vec<String>)> = vec![
         ("run".into(), entries.iter().map(|e| e.name.clone()).collect()),
@@ -187,7 +187,7 @@ pub(crate) fn table(entries: &[Entry]) -> (Vec<String>, Vec<Vec<String>>) {
 }
 
 /// The place of a column's score in [`SCORES`]; `None`: it is no score.
-pub(crate) fn score_of(column: &str) -> Option<usize> {
+pub fn score_of(column: &str) -> Option<usize> {
     SCORES.iter().position(|(name, ..)| *name == column)
 }
 

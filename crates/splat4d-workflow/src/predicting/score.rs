@@ -1,9 +1,9 @@
 //! Forecasts next to the images of what really came.
 
 use super::{Forecast, Work};
-use crate::console::Console;
 use crate::draw::Rgb;
 use crate::draw::{Painter, color_rgb};
+use crate::events::Listener;
 use crate::report::predict::ModelScores;
 use crate::video::{Film, have_ffmpeg};
 use splat4d::format::npy::Npy;
@@ -160,8 +160,8 @@ impl Views {
         work: &Work,
         folder: &Path,
         forecast: &Forecast,
-        console: &Console,
-    ) -> anyhow::Result<Vec<(String, PathBuf)>> {
+        console: &dyn Listener,
+    ) -> Result<Vec<(String, PathBuf)>> {
         const CAMERAS: usize = 2;
         let mut cameras: Vec<usize> = self.views.iter().map(|v| work.capture.frames[v.frame].camera).collect();
         cameras.sort_unstable();

@@ -11,7 +11,7 @@ const MOST_POINTS: usize = 1_000_000;
 
 /// A point of the file.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Asked {
+pub struct Asked {
     query: Query,
     /// Whose sight of it is told.
     camera: Option<String>,
@@ -37,7 +37,7 @@ fn remedy() -> String {
 ///
 /// Errors, with the line's number: columns that are unknown, missing or twice, a number that is none, a camera that is not
 /// there, a pixel outside of its image, a time outside of the clip.
-pub(crate) fn read(text: &str, views: &[View], clip: [f64; 2]) -> Result<Vec<Asked>> {
+pub fn read(text: &str, views: &[View], clip: [f64; 2]) -> Result<Vec<Asked>> {
     let mut lines = text.lines().enumerate().map(|(i, l)| (i + 1, l.trim())).filter(|(_, l)| !l.is_empty());
     let (_, header) = lines.next().ok_or_else(|| Error::input("the file of points is empty").remedy(remedy()))?;
     let mut columns = Vec::new();
@@ -132,7 +132,7 @@ fn at<'a>(views: &'a [View], name: &str, t: f64) -> Result<&'a Camera> {
 }
 
 /// Points that were followed, and what their cameras see of them.
-pub(crate) struct Answer {
+pub struct Answer {
     asked: Vec<Asked>,
     followed: Followed,
     /// [points, times]
@@ -141,7 +141,7 @@ pub(crate) struct Answer {
 
 impl Answer {
     /// Follows points to some moments. `progress` hears how many moments of how many are done.
-    pub(crate) fn of(
+    pub fn of(
         scene: &Scene<f32>,
         asked: Vec<Asked>,
         views: &[View],
@@ -169,18 +169,18 @@ impl Answer {
     }
 
     /// Points of which nothing was there to follow.
-    pub(crate) fn missing(&self) -> usize {
+    pub fn missing(&self) -> usize {
         self.followed.starts.iter().filter(|s| s.is_none()).count()
     }
 
     /// Points that were asked for.
-    pub(crate) fn len(&self) -> usize {
+    pub fn len(&self) -> usize {
         self.asked.len()
     }
 
     /// As CSV: `point,time,x,y,z,camera,u,v,visible`, a line for every moment at which a point is there. `point` counts the
     /// file's lines from 0; without a camera the last four are empty.
-    pub(crate) fn to_csv(&self) -> String {
+    pub fn to_csv(&self) -> String {
         let mut out = csv::Writer::from_writer(Vec::new());
         let header = ["point", "time", "x", "y", "z", "camera", "u", "v", "visible"];
         out.write_record(header).expect("memory takes every row");
@@ -201,7 +201,7 @@ impl Answer {
 
     /// As JSON: `{"version": 1, "times": [s], "points": [{"start": [x, y, z], "camera": name, "path": [[x, y, z] or null],
     /// "pixels": [[u, v] or null], "visible": [bool]}]}`; the last two only of points with a camera.
-    pub(crate) fn to_json(&self) -> String {
+    pub fn to_json(&self) -> String {
         let times = self.followed.times.len();
         let points: Vec<serde_json::Value> = (0..self.asked.len())
             .map(|i| {

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 /// The content of `predict.json`.
 #[derive(Debug, Serialize)]
-pub(crate) struct Told {
+pub struct Told {
     #[serde(serialize_with = "splat4d_train::path_text::lossy")]
     pub run: PathBuf,
     /// The last observed second.
@@ -40,7 +40,7 @@ const BASELINE: &str = "freeze";
 
 /// Scores of a model's forecast; numbers by horizon begin with the first predicted frame.
 #[derive(Clone, Debug, Default, Serialize)]
-pub(crate) struct ModelScores {
+pub struct ModelScores {
     pub name: String,
     /// dB, mean over all views.
     pub psnr: Option<f64>,
@@ -68,7 +68,7 @@ pub(crate) struct ModelScores {
 }
 
 /// Writes the page and returns its path. `films`: camera and file.
-pub(crate) fn write(folder: &Path, run: &str, told: &Told, films: &[(String, PathBuf)]) -> Result<PathBuf> {
+pub fn write(folder: &Path, run: &str, told: &Told, films: &[(String, PathBuf)]) -> Result<PathBuf> {
     let path = folder.join("report.html");
     files::write(&path, page(run, told, films).as_bytes())?;
     Ok(path)

@@ -108,7 +108,7 @@ pub struct Look {
 }
 
 /// The source's own cameras over its clip, or an orbit where it names none.
-pub(crate) fn looks_of(source: &Source, size: [usize; 2]) -> Result<Vec<Look>> {
+pub fn looks_of(source: &Source, size: [usize; 2]) -> Result<Vec<Look>> {
     let views = source.views()?;
     if !views.is_empty() {
         return Ok(looks(&views, source.scene.clip, size));

@@ -2,8 +2,8 @@
 //! is written again as any other file.
 
 use crate::baking::{self, Baking, Outline, bake_like, poster};
-use crate::console::Console;
 use crate::deadline::Deadline;
+use crate::events::Listener;
 use crate::files::{self, cannot_read, human_bytes};
 use crate::playable::FILE;
 use crate::run_folder::Run;
@@ -22,13 +22,13 @@ use std::sync::atomic::AtomicBool;
 const AGAIN: &str = ".scene.again.s4d";
 
 /// Appends all parts that are finished and not in the file yet. Nothing happens to a file that is finished.
-pub(crate) fn append(
+pub fn append(
     run: &Path,
     chunked: &Chunked,
     deadline: &Deadline,
     stop: &AtomicBool,
-    console: &Console,
-) -> anyhow::Result<()> {
+    console: &dyn Listener,
+) -> Result<()> {
     let _turn = chunked.turn(stop)?;
     let path = run.join(FILE);
     if path.is_file() && !grows(&path)? {
@@ -38,13 +38,13 @@ pub(crate) fn append(
 }
 
 /// Appends what is missing and finishes the file. Returns its length, bytes.
-pub(crate) fn complete(
+pub fn complete(
     run: &Path,
     chunked: &Chunked,
     deadline: &Deadline,
     stop: &AtomicBool,
-    console: &Console,
-) -> anyhow::Result<u64> {
+    console: &dyn Listener,
+) -> Result<u64> {
     let _turn = chunked.turn(stop)?;
     let path = run.join(FILE);
     // Of a take that was joined before, chunks may have been trained again.
@@ -63,8 +63,8 @@ fn complete_from(
     run: &Path,
     chunked: &Chunked,
     deadline: &Deadline,
-    console: &Console,
-) -> anyhow::Result<u64> {
+    console: &dyn Listener,
+) -> Result<u64> {
     let meta = append_to(growing, run, chunked, true, deadline, console)?;
     let first = opened(run, chunked.some(0..1)?)?;
     let poster = poster(&first.scene, &first.stage(&first.views()?), antialias(&first));
@@ -93,8 +93,8 @@ fn append_to(
     chunked: &Chunked,
     thorough: bool,
     deadline: &Deadline,
-    console: &Console,
-) -> anyhow::Result<Meta> {
+    console: &dyn Listener,
+) -> Result<Meta> {
     let done: Vec<Part> = chunked.parts().into_iter().filter(|p| chunked.is_done(*p)).collect();
     let place = |e: std::io::Error| Error::io("the playback file cannot be opened", e).at(path.display());
     let known = File::options().read(true).write(true).open(path).ok().and_then(|file| Growing::open(file).ok());
@@ -161,9 +161,7 @@ fn append_to(
         meta = Some(next);
     }
     console.clear();
-    meta.ok_or_else(|| {
-        Error::input("no chunk is finished").at(run.display()).remedy("Train --chunk shared first").into()
-    })
+    meta.ok_or_else(|| Error::input("no chunk is finished").at(run.display()).remedy("Train --chunk shared first"))
 }
 
 /// A scene of the run.

@@ -2,9 +2,9 @@
 //! left of `--minutes`.
 
 use crate::baking::{Baking, bake_into};
-use crate::console::Console;
 use crate::deadline::Deadline;
 use crate::draw::{Channel, Painter};
+use crate::events::Listener;
 use crate::files::{self, human_seconds};
 use crate::paths::{Clock, Route, Stage, orbit_seconds, shots};
 use crate::playable;
@@ -21,10 +21,10 @@ use splat4d_train::capture::{Capture, CaptureKind, CaptureOptions, ImageStore, T
 use splat4d_train::eval::Align;
 use splat4d_train::eval::flow::flow_error;
 use splat4d_train::eval::points::point_errors;
-use splat4d_train::eval::run::{EvalOptions, Measured, Scores, assess, evaluate};
+use splat4d_train::eval::run::{self as eval, EvalOptions, Measured, Scores};
 use splat4d_train::eval::tracks::track_error;
 use splat4d_train::eval::trajectory::trajectory_error;
-use splat4d_train::event::Event;
+use splat4d_train::output::OutputFolder;
 use splat4d_train::path_text::in_command;
 use splat4d_train::recipe::{MotionName, Recipe};
 use splat4d_train::run::chunks::Chunked;
@@ -60,7 +60,7 @@ const STRAIGHT: [&str; 3] = ["still", "spacetime", "native4d"];
 const LABEL_STEPS: f64 = 1.0;
 
 /// The time of what follows training, in training steps at full size: `--minutes` leaves room for it.
-pub(crate) fn steps(capture: &Capture, recipe: &Recipe, only_playback: bool) -> f64 {
+pub fn steps(capture: &Capture, recipe: &Recipe, only_playback: bool) -> f64 {
     let frames = || capture.train.iter().map(|&i| &capture.frames[i]);
     let masks = frames().filter(|f| f.labels.is_some()).count().min(labels::MOST_PICTURES);
     let featured = frames().filter(|f| f.features.is_some()).count().min(features::MOST_PICTURES);
@@ -80,19 +80,17 @@ pub(crate) fn steps(capture: &Capture, recipe: &Recipe, only_playback: bool) -> 
 }
 
 /// Options of measuring.
-#[derive(Debug, Default, clap::Args)]
+#[derive(Clone, Debug, Default)]
 pub struct Measure {
-    /// Weights (safetensors) for LPIPS; without them it is not computed
-    #[arg(long, value_name = "FILE", help_heading = "Evaluation")]
+    /// Weights (safetensors) for LPIPS; without them it is not computed.
     pub lpips_weights: Option<PathBuf>,
     /// Device that renders the views.
-    #[arg(skip)]
     pub device: Device,
 }
 
 impl Measure {
     /// Finds missing files before hours of training.
-    pub(crate) fn check(&self) -> Result<()> {
+    pub fn check(&self) -> Result<()> {
         match &self.lpips_weights {
             Some(path) if !path.is_file() => Err(Error::input("there is no such file")
                 .at(path.display())
@@ -103,7 +101,7 @@ impl Measure {
 }
 
 /// Scores, playback file, film and report, as far as the time allows: the file always, within what is left.
-pub(crate) fn all(run: &Path, measure: &Measure, deadline: &Deadline, console: &Console) -> anyhow::Result<()> {
+pub fn all(run: &Path, measure: &Measure, deadline: &Deadline, console: &dyn Listener) -> Result<()> {
     let opened = Run::open(run)?;
     let scene = read_scene(&opened.scene_file()?)?;
     let time = Times::estimate(&opened, &scene, deadline)?;
@@ -121,7 +119,7 @@ pub(crate) fn all(run: &Path, measure: &Measure, deadline: &Deadline, console: &
                 amend(run, [("orbit_seconds".into(), json!(deadline.now() - started))])?;
             }
             // The scene and its scores stand without the film.
-            Err(error) => console.warn(&format!("the orbit film was not written: {error:#}")),
+            Err(error) => console.warn(&format!("the orbit film was not written: {error}")),
         }
     }
     write_report(run, console)
@@ -129,7 +127,7 @@ pub(crate) fn all(run: &Path, measure: &Measure, deadline: &Deadline, console: &
 
 /// What is left of the minutes of a run that was resumed: the time of earlier commands until the end of training counts once,
 /// and time between commands does not count.
-pub(crate) fn rest_of(run: &Run, clock: Stopwatch) -> Deadline {
+pub fn rest_of(run: &Run, clock: Stopwatch) -> Deadline {
     let budget = &run.info["budget"];
     let left = || Some(60.0 * budget["minutes"].as_f64()? - budget["before"].as_f64()? - run.number("seconds")?);
     match left() {
@@ -171,7 +169,13 @@ impl Times {
     }
 
     /// Whether what takes `seconds` fits, and what is kept for later with it; says so in one line where it does not.
-    fn leaves(missing: &str, [seconds, kept]: [f64; 2], run: &Path, deadline: &Deadline, console: &Console) -> bool {
+    fn leaves(
+        missing: &str,
+        [seconds, kept]: [f64; 2],
+        run: &Path,
+        deadline: &Deadline,
+        console: &dyn Listener,
+    ) -> bool {
         let left = deadline.left();
         if !deadline.is_set() || seconds + kept <= left {
             return true;
@@ -187,22 +191,22 @@ impl Times {
 }
 
 /// Bakes the run into `scene.s4d`, whatever it takes. What goes wrong is said and never costs the run.
-pub fn playback(run: &Path, console: &Console) -> Result<()> {
+pub fn playback(run: &Path, console: &dyn Listener) -> Result<()> {
     playback_by(run, &Deadline::default(), console)
 }
 
 /// The same, within a time.
-pub(crate) fn playback_by(run: &Path, deadline: &Deadline, console: &Console) -> Result<()> {
+pub fn playback_by(run: &Path, deadline: &Deadline, console: &dyn Listener) -> Result<()> {
     // The file of a compression is what was learnt: baking again would lose its codes, palette and masks.
     // That of a long take was made chunk by chunk.
     if run.join(ORDER).is_file() || Chunked::is(run) {
         return Ok(());
     }
-    let baked = Source::open(run).map_err(anyhow::Error::from).and_then(|source| {
+    let baked = Source::open(run).and_then(|source| {
         not_empty(&source.scene, run)?;
         let title = Run::open(run)?.name();
         let baking = Baking { deadline: deadline.clone(), ..Baking::default() };
-        Ok(bake_into(&source, &title, &run.join(playable::FILE), &baking, console)?)
+        bake_into(&source, &title, &run.join(playable::FILE), &baking, console)
     });
     console.clear();
     match baked {
@@ -215,14 +219,37 @@ pub(crate) fn playback_by(run: &Path, deadline: &Deadline, console: &Console) ->
             ],
         ),
         Err(error) => {
-            console.warn(&format!("the playback file was not written: {error:#}"));
+            console.warn(&format!("the playback file was not written: {error}"));
             Ok(())
         }
     }
 }
 
-/// Renders and scores the held-out views.
-pub fn scores(run: &Path, scene: &Scene<f32>, measure: &Measure, console: &Console) -> anyhow::Result<Scores> {
+/// Measures a run on its held-out views again: renders and scores them, and writes `results.json`, `per_view.json`, the images and
+/// the report.
+///
+/// Errors: no scene yet; the capture has moved; another command writes the run.
+///
+/// ```no_run
+/// use splat4d_workflow::evaluating::{Measure, evaluate};
+///
+/// # fn main() -> splat4d::Result<()> {
+/// let scores = evaluate("runs/knight".as_ref(), &Measure::default(), &splat4d_workflow::events::ignore)?;
+/// println!("{:?} dB", scores.held("PSNR"));
+/// # Ok(())
+/// # }
+/// ```
+pub fn evaluate(run: &Path, measure: &Measure, console: &dyn Listener) -> Result<Scores> {
+    measure.check()?;
+    let scene = read_scene(&Run::open(run)?.scene_file()?)?;
+    let _folder = OutputFolder::amend(run, "eval")?;
+    let scores = scores(run, &scene, measure, console)?;
+    write_report(run, console)?;
+    Ok(scores)
+}
+
+/// Renders and scores the held-out views. The caller holds the run.
+pub fn scores(run: &Path, scene: &Scene<f32>, measure: &Measure, console: &dyn Listener) -> Result<Scores> {
     let opened = Run::open(run)?;
     let (mut capture, recipe) = opened.open_capture()?;
     capture.coarse().into_iter().for_each(|w| console.warn(w));
@@ -247,13 +274,13 @@ pub fn scores(run: &Path, scene: &Scene<f32>, measure: &Measure, console: &Conso
 /// by. `backgrounds` with their names; none: the run's own.
 ///
 /// Errors: the capture has no such views; images without alpha, which are composited on nothing; those of measuring.
-pub(crate) fn scores_on(
+pub fn scores_on(
     run: &Path,
     measured: Measured,
     backgrounds: &[(&str, [f32; 3])],
     measure: &Measure,
-    console: &Console,
-) -> anyhow::Result<()> {
+    console: &dyn Listener,
+) -> Result<()> {
     let opened = Run::open(run)?;
     let mut scene = read_scene(&opened.scene_file()?)?;
     let (mut capture, recipe) = opened.open_capture()?;
@@ -263,14 +290,12 @@ pub(crate) fn scores_on(
     if measured.frames(&capture).is_empty() {
         return Err(Error::input(format!("the run's capture has no views of the split `{split}`"))
             .at(run.display())
-            .remedy("A data set has `val` if it contains a list of these views, such as transforms_val.json.")
-            .into());
+            .remedy("A data set has `val` if it contains a list of these views, such as transforms_val.json."));
     }
     if !backgrounds.is_empty() && capture.background.is_none() {
         return Err(Error::input("the run's images have no transparent pixels, so there is no background to choose")
             .at(run.display())
-            .remedy("Leave --background out.")
-            .into());
+            .remedy("Leave --background out."));
     }
     let own = capture.background;
     let all = on_backgrounds(own, backgrounds);
@@ -290,14 +315,17 @@ pub(crate) fn scores_on(
 }
 
 /// Backgrounds with their names; where none are asked for, the capture's own.
-fn on_backgrounds<'a>(own: Option<[f32; 3]>, asked: &[(&'a str, [f32; 3])]) -> Vec<(&'a str, Option<[f32; 3]>)> {
+pub(crate) fn on_backgrounds<'a>(
+    own: Option<[f32; 3]>,
+    asked: &[(&'a str, [f32; 3])],
+) -> Vec<(&'a str, Option<[f32; 3]>)> {
     match asked {
         [] => vec![("", own)],
         chosen => chosen.iter().map(|(name, color)| (*name, Some(*color))).collect(),
     }
 }
 
-fn say_split(scores: &Scores, measured: Measured, background: &str, console: &Console) {
+pub(crate) fn say_split(scores: &Scores, measured: Measured, background: &str, console: &dyn Listener) {
     let on = if background.is_empty() { String::new() } else { format!(" on {background}") };
     let views = match measured {
         Measured::Test => "held-out views",
@@ -311,66 +339,10 @@ fn say_split(scores: &Scores, measured: Measured, background: &str, console: &Co
     }));
 }
 
-/// Scores a scene that is no run's on views of a capture, and writes scores and images into `out`, if there is such a folder.
-///
-/// Errors: the capture has no such views; images without alpha, which are composited on nothing; those of measuring.
-#[allow(clippy::too_many_arguments)]
-pub(crate) fn foreign_scores(
-    mut scene: Scene<f32>,
-    capture: &Capture,
-    recipe: &Recipe,
-    out: Option<&Path>,
-    measured: Measured,
-    backgrounds: &[(&str, [f32; 3])],
-    measure: &Measure,
-    console: &Console,
-) -> anyhow::Result<()> {
-    let mut capture = capture.clone();
-    capture.coarse().into_iter().for_each(|w| console.warn(w));
-    if capture.offset != scene.offset {
-        capture.relocate(scene.offset);
-    }
-    if measured.frames(&capture).is_empty() {
-        return Err(Error::input(format!("the capture has no views of the split `{}`", measured.name()))
-            .remedy("Choose them with --hold-out, for instance --hold-out every=8, or measure --split train.")
-            .into());
-    }
-    if !backgrounds.is_empty() && capture.background.is_none() {
-        return Err(Error::input("the capture's images have no transparent pixels, and so no background to choose")
-            .remedy("Leave --background out.")
-            .into());
-    }
-    for (name, background) in on_backgrounds(capture.background, backgrounds) {
-        scene.background = background.unwrap_or(scene.background);
-        let capture = Arc::new(Capture { background, ..capture.clone() });
-        let memory = usize::try_from(recipe.run.image_memory).unwrap_or(usize::MAX);
-        let store = Arc::new(ImageStore::new(capture.clone(), memory));
-        let options = EvalOptions {
-            folder: out.map(Path::to_owned).unwrap_or_default(),
-            antialias: recipe.appearance.antialias,
-            lpips_weights: measure.lpips_weights.clone(),
-            pictures: out.is_some(),
-            train_views: 0,
-            measured,
-            place: (!name.is_empty()).then(|| format!("{}-{name}", measured.name())),
-            device: measure.device,
-            ..EvalOptions::default()
-        };
-        let mut listen = |event: &Event| console.event(event);
-        let scores = match out {
-            Some(_) => evaluate(&scene, &capture, &store, 0, &options, &mut listen)?,
-            None => assess(&scene, &capture, &store, 0, &options, &mut listen)?,
-        };
-        console.clear();
-        say_split(&scores, measured, name, console);
-    }
-    Ok(())
-}
-
 /// Says and writes how far the cameras of a run are from those of a capture that knows.
 ///
 /// Errors: captures that cannot be read, or have no cameras in common.
-pub(crate) fn trajectory(run: &Path, truth: &Path, console: &Console) -> anyhow::Result<()> {
+pub fn trajectory(run: &Path, truth: &Path, console: &dyn Listener) -> Result<()> {
     let (mut capture, recipe) = Run::open(run)?.open_capture()?;
     corrected::apply(&mut capture, run)?;
     let fps = (recipe.capture.fps > 0.0).then_some(recipe.capture.fps);
@@ -412,8 +384,8 @@ impl Measuring<'_> {
         capture: &Arc<Capture>,
         measured: Measured,
         place: Option<String>,
-        console: &Console,
-    ) -> anyhow::Result<Scores> {
+        console: &dyn Listener,
+    ) -> Result<Scores> {
         not_empty(scene, &self.opened.path)?;
         let memory = usize::try_from(self.recipe.run.image_memory).unwrap_or(usize::MAX);
         let store = Arc::new(ImageStore::new(capture.clone(), memory));
@@ -428,7 +400,7 @@ impl Measuring<'_> {
             ..EvalOptions::default()
         };
         let iteration = self.opened.iteration().unwrap_or(0);
-        let scores = evaluate(scene, capture, &store, iteration, &options, &mut |event| console.event(event))?;
+        let scores = eval::evaluate(scene, capture, &store, iteration, &options, &mut |event| console.event(event))?;
         console.clear();
         Ok(scores)
     }
@@ -449,7 +421,7 @@ fn lives(scene: &Scene<f32>) -> [usize; LIFE_BINS] {
 }
 
 /// Measures tracks in space where the capture comes with true ones.
-fn tracks(run: &Path, scene: &Scene<f32>, capture: &Capture, console: &Console) -> Result<()> {
+fn tracks(run: &Path, scene: &Scene<f32>, capture: &Capture, console: &dyn Listener) -> Result<()> {
     let Some(e) = track_error(scene, capture)? else { return Ok(()) };
     console.say(&format!(
         "tracks of {} points in space: median error {:.4} units, {:.2} % of a character's height ({:.1} % of the \
@@ -509,7 +481,7 @@ fn tracks(run: &Path, scene: &Scene<f32>, capture: &Capture, console: &Console) 
 }
 
 /// Measures drawn flow where the capture brings some along.
-fn flow(run: &Path, scene: &Scene<f32>, capture: &Capture, recipe: &Recipe, console: &Console) -> Result<()> {
+fn flow(run: &Path, scene: &Scene<f32>, capture: &Capture, recipe: &Recipe, console: &dyn Listener) -> Result<()> {
     if capture.kind != CaptureKind::Own {
         return Ok(());
     }
@@ -539,14 +511,14 @@ fn flow(run: &Path, scene: &Scene<f32>, capture: &Capture, recipe: &Recipe, cons
 }
 
 /// The report, and the scores on the console.
-pub(crate) fn write_report(run: &Path, console: &Console) -> anyhow::Result<()> {
+pub fn write_report(run: &Path, console: &dyn Listener) -> Result<()> {
     write_page(run, console)?;
     say_scores(&Run::open(run)?, console);
     Ok(())
 }
 
 /// The report alone.
-pub(crate) fn write_page(run: &Path, console: &Console) -> anyhow::Result<()> {
+pub fn write_page(run: &Path, console: &dyn Listener) -> Result<()> {
     console.written(&report::write(&Run::open(run)?)?);
     Ok(())
 }
@@ -575,7 +547,7 @@ fn in_words(score: impl Fn(&str) -> Option<f64>) -> String {
 }
 
 /// Says how far training moved the cameras, the one that went furthest by name.
-pub(crate) fn say_refined(run: &Path, console: &Console) -> Result<()> {
+pub fn say_refined(run: &Path, console: &dyn Listener) -> Result<()> {
     if let Some(words) = corrected::read(run)?.and_then(|refined| refined_in_words(&refined)) {
         console.say(&words);
     }
@@ -583,7 +555,7 @@ pub(crate) fn say_refined(run: &Path, console: &Console) -> Result<()> {
 }
 
 /// The scores in one line.
-fn say_scores(run: &Run, console: &Console) {
+fn say_scores(run: &Run, console: &dyn Listener) {
     let words = in_words(|key| run.score(key));
     if !words.is_empty() {
         console.say(&format!("held-out views: {words}"));
@@ -599,7 +571,7 @@ fn say_scores(run: &Run, console: &Console) {
 }
 
 /// Films an orbit through space and time: mp4 where ffmpeg is found, an animated PNG otherwise.
-fn orbit(run: &Path, scene: &Scene<f32>, console: &Console) -> anyhow::Result<PathBuf> {
+fn orbit(run: &Path, scene: &Scene<f32>, console: &dyn Listener) -> Result<PathBuf> {
     let opened = Run::open(run)?;
     let views = opened.views()?;
     let stage = Stage::of_views(&views, scene.up);
@@ -632,7 +604,7 @@ fn small([width, height]: [usize; 2]) -> [usize; 2] {
 }
 
 /// Adds entries to `run.json`.
-pub(crate) fn amend<const N: usize>(run: &Path, entries: [(String, Value); N]) -> Result<()> {
+pub fn amend<const N: usize>(run: &Path, entries: [(String, Value); N]) -> Result<()> {
     let path = run.join("run.json");
     let mut info = if path.is_file() {
         crate::camera_file::json(&files::read_text(&path)?).map_err(|e| e.at(path.display()))?

@@ -7,8 +7,8 @@ use splat4d::{Error, Result, format};
 use std::io::Cursor;
 
 /// A format of arrays of numbers.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-pub(crate) enum RawFormat {
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum RawFormat {
     /// NumPy float32, [h,w,C], or [h,w] for one value
     Npy,
     /// Middlebury .flo, for flow only; unknown pixels are 1e10
@@ -23,8 +23,20 @@ const FLO_MAGIC: f32 = 202_021.25;
 const FLO_UNKNOWN: f32 = 1e10;
 
 impl RawFormat {
-    /// The files' ending.
-    pub(crate) fn ending(self) -> &'static str {
+    /// All of them.
+    pub const ALL: [Self; 3] = [Self::Npy, Self::Flo, Self::Exr];
+
+    /// What it stores.
+    pub fn about(self) -> &'static str {
+        match self {
+            Self::Npy => "NumPy float32, [h,w,C], or [h,w] for one value",
+            Self::Flo => "Middlebury .flo, for flow only; unknown pixels are 1e10",
+            Self::Exr => "OpenEXR, 32-bit floats: R G B, A, Z, U V, X Y Z, F00 F01 ..., or the channel's name",
+        }
+    }
+
+    /// The files' ending, which is its name.
+    pub fn ending(self) -> &'static str {
         match self {
             Self::Npy => "npy",
             Self::Flo => "flo",
@@ -33,7 +45,7 @@ impl RawFormat {
     }
 
     /// Errors: .flo of anything but flow.
-    pub(crate) fn suits(self, channel: Channel) -> Result<()> {
+    pub fn suits(self, channel: Channel) -> Result<()> {
         if self == Self::Flo && channel != Channel::Flow {
             return Err(Error::input(format!(".flo stores flow, not {}", channel.name()))
                 .remedy("Add --channel flow, or use --raw-format npy or exr."));
@@ -42,7 +54,7 @@ impl RawFormat {
     }
 
     /// The bytes of a file. Errors: as [`suits`](Self::suits).
-    pub(crate) fn bytes(self, channel: Channel, raw: &Planes<f32>) -> Result<Vec<u8>> {
+    pub fn bytes(self, channel: Channel, raw: &Planes<f32>) -> Result<Vec<u8>> {
         self.suits(channel)?;
         let mut out = Vec::new();
         match self {

@@ -38,7 +38,7 @@ fn mark(i: usize) -> String {
 }
 
 /// Text that is safe inside HTML and attributes.
-pub(crate) fn escape(text: &str) -> String {
+pub fn escape(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in splat4d::text::shown(text).chars() {
         match c {
@@ -54,7 +54,7 @@ pub(crate) fn escape(text: &str) -> String {
 }
 
 /// Curves over a common x axis; `None` where there is nothing to draw.
-pub(crate) fn lines(series: &[Series], x_label: &str, unit: &str) -> Option<String> {
+pub fn lines(series: &[Series], x_label: &str, unit: &str) -> Option<String> {
     let series: Vec<(usize, &str, Points)> = series
         .iter()
         .enumerate()
@@ -169,7 +169,7 @@ pub fn file(series: &[Series], x_label: &str, unit: &str) -> Option<String> {
 }
 
 /// One horizontal bar a row: label, value, and the text next to it. Bars start at `from`.
-pub(crate) fn bars(rows: &[(String, f64, String)], from: f64, label: &str) -> Option<String> {
+pub fn bars(rows: &[(String, f64, String)], from: f64, label: &str) -> Option<String> {
     const ROW: f64 = 24.0;
     const LABEL: f64 = 128.0;
     const VALUE: f64 = 84.0;
@@ -238,7 +238,7 @@ fn ticks(lo: f64, hi: f64, count: usize) -> Vec<f64> {
 }
 
 /// A number as people write it on an axis.
-pub(crate) fn short(v: f64) -> String {
+pub fn short(v: f64) -> String {
     let a = v.abs();
     let text = match a {
         _ if a >= 1e6 => format!("{:.1}M", v / 1e6),

@@ -2,9 +2,10 @@
 
 use super::chart::escape;
 use super::{STYLE, pictures};
-use crate::console::Console;
+use crate::events::Listener;
 use crate::files;
 use image::RgbImage;
+use splat4d::Result;
 use splat4d_import::doctor::{Finding, Grade, Options, Report, examine};
 use splat4d_train::capture::Capture;
 use splat4d_train::event::{Event, Progress};
@@ -12,19 +13,19 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
 /// Looks at a capture and writes `doctor.html`, whose path is given back, and `doctor.json` into `folder`.
-pub(crate) fn made(capture: &Capture, folder: &Path, console: &Console) -> anyhow::Result<(Report, PathBuf)> {
+pub fn made(capture: &Capture, folder: &Path, console: &dyn Listener) -> Result<(Report, PathBuf)> {
     let mut listen = |event: &Event| console.event(event);
     let report = examine(capture, &Options::default(), &mut Progress(&mut listen))?;
     console.clear();
     files::make_folder(folder)?;
     let html = folder.join("doctor.html");
     files::write(&html, page(&report).as_bytes())?;
-    files::write(&folder.join("doctor.json"), &serde_json::to_vec_pretty(&report)?)?;
+    files::write(&folder.join("doctor.json"), &serde_json::to_vec_pretty(&report).expect("a report is plain data"))?;
     Ok((report, html))
 }
 
 /// A finding in sentences.
-pub(crate) fn sentence(f: &Finding) -> String {
+pub fn sentence(f: &Finding) -> String {
     format!("{}: {} {} {}", word(f.grade), f.what, f.looks, f.remedy)
 }
 
@@ -122,7 +123,7 @@ fn pairs(report: &Report) -> String {
 }
 
 /// How bad it is, in a word.
-pub(crate) fn word(grade: Grade) -> &'static str {
+pub fn word(grade: Grade) -> &'static str {
     match grade {
         Grade::Bad => "bad",
         Grade::Warning => "warning",
@@ -131,7 +132,7 @@ pub(crate) fn word(grade: Grade) -> &'static str {
 }
 
 /// What else is worth knowing of the take, in sentences.
-pub(crate) fn about(report: &Report) -> Vec<String> {
+pub fn about(report: &Report) -> Vec<String> {
     let mut out = Vec::new();
     if let Some(share) = report.seen_by_three {
         out.push(format!("Three cameras see {:.0} % of the space in which something moves.", 100.0 * share));
@@ -147,7 +148,7 @@ pub(crate) fn about(report: &Report) -> Vec<String> {
 }
 
 /// All of it in a sentence.
-pub(crate) fn summary(report: &Report) -> String {
+pub fn summary(report: &Report) -> String {
     let count = |g: Grade| report.findings.iter().filter(|f| f.grade == g).count();
     let cameras = report.cameras.len();
     format!(

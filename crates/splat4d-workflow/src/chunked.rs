@@ -1,9 +1,9 @@
 //! Long takes in chunks: the work behind `train --chunk` and `join`.
 
-use crate::console::Console;
 use crate::deadline::Deadline;
+use crate::events::Listener;
 use crate::files::{grouped, human_bytes, human_seconds};
-use crate::{film, finish};
+use crate::{evaluating, growing};
 use serde_json::json;
 use splat4d::Result;
 use splat4d_train::event::Event;
@@ -21,7 +21,7 @@ const SEAMS: f64 = 0.25;
 
 /// The value of `--chunk`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Wanted {
+pub enum Wanted {
     /// Whatever there is to do, until nothing is.
     All,
     /// One part.
@@ -41,7 +41,7 @@ impl FromStr for Wanted {
 }
 
 /// The plan in a line.
-pub(crate) fn in_words(outlook: &Outlook) -> String {
+pub fn in_words(outlook: &Outlook) -> String {
     let Outlook { recipe, plan, seconds, memory, .. } = outlook;
     let longest = (0..plan.len()).map(|c| plan.frames(c).len()).max().unwrap_or(0);
     let mut words = format!(
@@ -61,20 +61,20 @@ pub(crate) fn in_words(outlook: &Outlook) -> String {
 
 /// Does what is wanted of a take, and appends what is finished to its playback file, within the options' minutes. `None`: nothing
 /// was to do.
-pub(crate) fn work(
+pub fn work(
     run: &Path,
     chunked: &Chunked,
     wanted: Wanted,
     options: &TrainOptions,
     stop: &AtomicBool,
-    console: &Console,
+    console: &dyn Listener,
     listen: &mut dyn FnMut(&Event),
 ) -> Result<Option<Outcome>> {
     let deadline = Deadline::of(options.clock.clone(), options.minutes);
     // What goes wrong with it never costs a chunk, and is made good at the join.
     let append = || {
-        if let Err(e) = film::append(run, chunked, &baking(chunked, &deadline), stop, console) {
-            console.warn(&format!("the playback file does not grow: {e:#}"));
+        if let Err(e) = growing::append(run, chunked, &baking(chunked, &deadline), stop, console) {
+            console.warn(&format!("the playback file does not grow: {e}"));
         }
     };
     let outcome = match wanted {
@@ -100,15 +100,15 @@ fn baking(chunked: &Chunked, deadline: &Deadline) -> Deadline {
 }
 
 /// Puts the chunks of a run together, measures how they meet, and does what follows training.
-pub(crate) fn join(
+pub fn join(
     run: &Path,
     chunked: &Chunked,
     no_eval: bool,
-    measure: &finish::Measure,
+    measure: &evaluating::Measure,
     deadline: &Deadline,
     stop: &AtomicBool,
-    console: &Console,
-) -> anyhow::Result<()> {
+    console: &dyn Listener,
+) -> Result<()> {
     let joined = chunked.join()?;
     let Joined { chunks, gaussians, seconds, peak_memory, .. } = joined;
     console.say(&format!(
@@ -126,12 +126,12 @@ pub(crate) fn join(
             seams.across, seams.inside, seams.cuts
         ));
     }
-    finish::amend(run, [("seams".into(), json!(seams)), ("chunk_peak_memory".into(), json!(peak_memory))])?;
+    evaluating::amend(run, [("seams".into(), json!(seams)), ("chunk_peak_memory".into(), json!(peak_memory))])?;
     console.say(&format!("wrote {}", path.display()));
     let started = Instant::now();
-    let bytes = film::complete(run, chunked, &baking(chunked, deadline), stop, console)?;
+    let bytes = growing::complete(run, chunked, &baking(chunked, deadline), stop, console)?;
     console.say(&format!("the playback file has {}", human_bytes(bytes)));
-    finish::amend(
+    evaluating::amend(
         run,
         [
             ("playback_bytes".into(), json!(bytes)),
@@ -139,11 +139,11 @@ pub(crate) fn join(
             ("join_peak_memory".into(), json!(run::peak_memory())),
         ],
     )?;
-    if no_eval { Ok(()) } else { finish::all(run, measure, deadline, console) }
+    if no_eval { Ok(()) } else { evaluating::all(run, measure, deadline, console) }
 }
 
 /// How chunks meet, at as many cuts as the time allows: the next one takes about as long as the last one.
-fn seams(chunked: &Chunked, deadline: &Deadline, console: &Console) -> Result<Option<Seams>> {
+fn seams(chunked: &Chunked, deadline: &Deadline, console: &dyn Listener) -> Result<Option<Seams>> {
     let (mut began, mut ended) = (deadline.now(), None);
     let found = chunked.seams(
         &mut |done| {

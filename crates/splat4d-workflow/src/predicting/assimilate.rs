@@ -2,8 +2,8 @@
 
 use super::score::{Case, Views, scores};
 use super::{Forecast, Work};
-use crate::console::Console;
 use crate::draw::antialias;
+use crate::events::Listener;
 use crate::report::predict::ModelScores;
 use splat4d::render::RenderConfig;
 use splat4d::scene::{Camera, Time};
@@ -24,7 +24,7 @@ pub(super) fn run(
     of: &Forecast,
     views: &Views,
     baselines: [&Vec<Case>; 2],
-    console: &Console,
+    console: &dyn Listener,
 ) -> Result<ModelScores> {
     if of.fitted.is_empty() {
         return Err(Error::input(format!("{} has no nodes that could be corrected", of.model.name()))

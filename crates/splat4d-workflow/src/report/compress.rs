@@ -20,7 +20,7 @@ const VIEWS: usize = 4;
 /// The content of `compress.json`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
-pub(crate) struct Compressed {
+pub struct Compressed {
     /// The run that was compressed.
     #[serde(with = "splat4d_train::path_text")]
     pub source: PathBuf,
@@ -46,7 +46,7 @@ pub(crate) struct Compressed {
 /// One stage of the work.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
-pub(crate) struct Step {
+pub struct Step {
     pub name: String,
     pub seconds: f64,
     pub steps: usize,
@@ -57,7 +57,7 @@ pub(crate) struct Step {
 /// The quality that may be lost, and what was.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
-pub(crate) struct Guard {
+pub struct Guard {
     pub loss_db: f64,
     pub limit_db: f64,
     pub passed: bool,
@@ -66,7 +66,7 @@ pub(crate) struct Guard {
 /// One try of a search.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
-pub(crate) struct Tried {
+pub struct Tried {
     /// Share of the Gaussians removed.
     pub prune: f64,
     pub bytes: u64,
@@ -75,12 +75,12 @@ pub(crate) struct Tried {
 
 impl Compressed {
     /// Baseline that the quality and the speed of `after` are compared with.
-    pub(crate) fn fair(&self) -> &Side {
+    pub fn fair(&self) -> &Side {
         self.unpruned.as_ref().unwrap_or(&self.before)
     }
 
     /// How many times smaller than 32-bit floats; `None` where there is nothing.
-    pub(crate) fn smaller(&self) -> Option<f64> {
+    pub fn smaller(&self) -> Option<f64> {
         (self.after.bytes > 0).then(|| self.before.float_bytes as f64 / self.after.bytes as f64)
     }
 }

@@ -8,7 +8,7 @@ mod write;
 
 use score::{Views, scores};
 
-use crate::console::Console;
+use crate::events::Listener;
 use crate::files::human_seconds;
 use crate::report::predict::Told;
 use crate::run_folder::Run;
@@ -24,6 +24,7 @@ use splat4d_dynamics::nodes::{Observed, follow, observe};
 use splat4d_dynamics::paths::{Moment, Neighbours, Paths};
 use splat4d_dynamics::score::{calibration, diverged, ensemble, node_errors};
 use splat4d_train::capture::{Capture, ImageStore};
+use splat4d_train::output::OutputFolder;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
@@ -33,27 +34,86 @@ use std::time::Instant;
 const STARTS: [f64; 3] = [0.6, 0.7, 0.8];
 const AHEAD: f64 = 0.2;
 /// Where the work goes, in the run.
-pub(crate) const FOLDER: &str = "predict";
+const FOLDER: &str = "predict";
 
-/// What was asked for.
+/// Nodes on dynamic regions unless others are asked for.
+pub const NODES: usize = 48;
+/// Steps of training unless others are asked for.
+pub const STEPS: usize = 1500;
+
+/// Options of [`predict`].
 #[derive(Debug)]
-pub(crate) struct Order {
+pub struct PredictOptions {
+    /// The run, trained with `capture.observe`; its capture must still be at its place.
     pub run: PathBuf,
+    /// Frames to predict. `None`: as many as have images.
     pub horizon: Option<usize>,
+    /// Models to try. The scene is that of the best at forecasting what was observed.
     pub models: Vec<Model>,
+    /// Known actions, one row per frame from the first of the clip.
     pub actions: Option<Actions>,
+    /// Members of the ensembles of the trained models.
     pub seeds: u64,
+    /// Largest number of nodes on dynamic regions.
     pub nodes: usize,
+    /// Training of the models that are trained.
     pub training: Training,
+    /// Give the trained models the down direction.
     pub gravity: bool,
+    /// Correct the prediction by each new frame.
     pub assimilate: bool,
+    /// A run of the same capture that saw all of it: the upper bound.
     pub oracle: Option<PathBuf>,
+    /// Write films of truth and prediction.
     pub film: bool,
 }
 
+impl PredictOptions {
+    /// All models, as far as there are images, with films.
+    pub fn new(run: impl Into<PathBuf>) -> Self {
+        Self {
+            run: run.into(),
+            horizon: None,
+            models: Model::ALL.to_vec(),
+            actions: None,
+            seeds: 1,
+            nodes: NODES,
+            training: Training { steps: STEPS, seed: 0 },
+            gravity: false,
+            assimilate: false,
+            oracle: None,
+            film: true,
+        }
+    }
+}
+
+/// Forecasts a scene and compares with the part of its capture that was kept from training. Returns the folder of the report,
+/// the forecasts and the predicted scene.
+///
+/// Errors: a run that is unfinished or was trained on its whole clip; too few observed frames; actions that are too short; nothing
+/// moves; another command writes the run.
+///
+/// ```no_run
+/// use splat4d_workflow::events::ignore;
+/// use splat4d_workflow::predicting::{PredictOptions, predict};
+///
+/// # fn main() -> splat4d::Result<()> {
+/// let folder = predict(PredictOptions { horizon: Some(90), ..PredictOptions::new("runs/seen") }, &ignore)?;
+/// println!("{}", folder.join("report.html").display());
+/// # Ok(())
+/// # }
+/// ```
+pub fn predict(options: PredictOptions, listener: &dyn Listener) -> Result<PathBuf> {
+    Run::open(&options.run)?;
+    let _folder = OutputFolder::amend(&options.run, "predict")?;
+    let folder = options.run.join(FOLDER);
+    Work::open(options, listener)?.run(listener)?;
+    Ok(folder)
+}
+
 /// Everything that is known before the first forecast.
-pub(crate) struct Work {
-    order: Order,
+struct Work {
+    order: PredictOptions,
     run: Run,
     antialias: bool,
     capture: Arc<Capture>,
@@ -66,7 +126,7 @@ pub(crate) struct Work {
 }
 
 /// A model's forecast.
-pub(crate) struct Forecast {
+struct Forecast {
     pub model: Model,
     pub fitted: Vec<Fitted>,
     pub moments: Vec<Moment>,
@@ -81,7 +141,7 @@ impl Work {
     ///
     /// Errors: a run that is unfinished or saw all of its take, too few observed frames, actions that are too short, nothing
     /// that moves.
-    pub(crate) fn open(order: Order, console: &Console) -> Result<Self> {
+    fn open(order: PredictOptions, console: &dyn Listener) -> Result<Self> {
         let run = Run::open(&order.run)?;
         let place = order.run.display().to_string();
         if !Run::is_finished(&order.run) {
@@ -117,7 +177,7 @@ impl Work {
         Ok(Self { order, run, antialias, capture, store, scene, clock, horizon, ticks, observed })
     }
 
-    pub(crate) fn run(&self, console: &Console) -> anyhow::Result<()> {
+    fn run(&self, console: &dyn Listener) -> Result<()> {
         let folder = self.order.run.join(FOLDER);
         files::make_folder(&folder)?;
         console.say(&format!(
@@ -299,7 +359,7 @@ impl Work {
 }
 
 /// The figures in the terminal.
-fn say(told: &Told, console: &Console) {
+fn say(told: &Told, console: &dyn Listener) {
     let number = |x: Option<f64>, digits: usize| x.map_or("–".to_owned(), |x| format!("{x:.digits$}"));
     console.say("model          PSNR  dynamic regions     skill over freeze  over velocity");
     for m in told.models.iter().chain(&told.assimilated).chain(&told.oracle) {

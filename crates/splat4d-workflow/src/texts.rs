@@ -2,7 +2,7 @@
 
 use crate::editor::Editor;
 use crate::source::Source;
-use crate::{asked, camera_file, paths};
+use crate::{camera_file, paths, point_queries};
 use splat4d::layers::Scene;
 use splat4d::scene::Camera;
 use splat4d::{Error, Result};
@@ -22,7 +22,7 @@ pub fn path(text: &str) -> Result<()> {
 pub fn points(text: &str) -> Result<()> {
     let camera = Camera::with_fov_y(splat4d::math::Se3::IDENTITY, 0.8, 8, 6);
     let view = paths::View { camera, name: "cam1".into(), time: 0.0, held: false };
-    asked::read(text, &[view], [0.0, 1.0]).map(drop)
+    point_queries::read(text, &[view], [0.0, 1.0]).map(drop)
 }
 
 /// Who answers the page of `view --edit`.

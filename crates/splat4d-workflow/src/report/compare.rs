@@ -9,7 +9,7 @@ use std::fmt::Write;
 const VIEWS: usize = 6;
 
 /// The page.
-pub(crate) fn page(entries: &[Entry]) -> String {
+pub fn page(entries: &[Entry]) -> String {
     let mut body = String::new();
     let names: Vec<&str> = entries.iter().map(|e| e.name.as_str()).collect();
     let _ = writeln!(body, "<header><h1>Comparison</h1><p>{}</p></header>", escape(&names.join(" · ")));

@@ -2,8 +2,7 @@
 
 use crate::draw::Rgb;
 use crate::files::{self, cannot_write};
-use anyhow::{Context, bail};
-use splat4d::Error;
+use splat4d::{Error, Result};
 use splat4d_train::output::Staged;
 use std::fs::File;
 use std::io::{BufWriter, Read, Write};
@@ -22,14 +21,14 @@ const INSTEAD: &str =
 const STDERR_BYTES: usize = 64 << 10;
 
 /// Whether the `ffmpeg` program can be called.
-pub(crate) fn have_ffmpeg() -> bool {
+pub fn have_ffmpeg() -> bool {
     let mut probe = Command::new("ffmpeg");
     probe.arg("-version").stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
     probe.status().is_ok_and(|s| s.success())
 }
 
 /// A film that is being written.
-pub(crate) enum Film {
+pub enum Film {
     /// Through ffmpeg.
     Mp4 {
         /// The temporary file.
@@ -60,7 +59,7 @@ pub(crate) enum Film {
 impl Film {
     /// Starts a film of `frames` frames at `path`: `.mp4`, `.mkv` and `.mov` through ffmpeg, `.png` and `.apng` as
     /// animated PNG, no ending as a folder of numbered PNGs.
-    pub(crate) fn create(path: &Path, [width, height]: [usize; 2], fps: f64, frames: usize) -> anyhow::Result<Self> {
+    pub fn create(path: &Path, [width, height]: [usize; 2], fps: f64, frames: usize) -> Result<Self> {
         let ending = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
         match ending.as_str() {
             "png" | "apng" => Self::apng(path, [width, height], fps, frames),
@@ -69,14 +68,11 @@ impl Film {
                 files::make_folder(path)?;
                 Ok(Self::Folder { path: path.to_owned(), next: 0 })
             }
-            _ => Err(Error::input(format!("films cannot be written as .{ending}"))
-                .at(path.display())
-                .remedy(ENDINGS)
-                .into()),
+            _ => Err(Error::input(format!("films cannot be written as .{ending}")).at(path.display()).remedy(ENDINGS)),
         }
     }
 
-    fn ffmpeg(path: &Path, ending: &str, [width, height]: [usize; 2], fps: f64) -> anyhow::Result<Self> {
+    fn ffmpeg(path: &Path, ending: &str, [width, height]: [usize; 2], fps: f64) -> Result<Self> {
         let output = Staged::new(path)?;
         // ffmpeg would report an unwritable place only after the first frame, in its own words.
         File::create(output.path()).map_err(|e| cannot_write(path, e))?;
@@ -105,7 +101,7 @@ impl Film {
         Ok(Self::Mp4 { output, child, pipe, words })
     }
 
-    fn apng(path: &Path, [width, height]: [usize; 2], fps: f64, frames: usize) -> anyhow::Result<Self> {
+    fn apng(path: &Path, [width, height]: [usize; 2], fps: f64, frames: usize) -> Result<Self> {
         let output = Staged::new(path)?;
         let file = File::create(output.path()).map_err(|e| cannot_write(path, e))?;
         let mut encoder = png::Encoder::new(BufWriter::new(file), width as u32, height as u32);
@@ -114,16 +110,18 @@ impl Film {
         encoder.set_compression(png::Compression::Balanced);
         encoder.set_filter(png::Filter::Adaptive);
         if frames > 1 {
-            encoder.set_animated(frames as u32, 0).context("an animated PNG cannot be started")?;
+            encoder.set_animated(frames as u32, 0).map_err(|e| full(path, e))?;
             // The delay is a fraction of two 16-bit numbers.
-            encoder.set_frame_delay((1000.0 / fps).round().clamp(1.0, 65535.0) as u16, 1000)?;
+            encoder
+                .set_frame_delay((1000.0 / fps).round().clamp(1.0, 65535.0) as u16, 1000)
+                .map_err(|e| full(path, e))?;
         }
         let writer = encoder.write_header().map_err(|e| full(path, e))?;
         Ok(Self::Apng { output, writer: Box::new(writer) })
     }
 
     /// Adds a frame. Panics never; frames of another size than the film's are an error of ours that ffmpeg reports.
-    pub(crate) fn frame(&mut self, picture: &Rgb) -> anyhow::Result<()> {
+    pub fn frame(&mut self, picture: &Rgb) -> Result<()> {
         match self {
             Self::Mp4 { pipe, .. } => {
                 let written = pipe.as_mut().map(|p| p.write_all(&picture.data));
@@ -143,7 +141,7 @@ impl Film {
     }
 
     /// Ends the film and gives the file its name.
-    pub(crate) fn finish(mut self) -> anyhow::Result<()> {
+    pub fn finish(mut self) -> Result<()> {
         if let Self::Mp4 { child, pipe, .. } = &mut self {
             drop(pipe.take());
             if !child.wait().is_ok_and(|s| s.success()) {
@@ -161,9 +159,9 @@ impl Film {
         Ok(())
     }
 
-    fn what_ffmpeg_said(&mut self) -> anyhow::Error {
+    fn what_ffmpeg_said(&mut self) -> Error {
         let Self::Mp4 { child, pipe, words, .. } = self else {
-            return anyhow::anyhow!("the film could not be written");
+            unreachable!("only ffmpeg's films have words of ffmpeg");
         };
         drop(pipe.take());
         let _ = child.wait();
@@ -173,34 +171,31 @@ impl Film {
         let last: Vec<&str> = last.into_iter().rev().collect();
         if said.contains("No space left") {
             let error = std::io::Error::from(std::io::ErrorKind::StorageFull);
-            return Error::environment("the film cannot be written", error).remedy(files::WRITE_REMEDY).into();
+            return Error::environment("the film cannot be written", error).remedy(files::WRITE_REMEDY);
         }
-        anyhow::anyhow!(
-            "ffmpeg could not write the film ({}). {INSTEAD}",
-            if last.is_empty() { "it printed nothing".into() } else { last.join("; ") }
-        )
+        let words = if last.is_empty() { "it printed nothing".into() } else { last.join("; ") };
+        Error::environment("ffmpeg could not write the film", std::io::Error::other(words)).remedy(INSTEAD)
     }
 }
 
 /// An error of the PNG encoder: nearly always the disk.
-fn full(path: &Path, error: png::EncodingError) -> anyhow::Error {
+fn full(path: &Path, error: png::EncodingError) -> Error {
     match error {
-        png::EncodingError::IoError(e) => cannot_write(path, e).into(),
-        other => anyhow::Error::new(other).context(format!("{} could not be encoded", path.display())),
+        png::EncodingError::IoError(e) => cannot_write(path, e),
+        other => Error::environment("the image could not be encoded", std::io::Error::other(other)).at(path.display()),
     }
 }
 
 /// Checks that the film's ending can be written before hours are spent on it.
-pub(crate) fn check(path: &Path) -> anyhow::Result<()> {
+pub fn check(path: &Path) -> Result<()> {
     let ending = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
     if matches!(ending.as_str(), "mp4" | "mkv" | "mov") && !have_ffmpeg() {
         return Err(Error::input("the program ffmpeg, which writes films, was not found")
             .at(path.display())
-            .remedy(INSTEAD)
-            .into());
+            .remedy(INSTEAD));
     }
     if !matches!(ending.as_str(), "" | "png" | "apng" | "mp4" | "mkv" | "mov") {
-        bail!(Error::input(format!("films cannot be written as .{ending}")).at(path.display()).remedy(ENDINGS));
+        return Err(Error::input(format!("films cannot be written as .{ending}")).at(path.display()).remedy(ENDINGS));
     }
     Ok(())
 }

@@ -1,12 +1,15 @@
 //! The work behind `edit`: what edits name next to the scene (cameras, masks, other scenes, the capture's images),
 //! found.
 
-use crate::console::Console;
-use crate::files;
+use crate::baking::title;
+use crate::converting::{self, Conversion};
+use crate::events::Listener;
+use crate::files::{self, grouped};
 use crate::paths::View;
 use crate::run_folder::Run;
-use crate::source::Source;
-use splat4d::edit::{Context, Edits, Mask, Selected, Step, mask_fits};
+use crate::source::{Source, not_empty};
+use serde_json::json;
+use splat4d::edit::{Context, Edits, Expr, Mask, Selected, Step, count, mask_fits, replay};
 use splat4d::format::playback::Provenance;
 use splat4d::layers::Scene;
 use splat4d::scene::{Camera, Planes, Time};
@@ -31,17 +34,130 @@ const COMPARED: usize = 40;
 /// Above this a mask's pixel is white, of 1.
 const WHITE: f32 = 0.5;
 
+/// Moments of the clip at which [`EditOptions::count`] counts what is visible.
+const MOMENTS: usize = 5;
+
+/// Options of [`edit`].
+#[derive(Clone, Debug, Default)]
+pub struct EditOptions {
+    /// The run or scene: everything that is converted.
+    pub scene: PathBuf,
+    /// A list of edits, TOML.
+    pub list: Option<PathBuf>,
+    /// More steps, after those of the list.
+    pub steps: Vec<Step>,
+    /// The file to write; its extension selects the format. Required unless `count` is given.
+    pub output: Option<PathBuf>,
+    /// Count this selection over time, and write nothing.
+    pub count: Option<String>,
+    /// A note for the provenance of a playback file.
+    pub note: Option<String>,
+    /// Write no provenance.
+    pub no_provenance: bool,
+    /// Write the list including `steps`.
+    pub save: Option<PathBuf>,
+}
+
+/// Replays edits on a scene and writes the result in the format of the output's extension.
+///
+/// Errors: a list that cannot be read; nothing to do; a step that fails; an output that cannot be written, in which case the old
+/// file stays.
+///
+/// ```no_run
+/// use splat4d::edit::Step;
+/// use splat4d_workflow::editing::{EditOptions, edit};
+/// use splat4d_workflow::events::ignore;
+///
+/// # fn main() -> splat4d::Result<()> {
+/// edit(
+///     &EditOptions {
+///         scene: "runs/take".into(),
+///         steps: vec![Step::Delete { select: "sphere(0,0,3, 0.5)".into() }],
+///         output: Some("take.s4d".into()),
+///         ..EditOptions::default()
+///     },
+///     &ignore,
+/// )
+/// # }
+/// ```
+pub fn edit(options: &EditOptions, console: &dyn Listener) -> Result<()> {
+    // What cannot be written is better known before the work.
+    if let Some(output) = &options.output {
+        converting::check_output(output)?;
+    }
+    let list = options.list.as_deref().map(read).transpose()?.unwrap_or_default();
+    let edits = with_steps(list, options.steps.iter().cloned());
+    let mut source = Source::open(&options.scene)?.finite();
+    not_empty(&source.scene, &options.scene)?;
+    source.warnings.lines().iter().for_each(|w| console.warn(&format!("{w}.")));
+    let listed: Vec<&Path> = options.list.iter().map(PathBuf::as_path).collect();
+    for file in options.output.iter().chain(&options.save) {
+        // A list may be saved with more steps in its own place.
+        let others = if options.save.as_ref() == Some(file) { &[] } else { &listed[..] };
+        source.keep(&options.scene, file, others)?;
+    }
+    let title = title(&source, &options.scene);
+    edits.check(&title)?;
+    if edits.steps.is_empty() && options.count.is_none() {
+        return Err(
+            Error::input("nothing to do").remedy("Give a list of edits, or an option such as --delete; see --help.")
+        );
+    }
+    let bring = Bring::new(&source, options.list.as_deref(), console)?;
+    let before = source.scene.len();
+    let (scene, done) = replay(&edits.steps, source.scene.clone(), &bring, &mut |done, all| {
+        console.phase("editing", done, all);
+    })?;
+    console.clear();
+    for step in &done {
+        console.say(&format!("{}: {} Gaussians", step.step, grouped(step.selected)));
+    }
+    if let Some(text) = &options.count {
+        return say_count(text, &scene, &bring, console);
+    }
+    console.say(&format!("{} Gaussians of {} in {} layers", grouped(scene.len()), grouped(before), scene.layers.len()));
+    console.emit(&json!({"type": "edited", "before": before, "gaussians": scene.len(), "layers": scene.layers.len(),
+        "steps": done}));
+    source.scene = scene;
+    let earlier = source.provenance.take();
+    source.provenance = (!options.no_provenance).then(|| provenance(&source, earlier, &edits, options.note.clone()));
+    if let Some(path) = &options.save {
+        write(path, &Edits { scene: Some(title), ..edits })?;
+        console.written(path);
+    }
+    let output = options.output.as_ref().ok_or_else(|| {
+        Error::input("no output was given").remedy("Name the file to write, or a selection to count.")
+    })?;
+    converting::write(&Conversion::new(&options.scene, output), source, console)
+}
+
+/// Reports how many Gaussians a selection holds, and how many of them are visible when.
+fn say_count(text: &str, scene: &Scene<f32>, context: &dyn Context, console: &dyn Listener) -> Result<()> {
+    let [start, end] = scene.clip;
+    let mut times: Vec<f64> = (0..MOMENTS).map(|i| start + (end - start) * i as f64 / (MOMENTS - 1) as f64).collect();
+    times.dedup();
+    let (all, seen) = count(&Expr::parse(text)?, scene, &times, context)?;
+    console.clear();
+    console.say(&format!("{text}: {} of {} Gaussians", grouped(all), grouped(scene.len())));
+    for (t, n) in times.iter().zip(&seen) {
+        console.say(&format!("{t:>9.3} s  {} visible", grouped(*n)));
+    }
+    console.emit(&json!({"type": "count", "selection": text, "gaussians": all, "of": scene.len(),
+        "seen": times.iter().zip(&seen).map(|(t, n)| json!([t, n])).collect::<Vec<_>>()}));
+    Ok(())
+}
+
 /// Where edits find what they name.
-pub(crate) struct Bring<'a> {
+pub struct Bring<'a> {
     source: &'a Source,
     /// Names of files are relative to this folder, that of the edits.
     folder: PathBuf,
     views: Vec<View>,
-    console: &'a Console,
+    console: &'a dyn Listener,
 }
 
 impl<'a> Bring<'a> {
-    pub(crate) fn new(source: &'a Source, edits: Option<&Path>, console: &'a Console) -> Result<Self> {
+    pub fn new(source: &'a Source, edits: Option<&Path>, console: &'a dyn Listener) -> Result<Self> {
         let folder = edits.and_then(Path::parent).map(Path::to_owned).unwrap_or_default();
         Ok(Self { source, folder, views: source.views()?, console })
     }
@@ -132,10 +248,10 @@ impl Context for Bring<'_> {
         let count = selected.iter().flatten().filter(|f| **f).count();
         self.console.say(&format!(
             "floaters: {} of {} Gaussians; {pictures} held-out images: {before:.2} dB with them, {after:.2} dB without",
-            files::grouped(count),
-            files::grouped(scene.len())
+            grouped(count),
+            grouped(scene.len())
         ));
-        self.console.emit(&serde_json::json!({"type": "floaters", "found": count, "strength": strength,
+        self.console.emit(&json!({"type": "floaters", "found": count, "strength": strength,
             "pictures": pictures, "psnr_before": before, "psnr_after": after}));
         Ok(selected)
     }
@@ -161,7 +277,7 @@ impl Context for Bring<'_> {
 }
 
 /// Gaussians that float, and what held-out images say of it.
-pub(crate) struct Proposal {
+pub struct Proposal {
     pub selected: Selected,
     /// Images that were compared, and their mean PSNR with and without the floaters, dB.
     pub pictures: usize,
@@ -173,7 +289,7 @@ impl Bring<'_> {
     /// Looks for floaters.
     ///
     /// Errors: no run with its capture, no held-out views, a strength that is not from 0 to 1.
-    pub(crate) fn propose(&self, scene: &Scene<f32>, strength: f64) -> Result<Proposal> {
+    pub fn propose(&self, scene: &Scene<f32>, strength: f64) -> Result<Proposal> {
         if !(0.0..=1.0).contains(&strength) {
             return Err(Error::input(format!("invalid strength {strength}")).remedy("Give 0 to 1"));
         }
@@ -207,7 +323,7 @@ fn mean_psnr(scene: &Scene<f32>, data: &Dataset, frames: &[usize]) -> Result<f64
 }
 
 /// Reads a list of edits.
-pub(crate) fn read(path: &Path) -> Result<Edits> {
+pub fn read(path: &Path) -> Result<Edits> {
     toml::from_str(&files::read_text(path)?).map_err(|e| {
         let line = e.span().map_or(String::new(), |s| format!(" (byte {})", s.start));
         Error::input(format!("invalid list of edits{line}: {}", e.message()))
@@ -217,25 +333,20 @@ pub(crate) fn read(path: &Path) -> Result<Edits> {
 }
 
 /// Writes a list of edits.
-pub(crate) fn write(path: &Path, edits: &Edits) -> Result<()> {
+pub fn write(path: &Path, edits: &Edits) -> Result<()> {
     let text = toml::to_string_pretty(edits).map_err(|e| Error::input(format!("cannot be written as TOML: {e}")))?;
     files::write(path, text.as_bytes())
 }
 
 /// The steps of options, behind those of a file.
-pub(crate) fn with_steps(mut edits: Edits, steps: impl IntoIterator<Item = Step>) -> Edits {
+pub fn with_steps(mut edits: Edits, steps: impl IntoIterator<Item = Step>) -> Edits {
     edits.steps.extend(steps);
     edits
 }
 
 /// Where an edited scene comes from: what its file said before, with these edits behind those and other words if there are
 /// some.
-pub(crate) fn provenance(
-    source: &Source,
-    earlier: Option<Provenance>,
-    edits: &Edits,
-    words: Option<String>,
-) -> Provenance {
+pub fn provenance(source: &Source, earlier: Option<Provenance>, edits: &Edits, words: Option<String>) -> Provenance {
     let earlier = earlier.unwrap_or_default();
     let print = |run: &Run| run.info.get("capture_fingerprint")?.as_str().map(str::to_owned);
     let capture = source.run.as_ref().and_then(print);
@@ -252,7 +363,7 @@ pub(crate) fn provenance(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::console::Loudness;
+    use crate::events::ignore;
     use splat4d::math::Se3;
 
     #[test]
@@ -299,9 +410,9 @@ mod tests {
         bytes.truncate(bytes.len() - 12);
         bytes.extend(b"\0\0\0\0IDAT\x35\xaf\x06\x1e");
         std::fs::write(folder.path().join("m.png"), bytes).unwrap();
-        let (source, console) = (Source::own(Scene::default()), Console::new(Loudness::Quiet, false));
+        let source = Source::own(Scene::default());
         let edits = folder.path().join("edits.toml");
-        let bring = Bring::new(&source, Some(&edits), &console).unwrap();
+        let bring = Bring::new(&source, Some(&edits), &ignore).unwrap();
         let camera = Camera::with_fov_y(Se3::IDENTITY, 0.8, 40, 30);
         let error = bring.mask("m.png", &camera).unwrap_err().to_string();
         assert!(error.contains("20000 x 20000") && error.contains("40 x 30"), "{error}");

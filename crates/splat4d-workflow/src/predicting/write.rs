@@ -2,9 +2,10 @@
 
 use super::{Forecast, Told, Work};
 use crate::baking::{Baking, bake_into};
-use crate::console::Console;
+use crate::events::Listener;
 use crate::source::Source;
 use crate::{files, playable};
+use splat4d::Result;
 use splat4d::format::safetensors::{self, Tensor};
 use splat4d_dynamics::paths::Moment;
 use std::collections::BTreeMap;
@@ -17,9 +18,9 @@ pub(super) fn all(
     told: &Told,
     forecasts: &[Forecast],
     best: &Forecast,
-    console: &Console,
-) -> anyhow::Result<()> {
-    files::write(&folder.join("predict.json"), &serde_json::to_vec_pretty(told)?)?;
+    console: &dyn Listener,
+) -> Result<()> {
+    files::write(&folder.join("predict.json"), &serde_json::to_vec_pretty(told).expect("results are plain data"))?;
     files::write(&folder.join("dynamics.safetensors"), &dynamics(work, forecasts)?)?;
     let mut bytes = Vec::new();
     splat4d::format::scene::write(&best.scene, &mut bytes)?;
@@ -34,7 +35,7 @@ pub(super) fn all(
 /// Paths of the nodes as observed and as each model goes on, and the weights of what was trained:
 /// `observed.positions` \[ticks, nodes, 3], `observed.rotations` \[ticks, nodes, 4] wxyz, `MODEL.positions`, `MODEL.rotations`,
 /// `MODEL.SEED.WEIGHT`.
-fn dynamics(work: &Work, forecasts: &[Forecast]) -> anyhow::Result<Vec<u8>> {
+fn dynamics(work: &Work, forecasts: &[Forecast]) -> Result<Vec<u8>> {
     let mut arrays: Vec<(String, Vec<usize>, Vec<f32>)> = Vec::new();
     let mut moments = |name: &str, moments: &[Moment]| {
         let nodes = work.observed.paths.nodes();

@@ -3,17 +3,17 @@
 //! folder's files; missing files are missing in the page.
 
 pub mod chart;
-pub(crate) mod compare;
-pub(crate) mod compress;
-pub(crate) mod doctor;
+pub mod compare;
+pub mod compress;
+pub mod doctor;
 mod pictures;
-pub(crate) mod predict;
+pub mod predict;
 mod refined;
 
 use crate::files::{self, grouped, human_bytes, human_seconds};
 use crate::run_folder::{Beside, Metrics, Run, ViewScore, beside};
 use chart::{Series, bars, escape, lines, short};
-pub(crate) use refined::refined_in_words;
+pub use refined::refined_in_words;
 use serde_json::Value;
 use splat4d::Result;
 use splat4d_train::path_text::in_command;
@@ -30,7 +30,7 @@ const CAMERA_CURVES: usize = 5;
 const CAMERA_BARS: usize = 24;
 
 /// Writes the page and returns its path.
-pub(crate) fn write(run: &Run) -> Result<PathBuf> {
+pub fn write(run: &Run) -> Result<PathBuf> {
     let path = run.path.join("report.html");
     files::write(&path, page(run).as_bytes())?;
     Ok(path)
@@ -55,7 +55,7 @@ fn page(run: &Run) -> String {
 }
 
 /// A whole page of a body.
-pub(crate) fn document(title: &str, body: &str) -> String {
+pub fn document(title: &str, body: &str) -> String {
     let title = escape(title);
     format!(
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" \

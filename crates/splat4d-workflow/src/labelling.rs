@@ -1,29 +1,50 @@
 //! The work behind `label`, which `train` does too where a capture has labels or features: both learnt into a run's scene, and
 //! measured.
 
-use crate::console::Console;
+use crate::evaluating::{self, amend};
+use crate::events::Listener;
 use crate::files;
-use crate::finish::amend;
 use crate::run_folder::Run;
 use crate::source::{not_empty, read_scene};
 use serde_json::json;
+use splat4d::Result;
 use splat4d::format;
 use splat4d::layers::Scene;
 use splat4d_train::capture::{Capture, CaptureOptions, Frame};
 use splat4d_train::features;
 use splat4d_train::labels::{self, LabelScores, ROUNDS, learn, measure};
+use splat4d_train::output::OutputFolder;
 use splat4d_train::run::{capture_options, corrected};
 use std::path::Path;
 
 /// Whether any image of a run's capture has a mask of labels or an image of features.
-pub(crate) fn has_any(capture: &Capture) -> bool {
+pub fn has_any(capture: &Capture) -> bool {
     capture.frames.iter().any(|f| f.labels.is_some() || f.features.is_some())
 }
 
-/// Learns the labels and the features of a run's capture, or of another with the same cameras, into its `scene.safetensors`.
+/// Learns a label and features of each Gaussian of a run from the masks and feature images of its capture, or of `from`, another
+/// capture of the same cameras; bakes and reports again. `rounds`: passes over the images.
+///
+/// Errors: no training image has either; files that cannot be read; another command writes the run.
+///
+/// ```no_run
+/// # fn main() -> splat4d::Result<()> {
+/// let listen = &splat4d_workflow::events::ignore;
+/// splat4d_workflow::labelling::label("runs/take".as_ref(), Some("segmented".as_ref()), None, listen)
+/// # }
+/// ```
+pub fn label(run: &Path, from: Option<&Path>, rounds: Option<usize>, console: &dyn Listener) -> Result<()> {
+    Run::open(run)?;
+    let _folder = OutputFolder::amend(run, "label")?;
+    learn_into(run, from, rounds, console)?;
+    evaluating::playback(run, console)?;
+    evaluating::write_page(run, console)
+}
+
+/// Learns labels and features into the run's `scene.safetensors`, and nothing else. The caller holds the run.
 ///
 /// Errors: no training image has either; files that cannot be read.
-pub(crate) fn label(run: &Path, from: Option<&Path>, rounds: Option<usize>, console: &Console) -> anyhow::Result<()> {
+pub fn learn_into(run: &Path, from: Option<&Path>, rounds: Option<usize>, console: &dyn Listener) -> Result<()> {
     let opened = Run::open(run)?;
     let file = opened.scene_file()?;
     let mut scene = read_scene(&file)?;
@@ -53,8 +74,8 @@ fn learn_features(
     scene: &mut Scene<f32>,
     capture: &Capture,
     rounds: Option<usize>,
-    console: &Console,
-) -> anyhow::Result<()> {
+    console: &dyn Listener,
+) -> Result<()> {
     let mut phase = |done, of| console.phase("learning features", done, of);
     let losses = features::learn(scene, capture, rounds.unwrap_or(features::ROUNDS), &mut phase)?;
     console.clear();
@@ -87,8 +108,8 @@ fn learn_labels(
     scene: &mut Scene<f32>,
     capture: &Capture,
     rounds: Option<usize>,
-    console: &Console,
-) -> anyhow::Result<()> {
+    console: &dyn Listener,
+) -> Result<()> {
     let mut phase = |done, of| console.phase("learning labels", done, of);
     let losses = learn(scene, capture, rounds.unwrap_or(ROUNDS), &mut phase)?;
     console.clear();
