@@ -89,7 +89,7 @@ impl Console {
     }
 
     /// Whether machines are listening.
-    pub(crate) fn json(&self) -> bool {
+    pub fn json(&self) -> bool {
         self.json
     }
 
@@ -113,7 +113,7 @@ impl Console {
     }
 
     /// Prints the result that the verb was asked for: on stdout whatever the loudness.
-    pub(crate) fn result(&self, text: &str) {
+    pub fn result(&self, text: &str) {
         self.above_bar(|| print(text));
     }
 
@@ -159,7 +159,7 @@ impl Console {
     }
 
     /// For people only, on stderr even with `--json`: where stdout is one JSON document.
-    pub(crate) fn aside(&self, text: &str) {
+    pub fn aside(&self, text: &str) {
         self.above_bar(|| eprint_line(text));
     }
 

@@ -160,6 +160,7 @@ const ORDER: [(&str, &[&str]); 9] = [
             "e03",
             "models",
             "suite",
+            "bench",
             "main",
         ],
     ),

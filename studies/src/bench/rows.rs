@@ -70,9 +70,9 @@ pub(super) fn json(rows: &[Row]) -> String {
 pub(super) fn read(path: &Path) -> Result<Vec<Row>> {
     let text = files::read_text(path)?;
     let broken = |what: String| {
-        Error::input(format!("invalid result of `splat4d bench`: {what}"))
+        Error::input(format!("invalid result of `studies bench`: {what}"))
             .at(path.display())
-            .remedy("Make one with `splat4d bench --save FILE`.")
+            .remedy("Make one with `studies bench --save FILE`.")
     };
     let rows: Vec<Row> = serde_json::from_str(&text).map_err(|e| broken(e.to_string()))?;
     match rows.iter().position(|r| !(r.ms.is_finite() && r.ms >= 0.0)) {

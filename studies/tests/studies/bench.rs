@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 /// The trained scene that comes with the repository.
 fn knight() -> String {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/knight.s4d");
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/knight.s4d");
     path.to_str().unwrap().to_owned()
 }
 

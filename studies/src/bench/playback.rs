@@ -1,8 +1,8 @@
 //! How scenes and files play, side by side: `splat4d_workflow::measure` by hand.
 
-use crate::console::Console;
 use serde::Serialize;
 use splat4d::Result;
+use splat4d_cli::console::Console;
 use splat4d_workflow::draw::antialias;
 use splat4d_workflow::files::{self, grouped, human_bytes};
 use splat4d_workflow::measure::{Side, Subject, What, in_turns, looks_of};

@@ -12,13 +12,13 @@ mod scenes;
 mod stages;
 mod training;
 
-use crate::console::Console;
 use growth::Axis;
 use roofline::Roofline;
 use rows::Row;
 use scenes::{Name, Pinned, Places};
 use splat4d::render::Simd;
 use splat4d::{Error, ErrorKind, Result};
+use splat4d_cli::console::Console;
 use splat4d_workflow::files;
 use splat4d_workflow::paths::parse_size;
 use stages::Way;
@@ -36,17 +36,17 @@ const THREADS: [usize; 2] = [1, 2];
 
 const EXAMPLES: &str = "\
 Examples:
-  splat4d bench                                     all scenes, one and two threads
-  splat4d bench --scene T --scene U --threads 1
-  splat4d bench --scene S --playbot FOLDER          the folder of the robot's SOG files
-  splat4d bench --simd scalar --json                an array of rows for machines
-  splat4d bench --save today.json
-  splat4d bench --against today.json                ratios to an earlier result
-  splat4d bench --growth all --plots docs/images    steps against Gaussians, pixels, frames
-  splat4d bench --device gpu --save gpu.json        every stage of a GPU, scenes A, B and C
-  splat4d bench --device gpu --sweep --save sweep.json    each kernel constant at each value
-  splat4d bench --device gpu --beside others        the same training in other programs
-  splat4d bench --playback runs/a runs/a-small      frames per second of runs and files
+  studies bench                                     all scenes, one and two threads
+  studies bench --scene T --scene U --threads 1
+  studies bench --scene S --playbot FOLDER          the folder of the robot's SOG files
+  studies bench --simd scalar --json                an array of rows for machines
+  studies bench --save today.json
+  studies bench --against today.json                ratios to an earlier result
+  studies bench --growth all --plots docs/images    steps against Gaussians, pixels, frames
+  studies bench --device gpu --save gpu.json        every stage of a GPU, scenes A, B and C
+  studies bench --device gpu --sweep --save sweep.json    each kernel constant at each value
+  studies bench --device gpu --beside others        the same training in other programs
+  studies bench --playback runs/a runs/a-small      frames per second of runs and files
 
 Times are means over eight views of the best of several rounds. `lower bound` is the time of a stage's compulsory work \
 at the measured rates of arithmetic and memory. Playback renders from 24 of the first scene's cameras over its clip, \
