@@ -128,6 +128,7 @@ const ORDER: [(&str, &[&str]); 9] = [
         "crates/splat4d-py",
         &[
             "errors",
+            "workflows",
             "arrays",
             "plain",
             "settings",
