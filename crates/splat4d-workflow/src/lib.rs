@@ -28,7 +28,7 @@
 //! | `camera_file.rs`, `paths/` | camera files; orbits, data-set cameras and key-framed camera paths |
 //! | `run_folder.rs`, `status.rs`, `sequence.rs` | run folders; how far a run is; numbered files |
 //! | `source.rs`, `source/` | scenes of runs and files, of other programs' folders and archives |
-//! | `draw.rs`, `video.rs`, `raw_values.rs` | renders a scene's channels as images, films, arrays |
+//! | `device.rs`, `draw.rs`, `video.rs`, `raw_values.rs`, `rendering.rs` | renders a scene's channels as images, films, arrays |
 //! | `point_queries.rs` | points followed through a scene |
 //! | `measure.rs`, `measure/` | how scenes and files play: frames per second, bytes, Gaussians alive |
 //! | `baking.rs`, `baking/` | a scene as a playback file, within bytes and likeness |
@@ -51,6 +51,7 @@ pub mod comparison;
 pub mod compressing;
 pub mod converting;
 pub mod deadline;
+pub mod device;
 pub mod draw;
 pub mod editing;
 pub mod editor;
@@ -67,6 +68,7 @@ pub mod playable;
 pub mod point_queries;
 pub mod predicting;
 pub mod raw_values;
+pub mod rendering;
 pub mod report;
 pub mod run_folder;
 pub mod sequence;

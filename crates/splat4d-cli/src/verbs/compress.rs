@@ -1,11 +1,12 @@
 //! `compress`: a trained run becomes one that is many times smaller and faster to play, measured before and after.
 
 use crate::console::Console;
-use crate::device::{self, Device};
+use crate::device::Device;
 use crate::interrupt;
 use crate::measuring::MeasureArgs;
 use splat4d_train::compress::{Compression, Level, MOST_PRUNED};
 use splat4d_workflow::compressing::{CompressOptions, GUARD, Work};
+use splat4d_workflow::device::chosen;
 use splat4d_workflow::measure::SIZE;
 use splat4d_workflow::paths::parse_size;
 use std::path::PathBuf;
@@ -83,7 +84,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         Some(dir) => Work::reopen(dir)?,
         None => Work::begin(args.run.as_ref().expect("clap asks for a run"), &options(args), console)?,
     };
-    let work = work.timed_at(args.size.unwrap_or(SIZE)).on(device::to_train(args.device, console));
+    let work = work.timed_at(args.size.unwrap_or(SIZE)).on(chosen(args.device.into(), "training", console));
     let stop = interrupt::flag("stopping");
     work.run(!args.no_eval, &args.measure.options(), &stop, console)?;
     Ok(())

@@ -1,12 +1,13 @@
 //! `eval`: measures a run again, perhaps next to a scene that stands still.
 
 use crate::console::Console;
-use crate::device::{self, Device};
+use crate::device::Device;
 use crate::interrupt;
 use crate::measuring::MeasureArgs;
 use splat4d_train::eval::run::Measured;
 use splat4d_train::output::OutputFolder;
 use splat4d_workflow::deadline::Deadline;
+use splat4d_workflow::device::chosen;
 use splat4d_workflow::evaluating::{self, Measure};
 use splat4d_workflow::foreign::{self, ForeignOptions};
 use splat4d_workflow::run_folder::Run;
@@ -122,7 +123,7 @@ pub(crate) struct Args {
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     args.measure.check()?;
-    let measure = Measure { device: device::chosen(args.device, "measuring", console), ..args.measure.options() };
+    let measure = Measure { device: chosen(args.device.into(), "measuring", console), ..args.measure.options() };
     let path = args.run.as_ref().or(args.model.as_ref()).expect("clap asks for a run");
     if let Some(capture) = &args.capture {
         let options = ForeignOptions {

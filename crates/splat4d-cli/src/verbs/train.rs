@@ -1,7 +1,7 @@
 //! `train`: a capture becomes a run: trained, measured, filmed and reported.
 
 use crate::console::Console;
-use crate::device::{self, Device};
+use crate::device::Device;
 use crate::interrupt;
 use crate::measuring::MeasureArgs;
 use crate::serving::{self, Place, Watch};
@@ -19,6 +19,7 @@ use splat4d_train::run::{memory_estimate, open_capture, open_frames};
 use splat4d_train::settings::{Knob, nearest};
 use splat4d_workflow::chunked::{self, Wanted};
 use splat4d_workflow::deadline::Deadline;
+use splat4d_workflow::device::chosen;
 use splat4d_workflow::files::{self, human_bytes, parse_bytes};
 use splat4d_workflow::run_folder::{self, Asked, Run, write_cameras};
 use splat4d_workflow::{evaluating, labelling};
@@ -212,7 +213,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let (folder, run, watch, trained) = if let Some(run) = args.resume.as_ref().filter(|_| again.is_none()) {
         let watch = watch(&Run::open(run)?.name());
         let folder = OutputFolder::amend(run, "train --resume")?;
-        let device = device::to_train(args.device, console);
+        let device = chosen(args.device.into(), "training", console);
         let clock = clock.clone();
         let options = TrainOptions { device, snapshots: snapshots(&watch), clock, ..TrainOptions::default() };
         interrupt::asks(SAVING);
@@ -300,7 +301,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         describe(&whole, memory_estimate(&whole, &recipe), console);
         let watch = watch(&whole.name);
         let options = TrainOptions {
-            device: device::to_train(args.device, console),
+            device: chosen(args.device.into(), "training", console),
             minutes,
             finish: evaluating::steps(&whole, &recipe, args.no_eval),
             predict,
@@ -382,7 +383,7 @@ fn in_chunks(
     console: &Console,
 ) -> anyhow::Result<()> {
     let options = TrainOptions {
-        device: device::to_train(args.device, console),
+        device: chosen(args.device.into(), "training", console),
         clock: clock.clone(),
         minutes: args.minutes,
         snapshots: watch.is_on().then_some(SNAPSHOT_INTERVAL),
