@@ -59,8 +59,7 @@ impl Capture {
         let mut check = self.judge(&mut looks, &mut matches);
         if !check.misread {
             let poses: Vec<Se3> = looks.iter().map(|l| self.frames[l.frame].source.cam_from_world).collect();
-            // Without matches points have shown that focal lengths are right.
-            check.more.extend(matches.and_then(|m| focal::check(&m, &looks, &poses)));
+            check.more.extend(focal::check(self, matches.as_deref(), &looks, &poses));
             check.more.extend(check_masks(&looks, &poses));
             let pixels: usize = looks.iter().map(|l| l.camera.width * l.camera.height).sum();
             check.more.extend(outliers::check(self, looks, PIXELS.saturating_sub(pixels)));
