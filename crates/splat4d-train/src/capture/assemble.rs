@@ -8,7 +8,7 @@ use super::{
     Capture, CaptureKind, CaptureOptions, Exif, Extent, FlowFile, Frame, HoldOut, PointCloud, RawFrame, Rig, Split,
     Take, Timing,
 };
-use super::{borders, evidence, lookup, masks, options, panorama, picture, plausible, pose};
+use super::{borders, evidence, lookup, masks, options, panorama, picture, plausible, pose, rig};
 use splat4d::math::se3::{norm, normalize};
 use splat4d::scene::{Camera, Lens, Time};
 use splat4d::{Error, Result};
@@ -69,6 +69,9 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         full.file_name().map_or_else(|| "capture".into(), |n| n.to_string_lossy().into_owned())
     });
     take.warnings.extend(take.points.as_ref().and_then(PointCloud::loss));
+    if take.points.is_none() && !in_part {
+        unread_clouds(&mut take);
+    }
     let points = take.points.map(|p| p.voxel_downsample(options.max_points)).filter(|p| !p.points.is_empty());
     let mut capture = Capture {
         name,
@@ -112,6 +115,20 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         all.retain(|&i| options.lists(frames[i].index));
     }
     Ok(capture)
+}
+
+/// Names point clouds next to the capture's files, where it has no points: nothing says that they are in its world.
+fn unread_clouds(take: &mut Take) {
+    let clouds: Vec<String> =
+        rig::file_names(&take.root).into_iter().filter(|n| n.to_ascii_lowercase().ends_with(".ply")).collect();
+    if !clouds.is_empty() {
+        let what = format!(
+            "Point clouds in the folder that the capture does not name: {}. To begin with one, name it (ply_file_path in \
+             transforms.json, points in capture.json).",
+            first_names(&clouds)
+        );
+        take.account.add(Aspect::NotRead, Severity::Note, what);
+    }
 }
 
 /// Points nearer than this share of all that a training camera sees may be wrong ones.

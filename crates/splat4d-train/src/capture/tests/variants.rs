@@ -2,7 +2,7 @@
 //! folders. What is read is that of the capture as it was written, or an error; and never without a word.
 
 use super::super::*;
-use super::samples::{self, FOCAL, HEIGHT, Sample, WIDTH};
+use super::samples::{self, FOCAL, HEIGHT, PLY, Sample, WIDTH};
 use crate::capture::pose::same_pose;
 use serde_json::{Value, json};
 use std::path::PathBuf;
@@ -307,7 +307,7 @@ fn times_are_read_as_what_they_count() {
     let lettered = |i: usize| format!("{}.png", char::from(b'a' + i as u8));
     let steps = |step: f64| (0..9).map(|i| step * i as f64).collect::<Vec<f64>>();
     type Case<'a> = (Vec<f64>, Option<f64>, &'a dyn Fn(usize) -> String, f64, Severity, &'a str);
-    let cases: [Case<'_>; 10] = [
+    let cases: [Case<'_>; 12] = [
         // Frame numbers, as names tell, and as a stated rate makes likely.
         (steps(1.0), Some(30.0), &numbered, 8.0 / 30.0, Severity::Note, "frame numbers"),
         (steps(1.0), None, &numbered, 8.0 / 30.0, Severity::Note, "frame numbers"),
@@ -319,6 +319,9 @@ fn times_are_read_as_what_they_count() {
         // Parts of the capture.
         (steps(1.0 / 8.0), None, &lettered, 8.0 / 30.0, Severity::Note, "parts"),
         (steps(1.0 / 9.0), Some(24.0), &lettered, 8.0 / 9.0 * 8.0 / 24.0, Severity::Note, "parts"),
+        // Every third frame of a second, and a clock that counts from a date.
+        (steps(0.1).iter().map(|t| 0.5 * t).collect(), Some(60.0), &lettered, 0.4, Severity::Note, "seconds"),
+        (steps(0.1).iter().map(|t| 1.7e9 + t).collect(), Some(10.0), &lettered, 0.8, Severity::Note, "seconds"),
         // Another rate than the one that is stated.
         (steps(2.0 / 15.0), Some(9.0), &lettered, 8.0 * 2.0 / 15.0, Severity::Warning, "do not fit"),
         // Milliseconds.
@@ -327,7 +330,9 @@ fn times_are_read_as_what_they_count() {
     for (times, fps, name, length, severity, word) in cases {
         let capture = with(&times, fps, name);
         let (first, last) = capture.time_range();
-        assert!((last - first - length).abs() < 1e-9, "{times:?} at {fps:?}: {} s", last - first);
+        // A clock from a date has no more digits.
+        assert!((last - first - length).abs() < 1e-6, "{times:?} at {fps:?}: {} s", last - first);
+        assert!(first.abs() < 1e3, "{first}");
         assert_said(&capture, Aspect::Assumed, severity, &["Times are read as", word, "9 instants"]);
     }
     let rate = with(&steps(1.0 / 25.0), None, &lettered).fps;
@@ -336,6 +341,41 @@ fn times_are_read_as_what_they_count() {
     sample.edit("transforms.json", |v| (0..3).for_each(|i| v["frames"][i]["time"] = json!(i)));
     let told = CaptureOptions { times: Times::Frames, fps: Some(10.0), ..CaptureOptions::default() };
     assert!((read(sample.root(), &told).time_range().1 - 0.2).abs() < 1e-12);
+}
+
+#[test]
+fn contradictions_of_focal_lengths_and_unread_clouds_are_reported() {
+    let with = |angle: f64| {
+        let sample = samples::photos(4, |i| format!("{i}.png"), None);
+        sample.edit("transforms.json", |v| {
+            v["camera_angle_x"] = json!(angle);
+            v["fl_x"] = json!(FOCAL);
+            v["fl_y"] = json!(FOCAL);
+        });
+        sample.write("sparse_pc.ply", PLY.as_bytes());
+        sample
+    };
+    let angle = 2.0 * (0.5 * WIDTH as f64 / FOCAL).atan();
+    let right = open(&with(angle));
+    assert!(!right.warnings.iter().any(|w| w.contains("differ")), "{:?}", right.warnings);
+    assert_said(&right, Aspect::NotRead, Severity::Note, &["Point clouds", "sparse_pc.ply"]);
+    assert_said(
+        &open(&with(0.5 * angle)),
+        Aspect::Assumed,
+        Severity::Warning,
+        &["camera_angle_x and fl_x differ", "20.0 px"],
+    );
+}
+
+#[test]
+fn a_lens_that_folds_inside_the_image_is_reported() {
+    let with = |k1: f64| {
+        let sample = samples::photos(4, |i| format!("{i}.png"), None);
+        sample.edit("transforms.json", |v| v["k1"] = json!(k1));
+        open(&sample)
+    };
+    assert_said(&with(-2.0), Aspect::Assumed, Severity::Warning, &["look wrong", "the lens folds"]);
+    assert!(!with(-0.1).warnings.iter().any(|w| w.contains("look wrong")));
 }
 
 #[test]
