@@ -52,6 +52,9 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
     check_poses(&mut take, &cameras)?;
     check_duplicates(&mut take, &cameras).map_err(located)?;
     shared_images(&mut take);
+    if take.points.is_none() && !in_part {
+        unread_clouds(&mut take);
+    }
     let (has_alpha, turned, unsure) = fit_pictures(&mut take, options)?;
     check_masks(&take, has_alpha)?;
     let background = options.background.or(take.background).or(has_alpha.then_some(WHITE)).filter(|_| has_alpha);
@@ -69,9 +72,6 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         full.file_name().map_or_else(|| "capture".into(), |n| n.to_string_lossy().into_owned())
     });
     take.warnings.extend(take.points.as_ref().and_then(PointCloud::loss));
-    if take.points.is_none() && !in_part {
-        unread_clouds(&mut take);
-    }
     let points = take.points.map(|p| p.voxel_downsample(options.max_points)).filter(|p| !p.points.is_empty());
     let mut capture = Capture {
         name,

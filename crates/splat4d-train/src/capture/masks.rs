@@ -31,6 +31,15 @@ pub(super) fn fill(take: &mut Take) -> Result<()> {
     let mut files = Vec::new();
     list(&folder, String::new(), 0, &mut files);
     if files.is_empty() {
+        let others: Vec<String> = rig::file_names(&folder).into_iter().filter(|n| folder.join(n).is_file()).collect();
+        if !others.is_empty() {
+            let what = format!(
+                "{} files in {name}/, none of which is an image ({}): training runs without masks. Write them as PNG.",
+                others.len(),
+                first_names(&others)
+            );
+            take.account.add(Aspect::NotRead, Severity::Warning, what);
+        }
         return Ok(());
     }
     let stated: BTreeSet<PathBuf> = take.frames.iter().filter_map(|f| f.mask.clone()).collect();
@@ -97,10 +106,15 @@ fn tell_of_others(take: &mut Take, folders: &[String]) {
     };
     let read = |folder: &String| {
         let folder = take.root.join(folder);
-        let maps = |f: &RawFrame| [f.depth.as_ref().map(|d| d.path.clone()), f.mask.clone(), f.labels.clone(), f.features.clone()];
-        take.frames.iter().any(|f| f.image.starts_with(&folder) || maps(f).iter().flatten().any(|p| p.starts_with(&folder)))
+        let maps = |f: &RawFrame| {
+            [f.depth.as_ref().map(|d| d.path.clone()), f.mask.clone(), f.labels.clone(), f.features.clone()]
+        };
+        take.frames
+            .iter()
+            .any(|f| f.image.starts_with(&folder) || maps(f).iter().flatten().any(|p| p.starts_with(&folder)))
     };
-    let usual = |n: &&String| !may_hold_masks(n) && !is_image_folder(&fold(n)) && !n.starts_with('.') && !rig::is_plain(n);
+    let usual =
+        |n: &&String| !may_hold_masks(n) && !is_image_folder(&fold(n)) && !n.starts_with('.') && !rig::is_plain(n);
     let like: Vec<&String> = folders.iter().filter(usual).filter(|n| !read(n)).filter(|n| fits(&n)).collect();
     if !like.is_empty() {
         let what = format!(

@@ -275,6 +275,14 @@ fn lists_of_splits_are_kept() {
     let capture = open(&sample);
     assert_eq!((capture.train.as_slice(), capture.held.as_slice()), (&[0, 2][..], &[1][..]));
     assert_said(&capture, Aspect::Assumed, Severity::Note, &["6 of 9", "left out"]);
+    // Lists of images at the top; not those of numbers.
+    let sample = colmap_at("sparse/0", &["images"]);
+    sample.write("test.txt", b"_DSC8680.png\n_DSC8683.png\n");
+    sample.write("train.txt", b"1\n2\n");
+    assert_eq!(open(&sample).held, [1, 4]);
+    // Keys of other programs are not kept, and named.
+    let other = with(json!({"train_ids": [0, 1, 2]}));
+    assert_said(&open(&other), Aspect::NotRead, Severity::Warning, &["train_ids (meant train_filenames?)"]);
     // DyCheck's lists and rate, and HyperNeRF's lists without ids.
     let sample = samples::nerfies();
     sample.edit("dataset.json", |v| *v = json!({"ids": ["000000", "000001", "000002", "000003"]}));
@@ -471,6 +479,27 @@ fn masks_next_to_images_are_found_in_every_layout() {
         Severity::Warning,
         &["None of the 1 files in masks/", "cam0.png.png", "_mask"],
     );
+    // Masks that are no images, and images of another folder.
+    let arrays = samples::photos(3, |c| format!("cam{c}.png"), None);
+    arrays.write("masks/cam1.npy", b"x");
+    assert_said(&open(&arrays), Aspect::NotRead, Severity::Warning, &["1 files in masks/", "cam1.npy", "PNG"]);
+    (0..3).for_each(|c| arrays.mask(&format!("sam2/cam{c}.png"), |_, _| 255));
+    assert_said(&open(&arrays), Aspect::NotRead, Severity::Note, &["named like the images: sam2"]);
+    // A mask in the alpha of a white image, and one of the numbers of labels.
+    let half = |x: u32| if x < 12 { 255u8 } else { 0 };
+    let rgba = |x, _| image::Rgba([255, 255, 255, half(x)]);
+    let labels = |x, _| image::Luma([u16::from(half(x) > 0) * 3]);
+    let [width, height] = [WIDTH as u32, HEIGHT as u32];
+    let sample_of = |save: &dyn Fn(&Sample)| {
+        let sample = samples::photos(3, |c| format!("cam{c}.png"), None);
+        save(&sample);
+        let store = ImageStore::new(Arc::new(open(&sample)), 1 << 20);
+        let mask = store.load(1).unwrap().to_picture().mask.unwrap();
+        (mask.get(0, 3, 2), mask.get(0, 3, 20))
+    };
+    let in_alpha = sample_of(&|s| s.save("masks/cam1.png", image::ImageBuffer::from_fn(width, height, rgba)));
+    let of_labels = sample_of(&|s| s.save("masks/cam1.png", image::ImageBuffer::from_fn(width, height, labels)));
+    assert_eq!([in_alpha, of_labels], [(1.0, 0.0); 2]);
     ["masks/cam1_mask.png", "masks/mask_cam1.png"].iter().for_each(|name| sample.mask(name, |_, _| 255));
     assert!(refuse(&sample).contains("several masks"), "{}", refuse(&sample));
 }
@@ -520,7 +549,7 @@ fn standard_folders_of_colmap_are_read() {
     let sample = colmap_at("sparse/0", &["images"]);
     std::fs::remove_file(sample.path("sparse/0/points3D.txt")).unwrap();
     assert!(open(&sample).points.is_none());
-    sample.write("sparse/0/points3D.ply", samples::PLY.as_bytes());
+    sample.write("sparse/0/points3D.ply", PLY.as_bytes());
     let capture = open(&sample);
     assert_eq!(capture.points.as_ref().unwrap().points.len(), 2);
     assert!(capture.notes.iter().any(|n| n.contains("2 initial points are those of a .ply")), "{:?}", capture.notes);
@@ -592,7 +621,7 @@ fn multiview_models_pose_the_folders_of_their_numbers() {
     std::fs::remove_dir_all(sample.path("images")).unwrap();
     sample.write("sparse_/images.txt", renamed.as_bytes());
     std::fs::remove_file(sample.path("sparse_/points3D.txt")).unwrap();
-    sample.write("points3D_multipleview.ply", samples::PLY.as_bytes());
+    sample.write("points3D_multipleview.ply", PLY.as_bytes());
     let capture = open(&sample);
     assert_eq!((capture.frames.len(), capture.cameras.len(), capture.fixed_cameras()), (6, 3, true));
     assert_eq!((capture.timing, capture.times().len()), (Timing::Numbers, 2));

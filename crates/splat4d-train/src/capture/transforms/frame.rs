@@ -335,6 +335,11 @@ const OTHER_WORDS: &[(&str, &str)] = &[
     ("ply_path", "ply_file_path"),
     ("train_files", "train_filenames"),
     ("test_files", "test_filenames"),
+    ("split", "train_filenames"),
+    ("train_ids", "train_filenames"),
+    ("train_split", "train_filenames"),
+    ("test_ids", "test_filenames"),
+    ("test_split", "test_filenames"),
     ("framerate", "fps"),
     ("frame_rate", "fps"),
 ];
