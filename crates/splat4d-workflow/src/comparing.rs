@@ -98,7 +98,7 @@ impl Entry {
             true => folder.canonicalize().ok().and_then(|f| f.file_name().map(|n| n.to_string_lossy().into_owned())),
             false => file.file_stem().map(|n| n.to_string_lossy().into_owned()),
         };
-        let per_view = std::fs::read(folder.join("per_view.json")).ok();
+        let per_view = crate::files::read(&folder.join("per_view.json")).ok();
         let per_view = per_view.and_then(|b| serde_json::from_slice::<Value>(&b).ok());
         let views = per_view.as_ref().and_then(newest).map(|(_, entry)| view_scores(entry)).unwrap_or_default();
         let pictures = steps.map(|n| folder.join("test").join(format!("ours_{n}"))).filter(|f| f.is_dir());

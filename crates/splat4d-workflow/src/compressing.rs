@@ -184,6 +184,15 @@ impl Order {
     fn text(&self) -> String {
         toml::to_string(self).expect("an order is plain data")
     }
+
+    /// Reads what [`text`](Self::text) made. Errors: damage; settings out of range.
+    pub(crate) fn read(text: &str) -> Result<Self> {
+        let order: Self = toml::from_str(text).map_err(|e| {
+            Error::input(format!("it is not readable: {}", e.message())).remedy("Start again: splat4d compress RUN.")
+        })?;
+        order.settings.check()?;
+        Ok(order)
+    }
 }
 
 /// What the first Ctrl-C is answered with while a scene is tuned.
@@ -275,12 +284,7 @@ impl Work {
 
     fn opened(dir: &Path, folder: OutputFolder) -> Result<Self> {
         let path = dir.join(ORDER);
-        let order: Order = toml::from_str(&files::read_text(&path)?).map_err(|e| {
-            Error::input(format!("it is not readable: {}", e.message()))
-                .at(path.display())
-                .remedy("Start again: splat4d compress RUN.")
-        })?;
-        order.settings.check().map_err(|e| e.at(path.display()))?;
+        let order = Order::read(&files::read_text(&path)?).map_err(|e| e.at(path.display()))?;
         Ok(Self { dir: dir.to_owned(), folder, order, fresh: false, device: Device::Cpu, size: SIZE })
     }
 

@@ -13,7 +13,7 @@ use splat4d_train::event::Event;
 use splat4d_train::output::{Found, Input, Mixes, OutputFolder, Owner, Request, STATE};
 use splat4d_train::path_text::of_text;
 use splat4d_train::recipe::Recipe;
-use splat4d_train::run::{capture_options, checkpoint};
+use splat4d_train::run::{capture_options, checkpoint, recorded_elsewhere};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -222,7 +222,10 @@ impl Run {
             // Also masks and maps that the recipe does not look at.
             Capture::open(&root, &capture_options(&recipe).ok()?).ok()
         };
-        Origin { capture: self.capture(), elsewhere: opened().map(|c| c.elsewhere).unwrap_or_default() }
+        // A capture that can no longer be opened still has the images that the run was trained on.
+        let mut elsewhere = recorded_elsewhere(&self.info);
+        elsewhere.extend(opened().into_iter().flat_map(|c| c.elsewhere));
+        Origin { capture: self.capture(), elsewhere }
     }
 
     /// Warnings and notes about the run: those of the capture's reader, and those since, in that order.

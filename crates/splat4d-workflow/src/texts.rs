@@ -1,5 +1,6 @@
 //! The texts that people give to verbs, read: for the fuzz targets.
 
+use crate::compressing::Order;
 use crate::editor::Editor;
 use crate::source::Source;
 use crate::{camera_file, paths, point_queries};
@@ -23,6 +24,11 @@ pub fn points(text: &str) -> Result<()> {
     let camera = Camera::with_fov_y(splat4d::math::Se3::IDENTITY, 0.8, 8, 6);
     let view = paths::View { camera, name: "cam1".into(), time: 0.0, held: false };
     point_queries::read(text, &[view], [0.0, 1.0]).map(drop)
+}
+
+/// Reads the settings of an unfinished compression, as `compress --resume` does.
+pub fn compress_order(text: &str) -> Result<()> {
+    Order::read(text).map(drop)
 }
 
 /// Who answers the page of `view --edit`.
