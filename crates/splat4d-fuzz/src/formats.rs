@@ -38,6 +38,10 @@ pub(crate) const READERS: &[Reader] = &[
     Reader { name: "npy", seeds: npy_seeds, read: |b| drop(npy::Npy::read(b)) },
     Reader { name: "npz", seeds: npz_seeds, read: |b| drop(npy::Npy::read_member(b, "data")) },
     Reader { name: "ply_zip", seeds: ply_zips, read: |b| file("scene.zip", b) },
+    Reader { name: "glb", seeds: || [written(".glb"), written(".spz.glb")].concat(), read: open },
+    Reader { name: "gltf", seeds: gltf_seeds, read: open },
+    Reader { name: "usda", seeds: usda_seeds, read: open },
+    Reader { name: "usdz", seeds: || written(".usdz"), read: open },
     Reader { name: "sog_levels", seeds: || vec![LEVELS.into()], read: sog_levels },
     Reader { name: "foreign", seeds: foreign_seeds, read: |b| drop(foreign::unread("a.splat4d", b)) },
 ];
@@ -104,6 +108,39 @@ fn written(ending: &str) -> Vec<Vec<u8>> {
     }
     out.dedup();
     out
+}
+
+/// A JSON with its numbers inside, and one that names another file.
+fn gltf_seeds() -> Vec<Vec<u8>> {
+    let mut all = written(".gltf");
+    let text = String::from_utf8_lossy(&all[0]).replace("data:application/octet-stream;base64,", "scene.bin?");
+    all.push(text.into_bytes());
+    all
+}
+
+/// A stage as other programs write it, with what ours lacks.
+const STAGE: &str = r#"#usda 1.0
+( upAxis = "Z" metersPerUnit = 0.01
+  timeCodesPerSecond = 10 )
+def Xform "w" ( prepend apiSchemas = ["A"] ) {
+    double3 xformOp:translate = (1, 2, 3)
+    float3 xformOp:rotateXYZ = (10, 20, 30)
+    matrix4d xformOp:transform = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))
+    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateXYZ", "!invert!xformOp:translate", "xformOp:transform"]
+    variantSet "v" = { "a" { def Mesh "m" { int[] i = [1] } } }
+    def ParticleField3DGaussianSplat "g" {
+        point3h[] positionsh.timeSamples = { 0: [(1, 2, 3), (4, 5, 6)], 1: [(1, 2, 4), (4, 5, 7)] }
+        float[] opacities = [0.5, 0.25] ( interpolation = "vertex" )
+        uniform int radiance:sphericalHarmonicsDegree = 0
+        float3[] radiance:sphericalHarmonicsCoefficients = [(1, 2, 3), (1, 2, 3)]
+    }
+}
+"#;
+
+fn usda_seeds() -> Vec<Vec<u8>> {
+    let mut all = written(".usda");
+    all.push(STAGE.into());
+    all
 }
 
 fn point_seeds() -> Vec<Vec<u8>> {

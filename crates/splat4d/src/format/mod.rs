@@ -4,6 +4,7 @@
 //! with the bytes present before anything is allocated.
 
 pub(crate) mod arrays;
+mod base64;
 mod bytes;
 pub mod dialect;
 mod fade;
@@ -27,6 +28,7 @@ pub mod sog;
 pub mod splat;
 pub mod splatv;
 pub mod spz;
+pub mod usd;
 pub(crate) mod warnings;
 pub mod zip;
 
@@ -49,6 +51,10 @@ pub const DIALECTS: &[Dialect] = &[
     splatv::DIALECT,
     sog::DIALECT,
     gltf::DIALECT,
+    gltf::TEXT,
+    gltf::COMPRESSED,
+    usd::TEXT,
+    usd::ARCHIVE,
 ];
 
 /// The scene in a file of any kind that says by its first bytes what it is: `.s4d`, .ply (3DGS, compressed, Spacetime
