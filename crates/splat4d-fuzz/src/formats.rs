@@ -41,6 +41,10 @@ pub(crate) const READERS: &[Reader] = &[
     Reader { name: "glb", seeds: || [written(".glb"), written(".spz.glb")].concat(), read: open },
     Reader { name: "gltf", seeds: gltf_seeds, read: open },
     Reader { name: "usda", seeds: usda_seeds, read: open },
+    Reader { name: "ftgs_ply", seeds: || written(".ftgs.ply"), read: open },
+    Reader { name: "torch", seeds: torch_seeds, read: open },
+    Reader { name: "torch_pickle", seeds: || vec![PICKLE.to_vec()], read: torch_pickle },
+    Reader { name: "dynamic3d", seeds: || vec![dynamic3d()], read: open },
     Reader { name: "usdz", seeds: || written(".usdz"), read: open },
     Reader { name: "sog_levels", seeds: || vec![LEVELS.into()], read: sog_levels },
     Reader { name: "foreign", seeds: foreign_seeds, read: |b| drop(foreign::unread("a.splat4d", b)) },
@@ -136,6 +140,34 @@ def Xform "w" ( prepend apiSchemas = ["A"] ) {
     }
 }
 "#;
+
+/// The pickle of a checkpoint of two Gaussians with degree 0, as `torch.save` writes it: {'splats': OrderedDict(...)}.
+const PICKLE: &[u8] = include_bytes!("../seeds/splats.pkl");
+
+/// The archive of a pickle and storages of 32 numbers.
+fn torch(pickle: &[u8]) -> Vec<u8> {
+    let numbers: Vec<u8> = (0..32).flat_map(|i| (i as f32 * 0.1).to_le_bytes()).collect();
+    let names: Vec<String> = (0..9).map(|i| format!("archive/data/{i}")).collect();
+    let storages = names.iter().map(|name| (name.as_str(), &numbers[..]));
+    zip(&std::iter::once(("archive/data.pkl", pickle)).chain(storages).collect::<Vec<_>>(), false)
+}
+
+fn torch_seeds() -> Vec<Vec<u8>> {
+    vec![torch(PICKLE)]
+}
+
+/// Another pickle for storages that are sound.
+fn torch_pickle(bytes: &[u8]) {
+    open(&torch(bytes));
+}
+
+/// Three frames of two Gaussians of Dynamic3DGaussians.
+fn dynamic3d() -> Vec<u8> {
+    let arrays = [("means3D", &[3, 2, 3][..]), ("unnorm_rotations", &[3, 2, 4]), ("rgb_colors", &[3, 2, 3])];
+    let arrays = arrays.into_iter().chain([("log_scales", &[2, 3][..]), ("logit_opacities", &[2, 1])]);
+    let files: Vec<(String, Vec<u8>)> = arrays.map(|(name, shape)| (format!("{name}.npy"), array(shape))).collect();
+    zip(&files.iter().map(|(n, b)| (n.as_str(), &b[..])).collect::<Vec<_>>(), true)
+}
 
 fn usda_seeds() -> Vec<Vec<u8>> {
     let mut all = written(".usda");
@@ -309,6 +341,13 @@ fn mend(bytes: &mut [u8]) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn seeds_of_trained_models_are_sound() {
+        for (bytes, rows) in [(torch(PICKLE), 2), (dynamic3d(), 2), (STAGE.into(), 2)] {
+            assert!(splat4d::open(&bytes).unwrap_or_else(|e| panic!("{e}")).len() >= rows);
+        }
+    }
 
     #[test]
     fn seeds_are_sound() {

@@ -6,7 +6,7 @@ use crate::sequence::newest;
 use crate::source::{Source, dialect_of};
 use splat4d::format::dialect::Opened;
 use splat4d::format::sog::{self, levels};
-use splat4d::format::{Dialect, dialect, gltf, usd, zip};
+use splat4d::format::{Dialect, dialect, dynamic3d, gltf, zip};
 use splat4d::layers::Scene;
 use splat4d::scene::Params;
 use splat4d::{Error, Result};
@@ -25,13 +25,16 @@ const MOST_RATIO: usize = 64;
 
 /// Whether a folder is one of these, and no capture or run.
 pub(crate) fn is_scene(folder: &Path) -> bool {
-    newest(folder).is_some() || folder.join(levels::LEVELS).is_file()
+    newest(folder).is_some() || [levels::LEVELS, dynamic3d::NAME].iter().any(|name| folder.join(name).is_file())
 }
 
 /// Opens a folder of these kinds; none where it is no such folder.
 pub(crate) fn open(folder: &Path, fps: f64) -> Result<Option<Source>> {
     if folder.join(levels::LEVELS).is_file() {
         return streamed(folder).map(Some);
+    }
+    if folder.join(dynamic3d::NAME).is_file() {
+        return Source::open_at(&folder.join(dynamic3d::NAME), fps).map(Some);
     }
     let Some((file, iteration)) = newest(folder) else { return Ok(None) };
     let mut source = Source::open_at(&file, fps)?;
@@ -72,9 +75,9 @@ fn from_uri(uri: &str) -> String {
     String::from_utf8_lossy(&out).into_owned()
 }
 
-/// Opens an archive with one scene in it; none where it is a zipped SOG scene or a .usdz, which are dialects of their own.
+/// Opens an archive with one scene in it; none where the archive itself is of a dialect (SOG, .usdz, checkpoints, .npz).
 pub(crate) fn open_archive(path: &Path, bytes: &[u8]) -> Result<Option<Source>> {
-    if !bytes.starts_with(&zip::MAGIC) || Dialect::of_file("", bytes) == Some(usd::ARCHIVE) {
+    if !bytes.starts_with(&zip::MAGIC) || Dialect::of_file("", bytes).is_some_and(|d| d != sog::DIALECT) {
         return Ok(None);
     }
     let archive = zip::Archive::open(bytes).map_err(|e| e.at(path.display()))?;

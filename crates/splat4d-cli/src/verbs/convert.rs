@@ -550,7 +550,7 @@ mod tests {
         assert_eq!(of("a.spz.glb").unwrap(), Target::Dialect(gltf::COMPRESSED));
         assert_eq!(of("scene.safetensors").unwrap(), Target::Scene);
         assert_eq!([of("a.s4d").unwrap(), of("a.SPLAT4D").unwrap()], [Target::Playback; 2]);
-        for (name, word) in [("a.sog", "not written"), ("a.ksplat", ".ply"), ("a", "ending")] {
+        for (name, word) in [("a.pt", "not written"), ("a.ksplat", ".ply"), ("a", "ending")] {
             assert!(of(name).unwrap_err().to_string().contains(word), "{name}");
         }
     }

@@ -236,7 +236,7 @@ mod tests {
     use super::*;
     use crate::format::kinematic::tests::moving as moving_scene;
     use crate::format::samples::gaussians;
-    use crate::format::{ply, sog, splat, splatv, spz, usd};
+    use crate::format::{checkpoint, dynamic3d, ply, splat, splatv, spz, usd};
     use crate::scene::GEOMETRY;
 
     /// A scene that every dialect can hold.
@@ -247,7 +247,10 @@ mod tests {
     #[test]
     fn every_dialect_is_written_recognised_and_opened() {
         // What is not written needs a file made by hand.
-        let by_hand = [(sog::DIALECT, sog::tests::sample(), 2)];
+        let by_hand = [
+            (dynamic3d::DIALECT, dynamic3d::tests::sample(), 2),
+            (checkpoint::DIALECT, checkpoint::tests::sample(&gaussians(20, 4)), 20),
+        ];
         for dialect in DIALECTS {
             let (scene, mut bytes, mut count) = (sample(dialect.moves), Vec::new(), 20);
             let written = dialect.write(&scene, &WriteOptions::default(), &mut bytes);
@@ -267,7 +270,11 @@ mod tests {
             };
             assert_eq!((rows, opened.scene.up), (count, dialect.up), "{dialect:?}");
             assert_eq!(opened.scene.is_moving(), dialect.moves, "{dialect:?}");
-            assert_eq!(matches!(dialect.writer, Writer::Moving(_)), dialect.moves && dialect.is_written());
+            assert_eq!(
+                matches!(dialect.writer, Writer::Moving(_)),
+                dialect.moves && dialect.is_written(),
+                "{dialect:?}"
+            );
             assert!(opened.ply.is_some() || ![ply::DIALECT, ply::COMPRESSED].contains(dialect), "{dialect:?}");
             for cut in (0..bytes.len()).step_by(1 + bytes.len() / 50) {
                 let _ = dialect.open(&bytes[..cut]);

@@ -76,15 +76,12 @@ const ENDINGS: [(&str, &str, &str); 3] = [
 ];
 
 /// Names of files in archives of other programs, by their ends: what such an archive is, and what to do with it.
-const ARCHIVES: [(&str, &str, &str); 2] = [
-    (
-        ".npy",
-        "a NumPy archive (.npz), not a SOG scene",
-        "Write its Gaussians as a 3DGS .ply; gsplat's export_splats does so. Points, depths and tracks in .npz belong to a \
+const ARCHIVES: [(&str, &str, &str); 1] = [(
+    ".npy",
+    "a NumPy archive (.npz), not a SOG scene",
+    "Write its Gaussians as a 3DGS .ply; gsplat's export_splats does so. Points, depths and tracks in .npz belong to a \
          capture.",
-    ),
-    ("data.pkl", "a checkpoint of PyTorch, which may hold code and is not read", "Export .ply from its program."),
-];
+)];
 
 /// Says what a file is that no reader takes. `name`: the file's, for formats without a mark; may be empty.
 pub fn unread(name: &str, bytes: &[u8]) -> Option<Error> {
@@ -135,7 +132,6 @@ mod tests {
         let names = |names: &[&str]| names.iter().map(|n| (*n).to_owned()).collect::<Vec<_>>();
         let error = archive(&names(&["means3d.npy", "viewmats.npy"])).unwrap().to_string();
         assert!(error.contains(".npz"), "{error}");
-        assert!(archive(&names(&["archive/data.pkl"])).unwrap().to_string().contains("PyTorch"));
         assert!(archive(&names(&["means_l.webp"])).is_none());
     }
 }

@@ -6,9 +6,12 @@
 pub(crate) mod arrays;
 mod base64;
 mod bytes;
+pub mod checkpoint;
 pub mod dialect;
+pub mod dynamic3d;
 mod fade;
 pub mod foreign;
+mod freetime;
 pub mod gltf;
 mod half;
 mod kinematic;
@@ -28,6 +31,7 @@ pub mod sog;
 pub mod splat;
 pub mod splatv;
 pub mod spz;
+mod torch;
 pub mod usd;
 pub(crate) mod warnings;
 pub mod zip;
@@ -46,6 +50,7 @@ pub const DIALECTS: &[Dialect] = &[
     ply::DIALECT,
     ply::COMPRESSED,
     ply::STG,
+    ply::FTGS,
     spz::DIALECT,
     splat::DIALECT,
     splatv::DIALECT,
@@ -55,6 +60,8 @@ pub const DIALECTS: &[Dialect] = &[
     gltf::COMPRESSED,
     usd::TEXT,
     usd::ARCHIVE,
+    dynamic3d::DIALECT,
+    checkpoint::DIALECT,
 ];
 
 /// The scene in a file of any kind that says by its first bytes what it is: `.s4d`, .ply (3DGS, compressed, Spacetime
