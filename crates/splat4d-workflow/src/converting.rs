@@ -11,10 +11,10 @@ use splat4d::bake::Likeness;
 use splat4d::format::dialect::{self, WriteOptions};
 use splat4d::format::mend::from_linear;
 use splat4d::format::{self, DIALECTS, Dialect, Linear, Warnings, playback, spz};
-use splat4d::layers::{self, Scene, rotation_between};
+use splat4d::layers::{self, Constant, Scene, rotation_between};
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
-use splat4d::scene::{Camera, Time};
+use splat4d::scene::{Camera, Params, Time};
 use splat4d::{Error, ErrorKind, Result};
 use std::path::{Path, PathBuf};
 
@@ -41,9 +41,11 @@ pub struct Conversion {
     pub time: Option<f64>,
     /// One file per frame.
     pub frames: bool,
+    /// The same Gaussians in the same order in every file of `frames`, with opacity 0 outside their lifespans.
+    pub constant: bool,
     /// Replace a sequence that splat4d wrote to the folder.
     pub force: bool,
-    /// Frames per second of a sequence that is read, or of `frames`.
+    /// Frames per second of a sequence that is read, of `frames` or of USD.
     pub fps: Option<f64>,
     /// First second of `frames`.
     pub from: Option<f64>,
@@ -96,7 +98,7 @@ impl Target {
         let (what, remedy) = match name.rsplit_once('.').map(|n| n.1) {
             Some("safetensors") => return Ok(Self::Scene),
             Some(playback::EXTENSION | playback::OLD_EXTENSION) => return Ok(Self::Playback),
-            Some("ksplat" | "glb" | "4dgs") => ("this format is not written", "Write .ply or .spz.".into()),
+            Some("ksplat" | "4dgs" | "usdc" | "usd") => ("this format is not written", "Write .ply or .spz.".into()),
             _ => {
                 ("has no ending that names a format", format!("Use {} .safetensors .s4d.", written(|_| true).join(" ")))
             }
@@ -128,6 +130,7 @@ impl Conversion {
             output: output.into(),
             time: None,
             frames: false,
+            constant: false,
             force: false,
             fps: None,
             from: None,
@@ -212,6 +215,9 @@ pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> R
     let compared: Vec<(f64, Camera)> = compared.into_iter().map(|(t, c)| (t, rotated(c, &rotation))).collect();
     if target == Target::Playback {
         return bake(source, args, rotation != IDENTITY, console);
+    }
+    if let (Some(fps), Target::Dialect(_), false) = (args.fps, target, args.frames) {
+        source.scene.fps = fps;
     }
     let scene = &source.scene;
     let options = WriteOptions {
@@ -344,12 +350,17 @@ fn write_frames(
     console: &dyn Listener,
 ) -> Result<()> {
     let (fps, times) = sequence::moments(scene, args.fps, [args.from, args.to])?;
+    let mut constant = args.constant.then(|| Constant::new(scene, times.clone())).transpose()?;
     let read = sequence::Read { path: &args.input, run };
     let owned = sequence::take(&[pattern], times.len(), &read, "convert", args.force)?;
     let mut total = 0;
     for (i, &time) in times.iter().enumerate() {
-        let (bytes, warnings) =
-            writer.bytes(&one_moment(scene, time)?).map_err(|e| e.at(format_args!("the frame at {time} s")))?;
+        let params = match &mut constant {
+            Some(frames) => frames.frame(i).clone(),
+            None => layers::moment(scene, Time(time))?,
+        };
+        let place = |e: Error| e.at(format_args!("the frame at {time} s"));
+        let (bytes, warnings) = writer.bytes(&standing(scene, params)).map_err(place)?;
         if i == 0 {
             warnings.lines().iter().for_each(|w| console.warn(&format!("{FIRST}: {w}.")));
         }
@@ -360,8 +371,9 @@ fn write_frames(
     owned.finished();
     console.clear();
     console.say(&format!(
-        "{} files, {fps} per second, from {} to {} s, {} in total",
+        "{} files{}, {fps} per second, from {} to {} s, {} in total",
         times.len(),
+        constant.as_ref().map(|c| format!(" of {} Gaussians each", grouped(c.len()))).unwrap_or_default(),
         times[0],
         times[times.len() - 1],
         human_bytes(total as u64)
@@ -411,8 +423,12 @@ fn rotated(camera: Camera, r: &[[f64; 3]; 3]) -> Camera {
 
 /// A scene that stands still as `scene` does at `time`.
 fn one_moment(scene: &Scene<f32>, time: f64) -> Result<Scene<f32>> {
-    let still = dialect::still(layers::moment(scene, Time(time))?);
-    Ok(Scene { up: scene.up, offset: scene.offset, background: scene.background, ..still })
+    layers::moment(scene, Time(time)).map(|params| standing(scene, params))
+}
+
+/// Static Gaussians in the world of `scene`.
+fn standing(scene: &Scene<f32>, params: Params) -> Scene<f32> {
+    Scene { up: scene.up, offset: scene.offset, background: scene.background, ..dialect::still(params) }
 }
 
 /// Writes one file of a kind.
@@ -443,7 +459,7 @@ impl Writer {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use splat4d::format::{ply, splat, splatv};
+    use splat4d::format::{gltf, ply, splat, splatv};
 
     #[test]
     fn formats_are_known_by_their_endings() {
@@ -453,9 +469,11 @@ mod tests {
         assert_eq!(of("a.stg.ply").unwrap(), Target::Dialect(ply::STG));
         assert_eq!(of("x/a.splatv").unwrap(), Target::Dialect(splatv::DIALECT));
         assert_eq!(of("a.splat").unwrap(), Target::Dialect(splat::DIALECT));
+        assert_eq!(of("a.glb").unwrap(), Target::Dialect(gltf::DIALECT));
+        assert_eq!(of("a.spz.glb").unwrap(), Target::Dialect(gltf::COMPRESSED));
         assert_eq!(of("scene.safetensors").unwrap(), Target::Scene);
         assert_eq!([of("a.s4d").unwrap(), of("a.SPLAT4D").unwrap()], [Target::Playback; 2]);
-        for (name, word) in [("a.sog", "not written"), ("a.glb", ".ply"), ("a", "ending")] {
+        for (name, word) in [("a.pt", "not written"), ("a.ksplat", ".ply"), ("a", "ending")] {
             assert!(of(name).unwrap_err().to_string().contains(word), "{name}");
         }
     }

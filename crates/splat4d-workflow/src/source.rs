@@ -105,7 +105,7 @@ impl Source {
         }
         let name = path.file_name().map(|n| n.to_string_lossy()).unwrap_or_default();
         let opened = match dialect_of(path, &bytes) {
-            Some(kind) => kind.open(&bytes).map(|o| Self {
+            Some(kind) => bundle::open_file(kind, path, &bytes).map(|o| Self {
                 ply: o.ply,
                 dialect: Some(kind),
                 warnings: o.warnings,

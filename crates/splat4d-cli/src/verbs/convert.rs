@@ -15,6 +15,8 @@ Examples:
   splat4d convert runs/knight knight.splatv           dynamic: splaTV and gsplat.js play it
   splat4d convert runs/knight now.spz --time 0.5      one time
   splat4d convert runs/knight 'frames/f_%04d.spz' --frames
+  splat4d convert runs/knight 'frames/f_%04d.ply' --frames --constant     for interpolation and motion blur
+  splat4d convert runs/knight knight.usdz             USD with time samples
   splat4d convert frames/ all.safetensors --fps 25    numbered files become one dynamic scene
   splat4d convert runs/field field.ply --world        positions in the capture's map
   splat4d convert lengths.ply scene.ply --linear scales --linear opacities";
@@ -46,10 +48,13 @@ pub(crate) struct Args {
     /// One file per frame
     #[arg(long)]
     frames: bool,
+    /// Write the same Gaussians in the same order to every file of --frames, with opacity 0 outside their lifespans
+    #[arg(long, requires = "frames")]
+    constant: bool,
     /// Replace a sequence that splat4d wrote to the folder, even a longer one
     #[arg(long, requires = "frames")]
     force: bool,
-    /// Frames per second of a sequence that is read (30), or of --frames (the scene's)
+    /// Frames per second of a sequence that is read (30), of --frames or of USD (the scene's)
     #[arg(long, value_name = "N")]
     fps: Option<f64>,
     /// First second of --frames
@@ -135,6 +140,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         output: args.output.clone(),
         time: args.time,
         frames: args.frames,
+        constant: args.constant,
         force: args.force,
         fps: args.fps,
         from: args.from,

@@ -1,14 +1,17 @@
-//! Scenes of other programs that are more than one file: output folders of 3DGS, archives with one scene, streamed SOG.
+//! Scenes of other programs that are more than one file: output folders of 3DGS, archives with one scene, streamed SOG,
+//! glTF with its numbers in other files.
 
 use crate::files;
 use crate::sequence::newest;
 use crate::source::{Source, dialect_of};
+use splat4d::format::dialect::Opened;
 use splat4d::format::sog::{self, levels};
-use splat4d::format::{dialect, zip};
+use splat4d::format::{Dialect, dialect, dynamic3d, gltf, zip};
 use splat4d::layers::Scene;
 use splat4d::scene::Params;
 use splat4d::{Error, Result};
 use std::borrow::Cow;
+use std::collections::BTreeMap;
 use std::path::{Component, Path, PathBuf};
 
 /// Files next to them without which they are not the scene: networks that move Gaussians (Deformable 3DGS,
@@ -22,13 +25,16 @@ const MOST_RATIO: usize = 64;
 
 /// Whether a folder is one of these, and no capture or run.
 pub fn is_scene(folder: &Path) -> bool {
-    newest(folder).is_some() || folder.join(levels::LEVELS).is_file()
+    newest(folder).is_some() || [levels::LEVELS, dynamic3d::NAME].iter().any(|name| folder.join(name).is_file())
 }
 
 /// Opens a folder of these kinds; none where it is no such folder.
 pub(crate) fn open(folder: &Path, fps: f64) -> Result<Option<Source>> {
     if folder.join(levels::LEVELS).is_file() {
         return streamed(folder).map(Some);
+    }
+    if folder.join(dynamic3d::NAME).is_file() {
+        return Source::open_at(&folder.join(dynamic3d::NAME), fps).map(Some);
     }
     let Some((file, iteration)) = newest(folder) else { return Ok(None) };
     let mut source = Source::open_at(&file, fps)?;
@@ -45,9 +51,33 @@ pub(crate) fn open(folder: &Path, fps: f64) -> Result<Option<Source>> {
     Ok(Some(source))
 }
 
-/// Opens an archive with one scene in it; none where it is a zipped SOG scene, which is a dialect of its own.
+/// Opens a file of a dialect, with the files next to it that a .gltf names.
+pub(crate) fn open_file(kind: Dialect, path: &Path, bytes: &[u8]) -> Result<Opened> {
+    if kind != gltf::TEXT {
+        return kind.open(bytes);
+    }
+    let mut buffers = BTreeMap::new();
+    for uri in gltf::buffers_of(bytes)? {
+        let file = within(path, &from_uri(&uri))?;
+        buffers.insert(uri, files::read(&file)?);
+    }
+    gltf::read_text(bytes, &buffers).map(|opened| kind.finish(opened))
+}
+
+/// A file's name of a relative URI, whose percent codes are bytes of UTF-8 (RFC 3986).
+fn from_uri(uri: &str) -> String {
+    let (bytes, mut out, mut i) = (uri.as_bytes(), Vec::with_capacity(uri.len()), 0);
+    while i < bytes.len() {
+        let code = uri.get(i + 1..i + 3).filter(|_| bytes[i] == b'%').and_then(|h| u8::from_str_radix(h, 16).ok());
+        out.push(code.unwrap_or(bytes[i]));
+        i += if code.is_some() { 3 } else { 1 };
+    }
+    String::from_utf8_lossy(&out).into_owned()
+}
+
+/// Opens an archive with one scene in it; none where the archive itself is of a dialect (SOG, .usdz, checkpoints, .npz).
 pub(crate) fn open_archive(path: &Path, bytes: &[u8]) -> Result<Option<Source>> {
-    if !bytes.starts_with(&zip::MAGIC) {
+    if !bytes.starts_with(&zip::MAGIC) || Dialect::of_file("", bytes).is_some_and(|d| d != sog::DIALECT) {
         return Ok(None);
     }
     let archive = zip::Archive::open(bytes).map_err(|e| e.at(path.display()))?;
@@ -173,6 +203,26 @@ mod tests {
         put(at, "point_cloud/iteration_30000/deformation.pth", b"");
         let said = Source::open(at).unwrap().warnings;
         assert!(said.lines().iter().any(|w| w.contains("deformation.pth")), "{said:?}");
+    }
+
+    #[test]
+    fn a_gltf_is_read_with_the_file_of_its_numbers() {
+        let dir = tempfile::tempdir().unwrap();
+        let (mut glb, at) = (Vec::new(), dir.path());
+        let mut params = Params::new(3, 1, &[]);
+        (0..3).for_each(|row| params[splat4d::scene::GEOMETRY].set(row, 3, 1.0));
+        gltf::DIALECT.write(&dialect::still(params), &dialect::WriteOptions::default(), &mut glb).unwrap();
+        let length = u32::from_le_bytes(glb[12..16].try_into().unwrap()) as usize;
+        let mut json: serde_json::Value = serde_json::from_slice(&glb[20..20 + length]).unwrap();
+        put(at, "my scene.bin", &glb[28 + length..]);
+        for (uri, says) in [("my%20scene.bin", ""), ("../my%20scene.bin", "outside"), ("none.bin", "none.bin")] {
+            json["buffers"][0]["uri"] = uri.into();
+            put(at, "scene.gltf", json.to_string().as_bytes());
+            match Source::open(&at.join("scene.gltf")) {
+                Ok(source) => assert_eq!((source.scene.len(), says), (3, "")),
+                Err(e) => assert!(!says.is_empty() && e.to_string().contains(says), "{uri}: {e}"),
+            }
+        }
     }
 
     #[test]
