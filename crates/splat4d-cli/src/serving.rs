@@ -1,10 +1,10 @@
 //! The player's server as verbs use it: options, what is said about it, the browser, and a run that is being watched.
 
 use crate::console::Console;
-use crate::playable;
 use serde_json::json;
 use splat4d_serve::{Config, News, Running, Server};
 use splat4d_train::event::Event;
+use splat4d_workflow::playable;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -161,7 +161,7 @@ impl Watch {
     /// Shows a finished run's playback file, where there is one.
     pub(crate) fn show(&self, run: &Path, iteration: usize) {
         let Some(running) = &self.running else { return };
-        if let Ok(bytes) = crate::files::read(&playable::of_run(run)) {
+        if let Ok(bytes) = splat4d_workflow::files::read(&playable::of_run(run)) {
             running.set_scene(bytes.into(), &json!({ "iteration": iteration }));
         }
     }

@@ -1,15 +1,15 @@
 //! `view`: a scene in the browser's player.
 
-use crate::baking::title;
 use crate::console::Console;
-use crate::editor::{self, Editor};
 use crate::interrupt;
-use crate::playable::Playable;
 use crate::serving::{self, Place};
-use crate::source::{Source, not_empty};
 use serde_json::json;
 use splat4d::Error;
 use splat4d_serve::{Config, Content, Editing};
+use splat4d_workflow::baking::title;
+use splat4d_workflow::editor::{self, Editor};
+use splat4d_workflow::playable::Playable;
+use splat4d_workflow::source::{Source, not_empty};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
