@@ -34,6 +34,9 @@ pub const DIALECT: Dialect = Dialect {
 pub const NAME: &str = "params.npz";
 /// Arrays by which it is known.
 const KNOWN: [&str; 2] = ["means3D.npy", "unnorm_rotations.npy"];
+/// Longest array that is inflated: bytes, and times its packed bytes. Numbers of Gaussians shrink by less than 20:1.
+const MOST_SMALL: usize = 1 << 20;
+const MOST_RATIO: usize = 64;
 /// Change of a colour that counts.
 const VISIBLE: f32 = 1.0 / 255.0;
 
@@ -44,8 +47,12 @@ fn is_dynamic3d(bytes: &[u8]) -> bool {
 
 fn read(bytes: &[u8]) -> Result<(Scene<f32>, Warnings)> {
     let mut warnings = Warnings::default();
+    let archive = zip::Archive::open(bytes)?;
     let array = |name: &str, shape: &[Option<usize>]| -> Result<Npy> {
-        let array = Npy::read_member(bytes, name).map_err(|e| e.at(name))?;
+        let file = format!("{name}.npy");
+        let most = MOST_SMALL + MOST_RATIO * archive.packed(&file).unwrap_or(0);
+        let missing = || Error::input(format!("the archive has no array `{name}`")).remedy("Save it again.");
+        let array = Npy::read(&archive.file(&file, most).ok_or_else(missing)??).map_err(|e| e.at(name))?;
         let fits =
             array.shape.len() == shape.len() && array.shape.iter().zip(shape).all(|(a, b)| b.is_none_or(|b| b == *a));
         if fits { Ok(array) } else { Err(wrong(name, &array.shape)) }

@@ -16,9 +16,7 @@ use std::collections::HashMap;
 const PICKLE: &str = "data.pkl";
 /// Longest pickle that is read: names and shapes alone; a network of a million tensors has less.
 const MOST_PICKLE: usize = 64 << 20;
-/// Longest storage that is read, bytes.
-const MOST_STORAGE: usize = u32::MAX as usize;
-/// Most numbers of a tensor for each number of its storage, beyond a view of a few rows.
+/// Most axes of a tensor that is believed.
 const MOST_AXES: usize = 16;
 
 /// What a pickle may call. All of them make plain data.
@@ -175,7 +173,9 @@ impl<'a> Torch<'a> {
     /// The numbers of a tensor, row-major. Errors: it lies outside its storage, which is missing or too short.
     pub(super) fn numbers(&self, tensor: &Tensor) -> Result<Vec<f32>> {
         let name = format!("{}data/{}", self.folder, tensor.key);
-        let file = self.archive.file(&name, MOST_STORAGE).ok_or_else(|| damaged(format!("{name} is missing")))?;
+        // Storages are stored as they are: a small file cannot become a large one.
+        let most = self.archive.packed(&name).unwrap_or(0);
+        let file = self.archive.file(&name, most).ok_or_else(|| damaged(format!("{name} is missing")))?;
         let (bytes, size) = (file?, tensor.kind.size());
         let have = bytes.len() / size;
         let outside = || damaged(format!("a tensor of shape {:?} lies outside {name}", tensor.shape));

@@ -54,8 +54,6 @@ const LAYER: &str = "scene.usda";
 const LAYERS: [&str; 3] = [".usda", ".usdc", ".usd"];
 /// Files of an archive begin at multiples of this (usdz specification, "Layout").
 const ALIGN: usize = 64;
-/// Longest layer that is taken from an archive, which stores it as it is.
-const MOST: usize = u32::MAX as usize;
 
 /// The schema of Gaussians.
 const FIELD: &str = "ParticleField3DGaussianSplat";
@@ -79,7 +77,9 @@ fn is_archive(bytes: &[u8]) -> bool {
 fn read_archive(bytes: &[u8]) -> Result<Opened> {
     let archive = zip::Archive::open(bytes)?;
     let name = archive.first().ok_or_else(|| damaged("the archive is empty"))?.to_owned();
-    let layer = archive.file(&name, MOST).expect("it is one of the names")?;
+    // An archive of USD stores its files as they are.
+    let most = archive.packed(&name).unwrap_or(0);
+    let layer = archive.file(&name, most).expect("it is one of the names")?;
     if layer.starts_with(BINARY) {
         return Err(binary().at(&name));
     }

@@ -71,7 +71,13 @@ const BY_HAND: &str = r#"#usda 1.0
     metersPerUnit = 0.01
     upAxis = "Z"
 )
-class "_base" { def ParticleField3DGaussianSplat "no" { point3f[] positions = [(9, 9, 9)] } }
+class "_base"
+{
+    def ParticleField3DGaussianSplat "no"
+    {
+        point3f[] positions = [(9, 9, 9)]
+    }
+}
 over "nothing" { }
 def Xform "world" (
     prepend apiSchemas = ["A", "B"]   # two
@@ -88,7 +94,9 @@ def Xform "world" (
 lines } "quoted" """
     reorder nameChildren = ["b", "a"]
     variantSet "lod" = {
-        "fine" { def Mesh "m" { int[] i = [1] } }
+        "fine" {
+            def Mesh "m" { int[] i = [1]; }
+        }
     }
     def "group" (active = true) {
         def ParticleField3DGaussianSplat "gaussians" (
@@ -108,7 +116,7 @@ lines } "quoted" """
             token outputs:x.connect = </world/y.z>
             token purpose = "default"
         }
-        def ParticleField3DGaussianSplat "hidden" ( active = false ) { point3f[] positions = [(9, 9, 9)] }
+        def ParticleField3DGaussianSplat "hidden" ( active = false ) { point3f[] positions = [(9, 9, 9)]; }
     }
 }
 "#;

@@ -175,7 +175,7 @@ impl Text<'_> {
         if codes.len() == 1 {
             self.put(&format!("{head} = ["))?;
             self.rows(array, frames.frame(0))?;
-            self.put("]\n")?;
+            self.put("]")?;
         } else {
             self.put(&format!("{head}.timeSamples = {{\n"))?;
             for (i, code) in codes.iter().enumerate() {
@@ -183,9 +183,12 @@ impl Text<'_> {
                 self.rows(array, frames.frame(i))?;
                 self.put("],\n")?;
             }
-            self.put("        }\n")?;
+            self.put("        }")?;
         }
-        Ok(())
+        // As NVIDIA's converter states it, so that programs need not derive it from the degree.
+        let each = frames.frame(0)[SH].width() / 3;
+        let note = format!(" (\n            elementSize = {each}\n            interpolation = \"vertex\"\n        )\n");
+        self.put(if array.name == COEFFICIENTS { &note } else { "\n" })
     }
 
     fn rows(&mut self, array: &Array, params: &Params) -> Result<()> {
