@@ -322,3 +322,26 @@ fn shares(k: f64) -> [(isize, f64); 2] {
     let low = k.floor();
     [(low as isize, 1.0 - (k - low)), (low as isize + 1, k - low)]
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use splat4d::math::Rng;
+
+    #[test]
+    fn a_limit_leaves_out_the_weakest_and_changes_none() {
+        let mut grey = Planes::<f32>::new(1, 60, 80);
+        let rng = Rng::new(1, "noise", 0);
+        grey.data.iter_mut().enumerate().for_each(|(i, v)| *v = rng.uniform(i as u64) as f32);
+        let grey = blurred(&grey, 1.5);
+        let of = |most: usize| {
+            let found = find(&grey, Limits { contrast: 0.002, most }, &|_, _| true);
+            found.into_iter().map(|f| (f.pixel, f.contrast, f.descriptor)).collect::<Vec<_>>()
+        };
+        let all = of(usize::MAX);
+        assert!(all.len() > 100, "{}", all.len());
+        for most in [1, 7, 50, all.len() - 1] {
+            assert!(of(most) == all[..most], "{most}");
+        }
+    }
+}

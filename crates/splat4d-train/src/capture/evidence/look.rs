@@ -24,6 +24,8 @@ pub(super) const COARSE: Detail = Detail { side: 320, features: 350 };
 pub(super) const FINE: Detail = Detail { side: 640, features: 800 };
 /// Least contrast of a feature, as structure from motion takes it.
 const CONTRAST: f64 = 0.004;
+/// Weight of a mask or alpha from which a pixel shows something.
+const SHOWN: f32 = 0.5;
 /// Foreground below this share of an image, or above the other, says nothing of a place.
 const FOREGROUND: [f64; 2] = [0.001, 0.6];
 
@@ -197,12 +199,15 @@ impl Look {
         camera
     }
 
-    /// The colour at which a point of the world is seen from `pose` by this camera of the file; `None`: outside.
+    /// The colour at which a point of the world is seen from `pose` by this camera of the file; `None`: outside, or
+    /// hidden by its mask or alpha.
     pub(super) fn color_of(&self, camera: &Camera, pose: &Se3, point: [f64; 3]) -> Option<[f32; 3]> {
         let [u, v] = pixel_of(camera, &self.lens, pose, point)?;
         let (x, y) = (u as usize / self.factor, v as usize / self.factor);
         let inside = x < self.color.width && y < self.color.height;
-        inside.then(|| std::array::from_fn(|c| self.color.get(c, y, x)))
+        // Points of what was cut out have the colours of another image.
+        let shown = |s: &Shown| s.weights[y * self.color.width + x] >= SHOWN;
+        (inside && self.shown.as_ref().is_none_or(shown)).then(|| std::array::from_fn(|c| self.color.get(c, y, x)))
     }
 }
 

@@ -31,6 +31,8 @@ const ALONE: f64 = 10.0;
 /// By how much another convention's colours fit better at least, where points in images already say so; else alone.
 pub(super) const BETTER: f64 = 0.05;
 const COLOURS_ALONE: f64 = 0.15;
+/// Sum of the differences of three channels below which colours are one.
+const ONE_COLOUR: f64 = 0.02;
 /// Colours that are compared at least.
 const ENOUGH: usize = 60;
 
@@ -345,6 +347,11 @@ fn gain(capture: &Capture, chosen: &[usize], looks: &[Look], poses: &[Se3], time
     let cloud = capture.points.as_ref()?;
     let apart = |a: &[f32; 3], b: &[f32; 3]| a.iter().zip(b).map(|(x, y)| f64::from((x - y).abs())).sum::<f64>();
     let (mut own, mut other, mut count) = (0.0, 0.0, 0);
+    // Points of one colour, such as those that have none, say nothing.
+    let first = chosen.first().map(|&p| cloud.colors[p])?;
+    if chosen.iter().all(|&p| apart(&cloud.colors[p], &first) < ONE_COLOUR) {
+        return None;
+    }
     for (look, pose) in looks.iter().zip(poses) {
         let camera = look.zoomed(times);
         let there = |p: usize| look.color_of(&camera, pose, cloud.points[p]);
