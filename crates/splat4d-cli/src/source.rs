@@ -119,8 +119,13 @@ impl Source {
         opened.map_err(|e| e.at(path.display()))
     }
 
-    /// Leaves out Gaussians whose numbers are not finite: files of other programs have such, and no writer takes them.
+    /// Leaves out Gaussians whose numbers are not finite: files of other programs have such, and no writer takes them. Says
+    /// what else of a .ply is lost: times and velocities of a moving scene, for instance.
     pub(crate) fn finite(mut self) -> Self {
+        let unread = self.ply.as_ref().map_or(&[][..], |ply| &ply.extra_properties);
+        if !unread.is_empty() {
+            self.warnings.say(format!("properties of the .ply that are not read: {}", unread.join(", ")));
+        }
         let all = self.scene.len();
         let dropped = self.scene.drop_non_finite();
         self.warnings.counted(dropped, all, "contain NaN or infinity and were left out");
@@ -283,6 +288,18 @@ mod tests {
             let error = Source::open(folder.path()).err().map(|e| e.to_string()).unwrap_or_default();
             assert!(error.contains("outside its folder"), "{name}: {error}");
         }
+    }
+
+    #[test]
+    fn times_of_another_programs_ply_are_not_lost_without_a_word() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("4d.ply");
+        let names = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3 t scale_t";
+        let header: String = names.split(' ').map(|name| format!("property float {name}\n")).collect();
+        let row = "0 0 4 0 0 0 1 -3 -3 -3 1 0 0 0 0.5 -1\n";
+        std::fs::write(&file, format!("ply\nformat ascii 1.0\nelement vertex 1\n{header}end_header\n{row}")).unwrap();
+        let said = Source::open(&file).unwrap().finite().warnings.lines().join("\n");
+        assert!(said.contains("not read: t, scale_t"), "{said}");
     }
 
     #[test]
