@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// Processor time from which a call hangs: undisturbed ones take up to three seconds (studies/records/2026-11-27-reliability.md). Time
+/// Processor time from which a call hangs: undisturbed ones take below two seconds (studies/records/2026-11-27-reliability.md). Time
 /// on the clock says nothing on a machine that is shared.
 const BUSY: f64 = 60.0;
 /// A call that waits so long without using a processor hangs.
