@@ -24,6 +24,8 @@ const GAUSSIANS_PER_ENTRY: usize = 8;
 /// Rounds of k-means: of the palette, and of a codebook, whose numbers are sorted and cheap.
 const ROUNDS: usize = 8;
 const BOOK_ROUNDS: usize = 40;
+/// Bins of the histogram from which a codebook begins.
+const BINS: usize = 4096;
 /// Half of the codes of a part of a quaternion.
 const HALF: f32 = 127.5;
 
@@ -122,7 +124,8 @@ struct Book {
 }
 
 impl Book {
-    /// 256 numbers with a small sum of squared distances to `all`: quantiles, then Lloyd's algorithm on sorted numbers.
+    /// 256 numbers with a small sum of squared distances to `all`: as dense as the cube root of their density, which is optimal for
+    /// many (Panter and Dite 1951), then Lloyd's algorithm on sorted numbers.
     fn of(all: impl Iterator<Item = f32>) -> Self {
         let mut sorted: Vec<f32> = all.collect();
         sorted.sort_by(f32::total_cmp);
@@ -130,9 +133,7 @@ impl Book {
         let mut sums = Vec::with_capacity(n + 1);
         sums.push(0.0f64);
         sorted.iter().for_each(|x| sums.push(sums[sums.len() - 1] + f64::from(*x)));
-        let mut values: Vec<f32> = (0..CODES).map(|i| sorted[(2 * i + 1) * n / (2 * CODES)]).collect();
-        // Density to the power ⅓ is the optimum, quantiles are density itself: the ends need help to be reached.
-        (values[0], values[CODES - 1]) = (sorted[0], sorted[n - 1]);
+        let mut values = spread(&sorted);
         for _ in 0..BOOK_ROUNDS {
             let mut first = 0;
             for i in 0..CODES {
@@ -155,6 +156,29 @@ impl Book {
         let nearer = (x - self.values[before]).abs() <= (self.values[after] - x).abs();
         (if nearer { before } else { after }) as u8
     }
+}
+
+/// 256 rising numbers over the range of sorted ones, as dense as the cube root of their density.
+fn spread(sorted: &[f32]) -> Vec<f32> {
+    let (low, high) = (f64::from(sorted[0]), f64::from(sorted[sorted.len() - 1]));
+    let width = (high - low) / BINS as f64;
+    let mut counts = [0.0f64; BINS];
+    for x in sorted {
+        counts[(((f64::from(*x) - low) / width.max(f64::MIN_POSITIVE)) as usize).min(BINS - 1)] += 1.0;
+    }
+    let mass = counts.map(f64::cbrt);
+    let step = mass.iter().sum::<f64>() / CODES as f64;
+    let (mut bin, mut before) = (0, 0.0);
+    let place = |i: usize| {
+        let wanted = (i as f64 + 0.5) * step;
+        while bin < BINS - 1 && before + mass[bin] < wanted {
+            before += mass[bin];
+            bin += 1;
+        }
+        let share = ((wanted - before) / mass[bin].max(f64::MIN_POSITIVE)).clamp(0.0, 1.0);
+        (low + (bin as f64 + share) * width) as f32
+    };
+    (0..CODES).map(place).collect()
 }
 
 /// The colours above degree 0: an image of entries, one of labels, and what `meta.json` says of them.

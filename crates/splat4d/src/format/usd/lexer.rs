@@ -262,7 +262,7 @@ impl<'a> Lexer<'a> {
         }
     }
 
-    /// Time samples: code and value, which `keep` gets in turn. Codes that are no numbers are an error.
+    /// Time samples: code and value, which `keep` gets in turn. Codes that are not numbers are an error.
     pub(super) fn samples(&mut self, mut keep: impl FnMut(f64, Value)) -> Result<()> {
         self.space();
         self.expect(b'{')?;

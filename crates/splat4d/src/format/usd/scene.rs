@@ -20,6 +20,8 @@ use std::sync::Arc;
 
 /// Up in stages with z up.
 const Z_UP: [f64; 3] = [0.0, 0.0, 1.0];
+/// A segment begins this share of a frame before its time sample, so that rounding of times does not choose the one before.
+const EARLY: f64 = 1e-6;
 /// Most time samples of a field.
 const MOST_TIMES: usize = 100_000;
 /// Gaussians that samples may become in any case; more only with as many numbers in the file.
@@ -264,8 +266,10 @@ impl<'a> Field<'a> {
             rates.write(to, 0, std::array::from_fn::<f32, 4, _>(|k| ((sign * p[k] - q[k]) / seconds) as f32));
         }
         let mut layer = Layer::new(format!("segment {i}"), params, Arc::new(motion), kind);
-        let from = if i == 0 { f64::NEG_INFINITY } else { origin };
-        layer.span = [from, self.times.get(i + 1).copied().unwrap_or(f64::INFINITY)];
+        // A frame's time is computed in several ways; all of them are within the segment that begins there.
+        let start = |i: usize| self.times[i] - EARLY * (self.times[i] - self.times[i - 1]);
+        let from = if i == 0 { f64::NEG_INFINITY } else { start(i) };
+        layer.span = [from, if i + 1 < self.times.len() { start(i + 1) } else { f64::INFINITY }];
         Ok(layer)
     }
 }
