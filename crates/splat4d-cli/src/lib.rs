@@ -19,7 +19,7 @@
 //! | `comparing.rs` | runs and results of other programs, for `compare` |
 //! | `report/`, `report/compress/` | `report.html`, drawn without a library |
 //! | `film.rs` | the playback file of a long capture, which grows during training |
-//! | `labelling.rs`, `chunked.rs`, `compressing.rs`, `predicting.rs`, `predicting/`, `editing.rs`, `editor.rs` | the work of `label`, `train --chunk` and `join`, `compress`, `predict`, `edit`, `view --edit` |
+//! | `labelling.rs`, `chunked.rs`, `compressing.rs`, `predicting.rs`, `predicting/`, `editing.rs`, `picking.rs`, `editor.rs` | the work of `label`, `train --chunk` and `join`, `compress`, `predict`, `edit`, `view --edit` |
 //! | `verbs/`, `verbs/info/` | one file per command |
 //! | `verbs/bench/` | pinned scenes, stages, training steps, growth, GPU stages, other programs (`studies/beside/with_gsplat.py`); each time with its lower bound |
 //! | `bin/` | `s4d`, the command's second name: a launcher |
@@ -29,6 +29,7 @@
 mod asked;
 mod baking;
 mod camera_file;
+mod capture_page;
 mod chunked;
 mod comparing;
 mod compressing;
@@ -45,6 +46,7 @@ pub mod interrupt;
 mod labelling;
 pub mod measure;
 pub mod paths;
+mod picking;
 mod playable;
 mod predicting;
 mod raw;
@@ -123,6 +125,9 @@ pub struct Globals {
     /// Print only warnings and errors
     #[arg(short, long, global = true)]
     quiet: bool,
+    /// Begin every line of progress, warnings and errors with the time (UTC); with --json every object has `time`
+    #[arg(long, global = true)]
+    log_time: bool,
     /// Number of threads [default: all cores]; the result does not depend on it
     #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     threads: Option<u16>,
@@ -204,7 +209,7 @@ pub fn call(words: &[OsString]) -> anyhow::Result<Vec<serde_json::Value>> {
     Ok(console.into_objects())
 }
 
-/// Parses the arguments of a program with the command's manners, does what `work` makes of them, and tells errors.
+/// Parses the arguments of a program with the command's manners, does what `work` makes of them, and prints errors.
 pub fn parsed<C, W>(work: impl FnOnce(C) -> (Globals, W)) -> ExitCode
 where
     C: Parser,
@@ -236,6 +241,9 @@ where
         (_, true) => Loudness::Verbose,
         _ => Loudness::Normal,
     };
+    if globals.log_time {
+        console::log_time();
+    }
     let console = Console::new(loudness, globals.json);
     match threads(globals.threads).and_then(|()| work(&console)) {
         Ok(()) => DONE,

@@ -9,6 +9,7 @@ pub(crate) mod doctor;
 mod pictures;
 pub(crate) mod predict;
 mod refined;
+mod rig_map;
 
 use crate::files::{self, grouped, human_bytes, human_seconds};
 use crate::run_folder::{Beside, Metrics, Run, ViewScore, beside};

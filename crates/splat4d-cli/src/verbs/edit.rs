@@ -11,7 +11,7 @@ use splat4d::edit::{Context, Edits, Expr, Step, count, replay};
 use splat4d::{Error, Result};
 use std::path::{Path, PathBuf};
 
-/// Moments of the clip for which --count tells how many can be seen.
+/// Moments of the clip for which --count prints how many are visible.
 const MOMENTS: usize = 5;
 
 const EXAMPLES: &str = "\

@@ -82,6 +82,21 @@ pub struct CameraReport {
     pub picture: Rgb8,
 }
 
+impl CameraReport {
+    /// Limits of one of its numbers, by the name of its field: beyond the first is a warning, beyond the second bad. Of
+    /// sharpness and focus, below.
+    pub fn limits(field: &str) -> Option<[f64; 2]> {
+        Some(match field {
+            "epipolar" => between::EPIPOLAR,
+            "exposure" => between::EXPOSURE,
+            "sharpness" | "focus" => finding::SHARPNESS,
+            "moved" => alone::MOVED,
+            "shutter" => clocks::SHUTTER,
+            _ => return None,
+        })
+    }
+}
+
 /// What two cameras say of each other.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct PairReport {
@@ -136,7 +151,7 @@ pub struct Options {
     pub features: usize,
     /// Corners of a camera that are followed.
     pub tracks: usize,
-    /// Bytes of memory that training may take; none: all that the machine has, where it tells.
+    /// Bytes of memory that training may take; none: all that the machine has, where it reports that.
     pub memory: Option<u64>,
 }
 

@@ -1,4 +1,4 @@
-//! What was measured: rows, and the three forms in which they are told.
+//! What was measured: rows, and the three forms in which they are printed.
 
 use crate::files::{self, grouped, human_bytes};
 use serde::{Deserialize, Serialize};
