@@ -5,6 +5,7 @@ use super::{STYLE, pictures, rig_map};
 use crate::console::Console;
 use crate::files;
 use image::RgbImage;
+use splat4d::scene::Camera;
 use splat4d_import::doctor::{CameraReport, Finding, Grade, Options, Report, examine};
 use splat4d_train::capture::Capture;
 use splat4d_train::event::{Event, Progress};
@@ -18,7 +19,7 @@ pub(crate) fn made(capture: &Capture, folder: &Path, console: &Console) -> anyho
     console.clear();
     files::make_folder(folder)?;
     let html = folder.join("doctor.html");
-    files::write(&html, page(&report, &rig_map::svg(capture, &|name| worst(&report, name))).as_bytes())?;
+    files::write(&html, page(&report, capture).as_bytes())?;
     files::write(&folder.join("doctor.json"), &serde_json::to_vec_pretty(&report)?)?;
     Ok((report, html))
 }
@@ -35,20 +36,30 @@ fn worst(report: &Report, camera: &str) -> Option<Grade> {
 }
 
 /// A number's limits, in words behind it.
-fn limits(field: &str, scale: f64) -> String {
-    let Some([warning, bad]) = CameraReport::limits(field).map(|l| l.map(|v| v * scale)) else { return String::new() };
+fn limits(field: &str, scale: f64, view: Option<&Camera>) -> String {
+    let Some(found) = view.and_then(|view| CameraReport::limits(field, view)) else { return String::new() };
+    // Two digits that count.
+    let [warning, bad] = found.map(|v| format!("{:.1e}", v * scale).parse::<f64>().unwrap_or(v));
     let way = if bad < warning { "below" } else { "above" };
-    format!(" · warning {way} {warning}, bad {way} {bad}")
+    format!("warning {way} {warning}, bad {way} {bad}")
 }
 
-/// The page; `map`: an SVG of the cameras.
-fn page(report: &Report, map: &str) -> String {
+/// The page.
+fn page(report: &Report, capture: &Capture) -> String {
+    let map = rig_map::svg(capture, &|name| worst(report, name));
+    let view_of = |name: &str| {
+        let camera = capture.cameras.iter().position(|c| c.name == name)?;
+        capture.frames.iter().find(|f| f.camera == camera).map(|f| &f.view)
+    };
     let mut body = String::new();
     let _ = writeln!(body, "<header><h1>{}</h1><p>{}</p></header>", escape(&report.capture), escape(&summary(report)));
     for line in about(report) {
         let _ = writeln!(body, "<p>{}</p>", escape(&line));
     }
     body.push_str("<h2>Findings, worst first</h2>\n");
+    if report.findings.is_empty() {
+        body.push_str("<p>None.</p>\n");
+    }
     for f in &report.findings {
         let class = if f.grade == Grade::Note { "note" } else { "warn" };
         let _ = write!(body, "<div class=\"{class}\"><b>{}</b> {}", word(f.grade), escape(&f.what));
@@ -80,7 +91,7 @@ fn page(report: &Report, map: &str) -> String {
          those of an image of 1920 pixels.</p>\n<div class=\"grid3\">",
     );
     for camera in &report.cameras {
-        let p = &camera.picture;
+        let (p, view) = (&camera.picture, view_of(&camera.name));
         let picture = RgbImage::from_raw(p.width as u32, p.height as u32, p.data.clone()).filter(|p| p.width() > 0);
         let image = picture.and_then(pictures::reduced).map(|uri| {
             format!(
@@ -96,24 +107,24 @@ fn page(report: &Report, map: &str) -> String {
                     body,
                     "<tr><th>{name}</th><td>{}<br><span class=\"note\">{}</span></td></tr>",
                     escape(&value),
-                    escape(limits.trim_start_matches(" · "))
+                    escape(&limits)
                 );
             }
         };
-        row("pose error", camera.epipolar.map(|v| format!("{v:.2} px of 1920")), limits("epipolar", 1.0));
+        row("pose error", camera.epipolar.map(|v| format!("{v:.2} px of 1920")), limits("epipolar", 1.0, view));
         row("time offset", camera.offset.map(|[v, s]| format!("{:+.1} ± {:.1} ms", 1e3 * v, 1e3 * s)), String::new());
         row(
             "exposure",
             camera.exposure.map(|e| e.map(|v| format!("{v:+.2}")).join(" ") + " stops"),
-            limits("exposure", 1.0),
+            limits("exposure", 1.0, view),
         );
-        row("sharpness", camera.sharpness.map(|v| format!("{v:.2} times the others'")), limits("sharpness", 1.0));
-        row("moved", camera.moved.map(|v| format!("{v:.2} px of 1920")), limits("moved", 1.0));
-        row("focus, last to first", camera.focus.map(|v| format!("{v:.2}")), limits("focus", 1.0));
+        row("sharpness", camera.sharpness.map(|v| format!("{v:.2} times the others'")), limits("sharpness", 1.0, view));
+        row("moved", camera.moved.map(|v| format!("{v:.2} px of 1920")), limits("moved", 1.0, view));
+        row("focus, last to first", camera.focus.map(|v| format!("{v:.2}")), limits("focus", 1.0, view));
         row(
             "first to last row",
             camera.shutter.map(|[v, s]| format!("{:+.1} ± {:.1} ms", 1e3 * v, 1e3 * s)),
-            limits("shutter", 1e3),
+            limits("shutter", 1e3, view),
         );
         body.push_str("</table></div>\n");
     }

@@ -8,7 +8,7 @@ use splat4d_train::capture::Capture;
 
 /// What stands still went so far, pixels of 1920, and at least so many own ones.
 pub(super) const MOVED: [f64; 2] = [0.5, 2.0];
-const MOVED_PIXELS: [f64; 2] = [0.35, 1.0];
+pub(super) const MOVED_PIXELS: [f64; 2] = [0.35, 1.0];
 /// Brightness that jumps from image to image, stops.
 const FLICKER: [f64; 2] = [0.05, 0.15];
 /// Missing and doubled frames, of all.

@@ -16,6 +16,7 @@ mod volume;
 
 use crate::{Error, Result};
 use serde::Serialize;
+use splat4d::scene::Camera;
 use splat4d_train::capture::{Capture, ImageStore, Rgb8, Severity};
 use splat4d_train::event::Progress;
 use splat4d_train::run::forecast;
@@ -83,14 +84,16 @@ pub struct CameraReport {
 }
 
 impl CameraReport {
-    /// Limits of one of its numbers, by the name of its field: beyond the first is a warning, beyond the second bad. Of
-    /// sharpness and focus, below.
-    pub fn limits(field: &str) -> Option<[f64; 2]> {
+    /// Limits of one of its numbers, by the name of its field, for images of this camera: beyond the first is a warning,
+    /// beyond the second bad. Of sharpness and focus, below.
+    pub fn limits(field: &str, view: &Camera) -> Option<[f64; 2]> {
+        // Small images resolve less: their own pixels count.
+        let or_pixels = |limits, pixels: [f64; 2]| finding::worse(limits, pixels.map(|p| p * finding::unit(view)));
         Some(match field {
-            "epipolar" => between::EPIPOLAR,
+            "epipolar" => or_pixels(between::EPIPOLAR, between::OWN_PIXELS),
             "exposure" => between::EXPOSURE,
             "sharpness" | "focus" => finding::SHARPNESS,
-            "moved" => alone::MOVED,
+            "moved" => or_pixels(alone::MOVED, alone::MOVED_PIXELS),
             "shutter" => clocks::SHUTTER,
             _ => return None,
         })
