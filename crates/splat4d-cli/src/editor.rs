@@ -410,16 +410,6 @@ fn held(select: &str, scene: &Scene<f32>, selected: &Selected, t: f64) -> Value 
     })
 }
 
-/// A token that cannot be guessed, from the system's randomness.
-pub(crate) fn token() -> Result<String> {
-    let mut bytes = [0; 16];
-    getrandom::fill(&mut bytes).map_err(|e| {
-        Error::input(format!("the system provides no random numbers ({e})"))
-            .remedy("Without them, other pages cannot be prevented from editing")
-    })?;
-    Ok(bytes.iter().map(|b| format!("{b:02x}")).collect())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -645,11 +635,5 @@ mod tests {
         let y = |told: &Value| told["nodes"][0][1].as_f64().unwrap();
         assert!((y(&moved) - y(&rest) - 0.5).abs() < 1e-5);
         assert_ne!(moved["picture"], rest["picture"]);
-    }
-
-    #[test]
-    fn tokens_differ() {
-        let tokens = [token().unwrap(), token().unwrap()];
-        assert!(tokens[0] != tokens[1] && tokens.iter().all(|t| t.len() == 32));
     }
 }

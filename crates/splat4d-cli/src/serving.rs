@@ -1,7 +1,7 @@
 //! The player's server as verbs use it: options, what is said about it, the browser, and a run that is being watched.
 
 use crate::console::Console;
-use crate::{capture_page, editor, playable};
+use crate::{capture_page, playable};
 use serde_json::{Value, json};
 use splat4d::{Error, Result};
 use splat4d_serve::{Config, EditAnswer, Editing, News, Running, Server};
@@ -105,6 +105,16 @@ fn open_browser(url: &str) -> bool {
     }
 }
 
+/// A token that cannot be guessed, from the system's randomness.
+pub(crate) fn token() -> Result<String> {
+    let mut bytes = [0; 16];
+    getrandom::fill(&mut bytes).map_err(|e| {
+        Error::input(format!("the system provides no random numbers ({e})"))
+            .remedy("Without them, other pages cannot be prevented from editing")
+    })?;
+    Ok(bytes.iter().map(|b| format!("{b:02x}")).collect())
+}
+
 /// Pause and stop of a run, as its page asks for them.
 ///
 /// A pause blocks the trainer between two steps, so that the result stays the same to the bit.
@@ -199,7 +209,7 @@ impl Watch {
         control: &Arc<Control>,
         console: &Console,
     ) -> Result<Running> {
-        let token = editor::token()?;
+        let token = token()?;
         let (asked, mut about) = (control.clone(), json!({ "title": title }));
         let photos = capture.map(|capture| {
             let (cameras, photos) = capture_page::cameras(capture);
@@ -267,6 +277,12 @@ impl Watch {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn tokens_differ() {
+        let tokens = [token().unwrap(), token().unwrap()];
+        assert!(tokens[0] != tokens[1] && tokens.iter().all(|t| t.len() == 32));
+    }
 
     #[test]
     fn a_paused_run_waits_without_using_its_time_and_goes_on_or_stops() {

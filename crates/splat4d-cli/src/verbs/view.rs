@@ -3,7 +3,7 @@
 use crate::baking::{Baking, pack, title};
 use crate::capture_page;
 use crate::console::Console;
-use crate::editor::{self, Editor};
+use crate::editor::Editor;
 use crate::interrupt;
 use crate::playable::Playable;
 use crate::run_folder::Run;
@@ -55,7 +55,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
                 .remedy("Download it first.")
                 .into());
         }
-        token = Some(editor::token()?);
+        token = Some(serving::token()?);
         editing(Path::new(&args.source), file, token.clone().expect("it was just made"), console)?
     } else if let Some(address) = address {
         let name = address.split(['?', '#']).next().and_then(|path| path.rsplit('/').next()).unwrap_or_default();

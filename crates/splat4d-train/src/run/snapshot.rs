@@ -1,9 +1,9 @@
 //! The scene while it learns, as a playback file: for the live view. It only reads, so that the result stays the same
 //! to the bit.
 
+use super::metrics::psnr;
 use crate::Result;
 use crate::capture::{Capture, ImageStore};
-use crate::eval::metrics;
 use crate::event::Event;
 use crate::step::trainer::Trainer;
 use splat4d::bake::{Options, bake};
@@ -68,14 +68,11 @@ impl HeldOut {
             scene.at(frame.time, &mut instant);
             let splats = scene.splats(&instant);
             device::draw(&mut self.backend, &Shot::new(&splats, &frame.view, scene.background), &mut image);
-            scores.extend(match &truth.valid {
-                // Only pixels that the lens recorded in full count.
-                Some(valid) => {
-                    let inside: Vec<bool> = valid.data.iter().map(|v| *v >= 1.0).collect();
-                    metrics::psnr_region(&image.color, &truth.color, &inside)
-                }
-                None => metrics::psnr(&image.color, &truth.color),
-            });
+            scores.push(psnr(mean_square(
+                &image.color.data,
+                &truth.color.data,
+                truth.valid.as_ref().map(|v| &v.data[..]),
+            )));
         }
         (!scores.is_empty()).then(|| scores.iter().sum::<f64>() / scores.len() as f64)
     }
@@ -155,6 +152,15 @@ impl Snapshots {
         write(&Draft { meta, nodes: baked.nodes, poster: None }, &config, &mut bytes)?;
         Ok(bytes)
     }
+}
+
+/// The mean squared difference of two images [3, height, width], of the pixels that the lens recorded in full.
+fn mean_square(a: &[f32], b: &[f32], valid: Option<&[f32]>) -> f64 {
+    let pixels = a.len() / 3;
+    let counts = |i: usize| valid.is_none_or(|v| v[i % pixels] >= 1.0);
+    let squares = (0..a.len()).filter(|&i| counts(i)).map(|i| f64::from(a[i] - b[i]).powi(2));
+    let (sum, n) = squares.fold((0.0, 0usize), |(sum, n), s| (sum + s, n + 1));
+    sum / n.max(1) as f64
 }
 
 /// The camera's viewpoint, with the depth of the scene's middle as the distance of its target.
