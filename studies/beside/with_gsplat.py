@@ -1,10 +1,10 @@
-"""The training of a folder of `splat4d bench --device gpu --beside FOLDER` in gsplat, on one NVIDIA card.
+"""The training of a folder of `studies bench --device gpu --beside FOLDER` in gsplat, on one NVIDIA card.
 
     python with_gsplat.py FOLDER/A [FOLDER/B ...]
 
 Needs PyTorch for CUDA, gsplat 1.5.3 (whose sources are compiled at the first import) and, for its fused SSIM, fused-ssim. Writes
 gsplat.json beside scene.json: milliseconds a step by the wall and by CUDA events, and the loss of every step. The next
-`splat4d bench --beside` tells how the two compare, if their losses agree.
+`studies bench --beside` tells how the two compare, if their losses agree.
 
 Same Gaussians, cameras, pictures, order, loss, rates and Adam as splat4d's; one picture a step; nothing is born and nothing dies.
 """

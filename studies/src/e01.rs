@@ -3,8 +3,8 @@
 use crate::lifting::{Findings, Settings, run as study};
 use serde_json::{Value, json};
 use splat4d_cli::console::Console;
-use splat4d_cli::files;
-use splat4d_cli::report::chart::{self, Series};
+use splat4d_workflow::files;
+use splat4d_workflow::report::chart::{self, Series};
 use std::fmt::Write;
 use std::path::PathBuf;
 

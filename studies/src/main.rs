@@ -12,7 +12,9 @@
 //! | `made/` | synthetic captures, each hard for one reason |
 //! | `e00.rs`, `e01.rs`, `e02.rs`, `e03.rs`, `models.rs` | the studies; `e02/` is the ablation of the filter |
 //! | `suite/` | the recipe on a list of captures (docs/suite.md) |
+//! | `bench.rs`, `bench/` | pinned scenes, stages, training steps, growth, GPU stages, playback, other programs (`beside/with_gsplat.py`); each time with its lower bound (docs/benchmarks.md) |
 
+mod bench;
 mod cells;
 mod deformation;
 mod e00;
@@ -39,6 +41,7 @@ Examples:
   studies e03 runs/knight --quick
   studies models examples/knight       every motion model, three minutes each
   studies suite --data sets            the recipe on captures of every kind
+  studies bench                        speed of this machine, stage by stage
   studies make one-wall runs/one-wall  a synthetic capture that is hard for one reason
 
 A study can be stopped at any time and goes on where it was.";
@@ -61,6 +64,7 @@ enum Study {
     E03(e03::Args),
     Models(models::Args),
     Suite(suite::Args),
+    Bench(Box<bench::Args>),
     /// Draw a synthetic capture that is hard for one reason
     Make(made::Args),
     /// `splat4d train`, for `models`: a cell is a process, so that its peak of memory is its own.
@@ -70,7 +74,7 @@ enum Study {
 
 fn main() -> ExitCode {
     splat4d_cli::parsed(|cli: Cli| {
-        let study = cli.study;
+        let (study, threads) = (cli.study, cli.globals.threads);
         (cli.globals, move |console: &_| match study {
             Study::E00(args) => e00::run(&args, console),
             Study::E01(args) => e01::run(&args, console),
@@ -78,6 +82,7 @@ fn main() -> ExitCode {
             Study::E03(args) => e03::run(&args, console),
             Study::Models(args) => models::run(&args, console),
             Study::Suite(args) => suite::run(&args, console),
+            Study::Bench(args) => bench::run(&args, threads, console),
             Study::Make(args) => made::run(&args, console),
             Study::Train(args) => verbs::train::run(&args, console),
         })

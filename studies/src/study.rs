@@ -3,8 +3,8 @@
 use crate::cells::Cell;
 use serde::{Deserialize, Serialize};
 use splat4d::{Error, Result};
-use splat4d_cli::files;
-use splat4d_cli::measure::Side;
+use splat4d_workflow::files;
+use splat4d_workflow::measure::Side;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 

@@ -2,9 +2,9 @@
 
 use crate::cells::{Cell, Grid};
 use crate::study::{Findings, Found};
-use splat4d_cli::files::{grouped, human_bytes};
-use splat4d_cli::measure::Side;
-use splat4d_cli::report::chart::{self, Series};
+use splat4d_workflow::files::{grouped, human_bytes};
+use splat4d_workflow::measure::Side;
+use splat4d_workflow::report::chart::{self, Series};
 use std::fmt::Write;
 
 /// All tables of one run. Cells that are missing are empty.

@@ -1,5 +1,7 @@
 //! The studies on a tiny run and a tiny capture: every cell is measured once, and what is found can be trusted.
 
+#[path = "studies/bench.rs"]
+mod bench;
 #[allow(dead_code)] // what the command's tests alone need
 #[path = "../../crates/splat4d-cli/tests/cli/sample.rs"]
 mod sample;

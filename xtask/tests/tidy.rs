@@ -419,7 +419,7 @@ fn motion_models_are_named_only_in_their_modules() {
 const DIALECT_LIST: &str = "crates/splat4d/src/format/mod.rs";
 /// Files elsewhere that may name one of them, each with its reason.
 const DIALECT_NAMES: [(&str, &str); 1] =
-    [("crates/splat4d-cli/src/source/bundle.rs", "a SOG scene may lie in a folder")];
+    [("crates/splat4d-workflow/src/source/bundle.rs", "a SOG scene may lie in a folder")];
 
 /// A new dialect is its own file and its entry in the list: no other code may name one. Its properties answer what others
 /// need to know.

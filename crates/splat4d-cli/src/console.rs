@@ -1,13 +1,15 @@
 //! What the user sees while work goes on: a progress bar on a terminal, plain lines elsewhere, JSON lines for machines.
 //! Results go to stdout; progress, warnings and errors go to stderr (with `--json`, all of them are lines on stdout).
 
-use crate::files::{grouped, human_bytes, human_seconds};
+use crate::interrupt;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::{Value, json};
 use splat4d::text;
 use splat4d_train::event::Event;
 use splat4d_train::output::rfc3339;
 use splat4d_train::path_text::in_command;
+use splat4d_workflow::events::{Listener, linked};
+use splat4d_workflow::files::{grouped, human_bytes, human_seconds};
 use std::borrow::Cow;
 use std::cell::RefCell;
 use std::io::{IsTerminal, Write};
@@ -65,6 +67,25 @@ struct State {
     objects: Option<Vec<Value>>,
 }
 
+impl Listener for Console {
+    fn on_event(&self, event: &splat4d_workflow::events::Event<'_>) {
+        use splat4d_workflow::events::Event;
+        match *event {
+            Event::Phase { name, done, total } => self.phase(name, done, total),
+            Event::PhaseEnded => self.clear(),
+            Event::Result(text) => self.say(text),
+            Event::Record(value) => self.emit(value),
+            Event::Detail(text) => self.detail(text),
+            Event::Warning(text) => self.warn(text),
+            Event::Written(path) => self.written(path),
+            Event::Training(event) => self.event(event),
+            Event::StopPolled(reaction) => interrupt::asks(reaction.to_owned()),
+            Event::StopNotPolled(kept) => interrupt::ends(kept),
+            _ => {}
+        }
+    }
+}
+
 impl Console {
     pub fn new(loudness: Loudness, json: bool) -> Self {
         let terminal = std::io::stderr().is_terminal() && std::env::var_os("TERM").is_none_or(|t| t != "dumb");
@@ -84,7 +105,7 @@ impl Console {
     }
 
     /// Whether machines are listening.
-    pub(crate) fn json(&self) -> bool {
+    pub fn json(&self) -> bool {
         self.json
     }
 
@@ -108,7 +129,7 @@ impl Console {
     }
 
     /// Prints the result that the verb was asked for: on stdout whatever the loudness.
-    pub(crate) fn result(&self, text: &str) {
+    pub fn result(&self, text: &str) {
         self.above_bar(|| print(text));
     }
 
@@ -160,7 +181,7 @@ impl Console {
     }
 
     /// For people only, on stderr even with `--json`: where stdout is one JSON document.
-    pub(crate) fn aside(&self, text: &str) {
+    pub fn aside(&self, text: &str) {
         self.above_bar(|| eprint_line(text));
     }
 
@@ -379,24 +400,6 @@ fn bar(total: usize) -> ProgressBar {
     bar
 }
 
-/// The text with pages of the documentation, of which an installed program has no copy, as links.
-fn linked(text: &str) -> String {
-    const FOLDER: &str = "docs/";
-    let mut out = String::with_capacity(text.len());
-    let mut rest = text;
-    while let Some(at) = rest.find(FOLDER) {
-        let name = at + FOLDER.len();
-        let end = rest[name..].find(|c: char| !(c.is_ascii_lowercase() || c == '-')).map_or(rest.len(), |n| name + n);
-        // A path that the user gave stands at the beginning or behind another folder.
-        let ours = rest[..at].ends_with([' ', '(']) && rest[end..].starts_with(".md");
-        out += &rest[..at];
-        out += if ours { concat!(env!("CARGO_PKG_REPOSITORY"), "/blob/main/") } else { "" };
-        out += &rest[at..end];
-        rest = &rest[end..];
-    }
-    out + rest
-}
-
 /// JSON in one line, in which no character acts on a terminal: outside strings JSON has none, and inside they are escaped.
 fn one_json_line(value: &Value) -> String {
     let line = value.to_string();
@@ -430,7 +433,10 @@ fn print_shown(line: &str) {
         if error.kind() == std::io::ErrorKind::BrokenPipe {
             std::process::exit(0);
         }
-        eprint_line(&format!("error: standard output cannot be written ({error}). {}", crate::files::WRITE_REMEDY));
+        eprint_line(&format!(
+            "error: standard output cannot be written ({error}). {}",
+            splat4d_workflow::files::WRITE_REMEDY
+        ));
         std::process::exit(crate::FAILED.into());
     }
 }
@@ -459,16 +465,6 @@ fn stamped(line: &str) -> Cow<'_, str> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn pages_of_the_documentation_are_links() {
-        let pages = concat!(env!("CARGO_PKG_REPOSITORY"), "/blob/main/docs/");
-        assert!(pages.starts_with("https://"), "{pages}");
-        let text = "docs/a.json: is no list (docs/capture-format.md). See docs/edit.md, my/docs/edit.md or docs/";
-        let wanted =
-            format!("docs/a.json: is no list ({pages}capture-format.md). See {pages}edit.md, my/docs/edit.md or docs/");
-        assert_eq!(linked(text), wanted);
-    }
 
     #[test]
     fn machines_are_told_the_ends_of_a_phase_and_little_between() {

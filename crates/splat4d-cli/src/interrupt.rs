@@ -3,6 +3,7 @@
 //! Work that does not ask whether it should stop (`ends`) is ended after a moment: all files are written under temporary names,
 //! and locks of dead processes are taken over, so that the same command goes on.
 
+use std::borrow::Cow;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -18,14 +19,15 @@ const PATIENCE: Duration = Duration::from_millis(1200);
 struct State {
     raised: bool,
     /// What is said of the first one.
-    first: &'static str,
+    first: Cow<'static, str>,
     /// Where the program is ended soon: what is said then.
     last: Option<String>,
     /// Whether another program has called, which must not be ended.
     embedded: bool,
 }
 
-static STATE: Mutex<State> = Mutex::new(State { raised: false, first: "stopping", last: None, embedded: false });
+static STATE: Mutex<State> =
+    Mutex::new(State { raised: false, first: Cow::Borrowed("stopping"), last: None, embedded: false });
 
 fn state() -> MutexGuard<'static, State> {
     STATE.lock().unwrap_or_else(PoisonError::into_inner)
@@ -77,9 +79,9 @@ pub fn flag(first: &'static str) -> Arc<AtomicBool> {
 }
 
 /// From now on the work asks for the flag, and does what `first` says.
-pub(crate) fn asks(first: &'static str) {
+pub(crate) fn asks(first: impl Into<Cow<'static, str>>) {
     let mut state = state();
-    (state.first, state.last) = (first, None);
+    (state.first, state.last) = (first.into(), None);
 }
 
 /// From now on a Ctrl-C ends the program after a moment, also where the work does not ask; `last` says what is kept and how to go
@@ -90,7 +92,7 @@ pub(crate) fn ends(last: impl Into<String>) {
     if state.raised && !state.embedded {
         end(&last);
     }
-    (state.first, state.last) = ("stopping", Some(last));
+    (state.first, state.last) = ("stopping".into(), Some(last));
 }
 
 /// Another program has called: it must not be ended.
@@ -111,7 +113,7 @@ mod tests {
     fn work_that_does_not_ask_is_ended_soon_and_other_work_is_not() {
         let state = |last: Option<&str>, embedded| State {
             raised: false,
-            first: "stopping",
+            first: "stopping".into(),
             last: last.map(str::to_owned),
             embedded,
         };

@@ -1,7 +1,7 @@
 //! The `splat4d` command: trains, measures, renders, compresses and plays dynamic 3D scenes.
 //!
-//! Each command is a file in `verbs`. Exit codes: 0 done, 1 failed, 2 bad input. This is a library only because the
-//! studies and the Python package share its console, run folders and measurements; its interface is not public.
+//! Each command is a file in `verbs`: it parses, calls `splat4d-workflow` and prints. Exit codes: 0 done, 1 failed, 2 bad input.
+//! This is a library only because the studies and the Python package share its console; its interface is not public.
 //!
 //! # Code map
 //!
@@ -9,59 +9,24 @@
 //!
 //! | module | content |
 //! |---|---|
-//! | `camera_file.rs`, `console.rs`, `video.rs` | camera files, output, films |
-//! | `paths/` | orbits, data-set cameras and key-framed camera paths |
-//! | `run_folder.rs` | run folders |
-//! | `source.rs`, `source/` | scenes of other programs that are folders or archives |
-//! | `raw.rs`, `asked.rs` | channel values as files; files of queried points and their results |
-//! | `measure.rs`, `measure/` | how scenes and files play, for `compress`, the studies and `bench --playback` |
-//! | `baking.rs`, `baking/` | the playback file at the end of a run |
-//! | `comparing.rs` | runs and results of other programs, for `compare` |
-//! | `report/`, `report/compress/` | `report.html`, drawn without a library |
-//! | `film.rs` | the playback file of a long capture, which grows during training |
-//! | `labelling.rs`, `chunked.rs`, `compressing.rs`, `predicting.rs`, `predicting/`, `editing.rs`, `picking.rs`, `editor.rs` | the work of `label`, `train --chunk` and `join`, `compress`, `predict`, `edit`, `view --edit` |
+//! | `interrupt.rs`, `console.rs` | Ctrl-C; output |
+//! | `device.rs`, `measuring.rs`, `serving.rs` | options of several commands: device, evaluation, the player's server |
 //! | `verbs/`, `verbs/info/` | one file per command |
-//! | `verbs/bench/` | pinned scenes, stages, training steps, growth, GPU stages, other programs (`studies/beside/with_gsplat.py`); each time with its lower bound |
 //! | `bin/` | `s4d`, the command's second name: a launcher |
 
 #![allow(missing_docs)] // nobody outside the workspace reads it
 
-mod asked;
-mod baking;
-mod camera_file;
-mod capture_page;
-mod chunked;
-mod comparing;
-mod compressing;
 pub mod console;
-mod deadline;
 mod device;
-pub mod draw;
-mod editing;
-mod editor;
-pub mod files;
-mod film;
-pub mod finish;
 pub mod interrupt;
-mod labelling;
-pub mod measure;
-pub mod paths;
-mod picking;
-mod playable;
-mod predicting;
-mod raw;
-pub mod report;
-pub mod run_folder;
-pub mod sequence;
+mod measuring;
 mod serving;
-pub mod source;
-pub mod texts;
 pub mod verbs;
-mod video;
 
 use clap::{Parser, Subcommand};
 use console::{Console, Loudness};
 use splat4d::Error;
+
 use std::ffi::OsString;
 use std::process::ExitCode;
 
@@ -91,7 +56,6 @@ Examples:
   splat4d edit runs/knight edits.toml -o clean.safetensors
   splat4d label runs/take                  labels of Gaussians, from masks
   splat4d info my-take                     contents and findings of a capture, run or file
-  splat4d bench                            speed of this machine
 
 Exit codes: 0 done, 1 failed or interrupted, 2 bad input.";
 
@@ -130,7 +94,7 @@ pub struct Globals {
     log_time: bool,
     /// Number of threads [default: all cores]; the result does not depend on it
     #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
-    threads: Option<u16>,
+    pub threads: Option<u16>,
 }
 
 #[derive(Debug, Subcommand)]
@@ -152,12 +116,11 @@ enum Verb {
     Edit(verbs::edit::Args),
     Label(verbs::label::Args),
     Info(verbs::info::Args),
-    Bench(verbs::bench::Args),
     Completions(verbs::completions::Args),
 }
 
 impl Verb {
-    fn run(&self, threads: Option<u16>, console: &Console) -> anyhow::Result<()> {
+    fn run(&self, console: &Console) -> anyhow::Result<()> {
         match self {
             Verb::Import(args) => verbs::import::run(args, console),
             Verb::Train(args) => verbs::train::run(args, console),
@@ -176,7 +139,6 @@ impl Verb {
             Verb::Edit(args) => verbs::edit::run(args, console),
             Verb::Label(args) => verbs::label::run(args, console),
             Verb::Info(args) => verbs::info::run(args, console),
-            Verb::Bench(args) => verbs::bench::run(args, threads, console),
             Verb::Completions(args) => verbs::completions::run(args, console),
         }
     }
@@ -189,10 +151,7 @@ pub fn main() -> ExitCode {
 
 /// The command with these words, of which the first is its name; the exit code.
 pub fn main_from(words: impl IntoIterator<Item = OsString>) -> u8 {
-    parsed_from(words, |cli: Cli| {
-        let threads = cli.globals.threads;
-        (cli.globals, move |console: &Console| cli.verb.run(threads, console))
-    })
+    parsed_from(words, |cli: Cli| (cli.globals, move |console: &Console| cli.verb.run(console)))
 }
 
 /// One verb with its options, for another program: prints nothing but warnings, and returns the objects that `--json` would
@@ -205,7 +164,7 @@ pub fn call(words: &[OsString]) -> anyhow::Result<Vec<serde_json::Value>> {
     })?;
     interrupt::embedded();
     let console = Console::keeping_objects();
-    cli.verb.run(None, &console)?;
+    cli.verb.run(&console)?;
     Ok(console.into_objects())
 }
 

@@ -1,13 +1,14 @@
 //! The player's server as verbs use it: options, what is said about it, the browser, and a run that is being watched.
 
 use crate::console::Console;
-use crate::{capture_page, playable};
 use serde_json::{Value, json};
 use splat4d::{Error, Result};
 use splat4d_serve::{Config, EditAnswer, Editing, News, Running, Server};
 use splat4d_train::capture::Capture;
 use splat4d_train::event::Event;
 use splat4d_train::run::Stopwatch;
+use splat4d_workflow::editor::token;
+use splat4d_workflow::{capture_page, playable};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -103,16 +104,6 @@ fn open_browser(url: &str) -> bool {
         }
         Err(_) => false,
     }
-}
-
-/// A token that cannot be guessed, from the system's randomness.
-pub(crate) fn token() -> Result<String> {
-    let mut bytes = [0; 16];
-    getrandom::fill(&mut bytes).map_err(|e| {
-        Error::input(format!("the system provides no random numbers ({e})"))
-            .remedy("Without them, other pages cannot be prevented from editing")
-    })?;
-    Ok(bytes.iter().map(|b| format!("{b:02x}")).collect())
 }
 
 /// Pause and stop of a run, as its page asks for them.
@@ -268,7 +259,7 @@ impl Watch {
     /// Shows a finished run's playback file, where there is one.
     pub(crate) fn show(&self, run: &Path, iteration: usize) {
         let Some(running) = &self.running else { return };
-        if let Ok(bytes) = crate::files::read(&playable::of_run(run)) {
+        if let Ok(bytes) = splat4d_workflow::files::read(&playable::of_run(run)) {
             running.set_scene(bytes.into(), &json!({ "iteration": iteration }));
         }
     }
@@ -277,12 +268,6 @@ impl Watch {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn tokens_differ() {
-        let tokens = [token().unwrap(), token().unwrap()];
-        assert!(tokens[0] != tokens[1] && tokens.iter().all(|t| t.len() == 32));
-    }
 
     #[test]
     fn a_paused_run_waits_without_using_its_time_and_goes_on_or_stops() {

@@ -1,7 +1,5 @@
 //! The built binary on small synthetic captures: what users type, what they get, and what is printed.
 
-#[path = "cli/bench.rs"]
-mod bench;
 #[path = "cli/channels.rs"]
 mod channels;
 #[path = "cli/chunked.rs"]
@@ -69,7 +67,6 @@ fn help_teaches_and_completions_complete() {
         "convert",
         "label",
         "info",
-        "bench",
         "completions",
     ] {
         assert!(help.contains(verb), "{verb} is missing");

@@ -30,6 +30,11 @@ pub(crate) const READERS: &[Reader] = &[
     Reader { name: "nerfies_metadata", seeds: || vec![METADATA.into()], read: |b| open("nerfies", "metadata.json", b) },
     Reader { name: "nerfies_camera", seeds: || vec![nerfies().into()], read: |b| open("nerfies", "camera/0.json", b) },
     Reader { name: "nerfies_scene", seeds: || vec![FRAMING.into()], read: |b| open("nerfies", "scene.json", b) },
+    Reader { name: "nerfies_points", seeds: || vec![floats(&[4, 3])], read: |b| open("nerfies", "points.npy", b) },
+    Reader { name: "nerfies_split", seeds: || vec![SPLIT.into()], read: |b| open("nerfies", "splits/train.json", b) },
+    Reader { name: "import_note", seeds: || vec![NOTE.into()], read: |b| open("n3dv", "import/cam00.json", b) },
+    Reader { name: "panoptic_points", seeds: panoptic_points, read: |b| open("panoptic", "init_pt_cld.npz", b) },
+    Reader { name: "split_list", seeds: || vec![b"0.png\n".into()], read: |b| open("colmap", "sparse/0/test.txt", b) },
     Reader { name: "metashape_xml", seeds: || vec![metashape().into()], read: |b| open("metashape", "cameras.xml", b) },
     Reader { name: "realityscan_csv", seeds: realityscan, read: |b| open("realityscan", "cameras.csv", b) },
     Reader {
@@ -91,6 +96,22 @@ fn open(layout: &'static str, file: &str, bytes: &[u8]) {
             let _ = store.load(0);
         }
     });
+}
+
+/// A rig of two cameras and two frames.
+pub(crate) fn rig() -> (TempDir, Capture) {
+    let folder = made("panoptic");
+    let camera = |c: usize| {
+        let mut pose = POSE;
+        pose[0][3] = 0.2 * c as f64;
+        json!({"name": format!("c{c}"), "width": WIDTH, "height": HEIGHT, "fx": 8.0, "fy": 8.0, "cx": 4.0, "cy": 3.0,
+            "world_to_camera": pose, "images": "images/%d.png"})
+    };
+    let text = json!({"version": 1, "fps": 30, "cameras": [camera(0), camera(1)]}).to_string();
+    write(folder.path(), "capture.json", text.as_bytes());
+    let options = CaptureOptions { hold_out: Some("none".parse().expect("it is a word")), ..CaptureOptions::default() };
+    let capture = Capture::open(folder.path(), &options).unwrap_or_else(|e| panic!("{e}"));
+    (folder, capture)
 }
 
 fn write(folder: &Path, file: &str, bytes: &[u8]) {
@@ -339,6 +360,14 @@ fn beside() -> String {
     let files = "\"masks\":[\"mask.png\",\"mask.png\"],\"labels\":[\"labels.png\",\"labels.png\"],\
                  \"features\":[\"features.npy\",\"features.npy\"],\"tracks\":\"tracks.csv\",\"name\"";
     own().replacen("\"name\"", files, 1).replacen("\"fps\"", "\"labels\":[\"a\",\"b\"],\"fps\"", 1)
+}
+
+/// DyCheck's `splits/train.json`, and a note of extracted frames.
+const SPLIT: &str = r#"{"frame_names": ["0"], "camera_ids": [0], "time_ids": [0]}"#;
+const NOTE: &str = r#"{"interval": 0.04}"#;
+
+fn panoptic_points() -> Vec<Vec<u8>> {
+    [false, true].map(|deflate| zip(&[("data.npy", &floats(&[5, 7]))], deflate)).into()
 }
 
 const TRACKS: &str = "point,frame,x,y\n0,0,1.5,2\n0,1,2.5,2\n1,1,3,4\n";

@@ -14,7 +14,7 @@ use splat4d::math::Rng;
 use splat4d::motion::{Spacetime, SpacetimeSpec};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, LIFE, LifeKind, Params, SH, Time};
-use splat4d_cli::source::Source;
+use splat4d_workflow::source::Source;
 use std::borrow::Cow;
 use std::cell::RefCell;
 use std::io::{Read, Write};
@@ -38,6 +38,14 @@ pub(crate) const READERS: &[Reader] = &[
     Reader { name: "npy", seeds: npy_seeds, read: |b| drop(npy::Npy::read(b)) },
     Reader { name: "npz", seeds: npz_seeds, read: |b| drop(npy::Npy::read_member(b, "data")) },
     Reader { name: "ply_zip", seeds: ply_zips, read: |b| file("scene.zip", b) },
+    Reader { name: "glb", seeds: || [written(".glb"), written(".spz.glb")].concat(), read: open },
+    Reader { name: "gltf", seeds: gltf_seeds, read: open },
+    Reader { name: "usda", seeds: usda_seeds, read: open },
+    Reader { name: "ftgs_ply", seeds: || written(".ftgs.ply"), read: open },
+    Reader { name: "torch", seeds: torch_seeds, read: open },
+    Reader { name: "torch_pickle", seeds: || vec![PICKLE.to_vec()], read: torch_pickle },
+    Reader { name: "dynamic3d", seeds: || vec![dynamic3d()], read: open },
+    Reader { name: "usdz", seeds: || written(".usdz"), read: open },
     Reader { name: "sog_levels", seeds: || vec![LEVELS.into()], read: sog_levels },
     Reader { name: "foreign", seeds: foreign_seeds, read: |b| drop(foreign::unread("a.splat4d", b)) },
 ];
@@ -104,6 +112,67 @@ fn written(ending: &str) -> Vec<Vec<u8>> {
     }
     out.dedup();
     out
+}
+
+/// A JSON with its numbers inside, and one that names another file.
+fn gltf_seeds() -> Vec<Vec<u8>> {
+    let mut all = written(".gltf");
+    let text = String::from_utf8_lossy(&all[0]).replace("data:application/octet-stream;base64,", "scene.bin?");
+    all.push(text.into_bytes());
+    all
+}
+
+/// A stage as other programs write it, with what ours lacks.
+const STAGE: &str = r#"#usda 1.0
+( upAxis = "Z" metersPerUnit = 0.01
+  timeCodesPerSecond = 10 )
+def Xform "w" ( prepend apiSchemas = ["A"] ) {
+    double3 xformOp:translate = (1, 2, 3)
+    float3 xformOp:rotateXYZ = (10, 20, 30)
+    matrix4d xformOp:transform = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))
+    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateXYZ", "!invert!xformOp:translate", "xformOp:transform"]
+    variantSet "v" = { "a" { def Mesh "m" { int[] i = [1] } } }
+    def ParticleField3DGaussianSplat "g" {
+        point3h[] positionsh.timeSamples = { 0: [(1, 2, 3), (4, 5, 6)], 1: [(1, 2, 4), (4, 5, 7)] }
+        float[] opacities = [0.5, 0.25] ( interpolation = "vertex" )
+        uniform int radiance:sphericalHarmonicsDegree = 0
+        float3[] radiance:sphericalHarmonicsCoefficients = [(1, 2, 3), (1, 2, 3)]
+    }
+}
+"#;
+
+/// The pickle of a checkpoint of two Gaussians with degree 0, as `torch.save` writes it: {'splats': OrderedDict(...)}.
+const PICKLE: &[u8] = include_bytes!("../seeds/splats.pkl");
+
+/// The archive of a pickle and storages of 32 numbers.
+fn torch(pickle: &[u8]) -> Vec<u8> {
+    let numbers: Vec<u8> = (0..32).flat_map(|i| (i as f32 * 0.1).to_le_bytes()).collect();
+    let names: Vec<String> = (0..9).map(|i| format!("archive/data/{i}")).collect();
+    let storages = names.iter().map(|name| (name.as_str(), &numbers[..]));
+    zip(&std::iter::once(("archive/data.pkl", pickle)).chain(storages).collect::<Vec<_>>(), false)
+}
+
+fn torch_seeds() -> Vec<Vec<u8>> {
+    vec![torch(PICKLE)]
+}
+
+/// Another pickle for storages that are sound.
+fn torch_pickle(bytes: &[u8]) {
+    open(&torch(bytes));
+}
+
+/// Three frames of two Gaussians of Dynamic3DGaussians.
+fn dynamic3d() -> Vec<u8> {
+    let arrays = [("means3D", &[3, 2, 3][..]), ("unnorm_rotations", &[3, 2, 4]), ("rgb_colors", &[3, 2, 3])];
+    let arrays = arrays.into_iter().chain([("log_scales", &[2, 3][..]), ("logit_opacities", &[2, 1])]);
+    let files: Vec<(String, Vec<u8>)> = arrays.map(|(name, shape)| (format!("{name}.npy"), array(shape))).collect();
+    zip(&files.iter().map(|(n, b)| (n.as_str(), &b[..])).collect::<Vec<_>>(), true)
+}
+
+fn usda_seeds() -> Vec<Vec<u8>> {
+    let mut all = written(".usda");
+    all.push(STAGE.into());
+    all
 }
 
 fn point_seeds() -> Vec<Vec<u8>> {
@@ -272,6 +341,13 @@ fn mend(bytes: &mut [u8]) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn seeds_of_trained_models_are_sound() {
+        for (bytes, rows) in [(torch(PICKLE), 2), (dynamic3d(), 2), (STAGE.into(), 2)] {
+            assert!(splat4d::open(&bytes).unwrap_or_else(|e| panic!("{e}")).len() >= rows);
+        }
+    }
 
     #[test]
     fn seeds_are_sound() {

@@ -11,7 +11,10 @@ mod formats;
 mod http;
 pub mod mutate;
 mod runs;
+#[cfg(test)]
+mod sources;
 mod texts;
+mod trained;
 mod zip;
 
 /// A reader.
@@ -24,7 +27,8 @@ pub struct Reader {
 }
 
 /// All of them.
-pub const READERS: &[&[Reader]] = &[formats::READERS, captures::READERS, texts::READERS, runs::READERS, http::READERS];
+pub const READERS: &[&[Reader]] =
+    &[formats::READERS, captures::READERS, texts::READERS, runs::READERS, trained::READERS, http::READERS];
 
 /// All of them, one by one.
 pub fn readers() -> impl Iterator<Item = &'static Reader> {

@@ -2,10 +2,11 @@
 
 use crate::Reader;
 use serde_json::json;
-use splat4d_cli::run_folder::{Asked, Run};
-use splat4d_train::output;
+use splat4d_train::output::{self, Owner};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::chunks::Chunked;
+use splat4d_train::run::corrected;
+use splat4d_workflow::run_folder::{Asked, Run};
 use std::cell::OnceCell;
 use std::path::Path;
 use tempfile::TempDir;
@@ -17,6 +18,9 @@ pub(crate) const READERS: &[Reader] = &[
     Reader { name: "per_view_json", seeds: || vec![PER_VIEW.into()], read: |b| open("per_view.json", b) },
     Reader { name: "cameras_json", seeds: || vec![CAMERAS.into()], read: |b| open("cameras.json", b) },
     Reader { name: "chunk_plan", seeds: || vec![PLAN.into()], read: |b| open("chunks/plan.json", b) },
+    Reader { name: "compress_json", seeds: || vec![COMPRESS.into()], read: |b| open("compress.json", b) },
+    Reader { name: "refined_json", seeds: || vec![REFINED.into()], read: |b| open("refined.json", b) },
+    Reader { name: "owner_json", seeds: || vec![OWNER.into()], read: |b| open(".splat4d/owner.json", b) },
     Reader { name: "output_files", seeds: || vec![FILES.into()], read: |b| open(".splat4d/files", b) },
     Reader { name: "output_asked", seeds: || vec![asked().into()], read: |b| open(".splat4d/asked", b) },
 ];
@@ -30,6 +34,11 @@ const CAMERAS: &str = r#"[{"id": 0, "img_name": "a", "width": 8, "height": 6, "p
     "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "fx": 8, "fy": 8, "cx": 4, "cy": 3, "near": 0.1, "time": 0.5, "split": "test"}]"#;
 const PLAN: &str = r#"{"version": "0.1.0", "recipe": "0011223344556677", "capture": "8899", "take": [0, 120], "overlap": 16, "cuts": [60]}"#;
 const FILES: &str = "run.json\ntest/ours_10/\ntest/ours_10/renders/00000.png\nü%0a.json\n";
+
+const COMPRESS: &str = r#"{"bytes": 1000, "before": {"PSNR": 20.5}, "after": {"PSNR": 20.0}, "tiers": []}"#;
+const REFINED: &str =
+    r#"{"cameras": [{"camera": "a", "frame": null, "twist": [0, 0, 0, 0, 0, 0.1], "offset": 0.01, "focal": 0.02}]}"#;
+const OWNER: &str = r#"{"command": "train", "process": 7, "host": "h", "since": "2026-11-27T00:00:00Z", "machine": "m", "beat": "0000000001"}"#;
 
 fn run_json() -> String {
     json!({"version": "0.1.0", "capture": "/nowhere", "capture_name": "a", "iteration": 10, "iterations": 10, "seconds": 1.5,
@@ -55,6 +64,7 @@ fn open(file: &str, bytes: &[u8]) {
         if let Ok(run) = Run::open(run) {
             drop((run.name(), run.iteration(), run.scene_file(), run.views()));
         }
+        drop((corrected::read(run), Owner::holder(run)));
         drop((Chunked::open(run).map(|c| c.parts()), Asked::unbegun(run), output::written(run)));
         std::fs::remove_file(path).expect("it is there");
     });

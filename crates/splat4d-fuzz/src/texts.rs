@@ -5,12 +5,12 @@
 use crate::Reader;
 use splat4d::Error;
 use splat4d::edit::{Edits, Expr};
-use splat4d_cli::texts::{self, Page};
 use splat4d_dynamics::actions::Actions;
 use splat4d_import::calibration;
 use splat4d_import::corrections::{self, Corrections};
 use splat4d_import::video::{self, Selection};
 use splat4d_train::recipe::Recipe;
+use splat4d_workflow::texts::{self, Page};
 use std::cell::RefCell;
 use std::path::Path;
 use tempfile::{NamedTempFile, TempDir};
@@ -26,6 +26,7 @@ pub(crate) const READERS: &[Reader] = &[
     Reader { name: "actions", seeds: actions, read: |b| drop(Actions::parse(&text(b))) },
     Reader { name: "calibration", seeds: calibrations, read: calibration },
     Reader { name: "calibration_rig", seeds: rigs, read: calibration },
+    Reader { name: "compress_toml", seeds: || seeds(&[ORDER]), read: |b| drop(texts::compress_order(&text(b))) },
     Reader { name: "corrections", seeds: || seeds(&[CORRECTIONS]), read: corrections },
     Reader { name: "edit_request", seeds: requests, read: edit_request },
     Reader { name: "video_avi", seeds: films, read: film },
@@ -138,6 +139,9 @@ fn rigs() -> Vec<Vec<u8>> {
         "world_to_camera": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]}]}"#,
     ])
 }
+
+/// `compress.toml`, as it is written.
+const ORDER: &str = "source = \"runs/a\"\nlevel = 1\nguard = 0.1\nasked = false\nunpruned = false\nfree = true\n\n[settings]\nprune = 0.2\nrounds = 1\n";
 
 /// `import.toml`, as it is written.
 const CORRECTIONS: &str = "version = 1\n[[camera]]\nname = \"a\"\nuse = true\noffset = 0.5\nkeep_offset = true\n[camera.lens]\nfx = 8\ncx = 4\ncy = 3\nk = [0.1]\n\n[[camera]]\nname = \"b\"\nuse = false\n";

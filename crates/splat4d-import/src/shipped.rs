@@ -170,7 +170,7 @@ pub struct Contents {
 
 /// Whether all frames of a video are extracted, by the notes of that.
 fn is_extracted(root: &Path, video: &Path) -> bool {
-    let note = std::fs::read(root.join(NOTES).join(format!("{}.json", stem(video)))).ok();
+    let note = splat4d_train::files::read(&root.join(NOTES).join(format!("{}.json", stem(video)))).ok();
     let note: Option<serde_json::Value> = note.and_then(|bytes| serde_json::from_slice(&bytes).ok());
     note.is_some_and(|n| n["complete"] == true)
 }

@@ -7,7 +7,7 @@ use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
 use splat4d::layers::{self, Evaluation};
 use splat4d::scene::Time;
-use splat4d_cli::source::Source;
+use splat4d_workflow::source::Source;
 use std::sync::Arc;
 
 /// The Gaussians alive at one time as NumPy arrays, activated, as gsplat's `rasterization` takes them.

@@ -8,7 +8,7 @@
 //!
 //! | module | content |
 //! |---|---|
-//! | `errors.rs`, `arrays.rs`, `plain.rs`, `settings.rs` | errors, NumPy in and out, plain values, settings by name |
+//! | `errors.rs`, `workflows.rs`, `arrays.rs`, `plain.rs`, `settings.rs` | errors, workflows with Python's signals, NumPy in and out, plain values, settings by name |
 //! | `camera.rs`, `scene_arrays.rs`, `gaussians.rs` | cameras, arrays into scenes, Gaussians at a time |
 //! | `from_arrays.rs` | images in memory become a capture on disk |
 //! | `metrics.rs`, `loss.rs`, `motion.rs` | metrics; losses and motion models written in Python |
@@ -31,6 +31,7 @@ mod scene;
 mod scene_arrays;
 mod settings;
 mod train;
+mod workflows;
 
 use pyo3::prelude::*;
 
@@ -52,7 +53,7 @@ mod _native {
     #[pymodule_export]
     use crate::rendering::Rendering;
     #[pymodule_export]
-    use crate::run::Run;
+    use crate::run::{Run, compare};
     #[pymodule_export]
     use crate::scene::{Scene, Tracks, open};
     #[pymodule_export]

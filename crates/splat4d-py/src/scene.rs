@@ -9,16 +9,22 @@ use crate::rendering::{self, Rendering};
 use crate::scene_arrays::{self, About, Moving, Shapes};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use splat4d::bake::{Options, TOLERANCE};
 use splat4d::device;
 use splat4d::flow::tracks;
 use splat4d::layers::{Evaluation, Head};
 use splat4d::render::{Image, RenderConfig, Shot, Tables, Wanted};
 use splat4d::scene::{Planes, Time};
-use splat4d_cli::draw::{Channel, Painter, antialias};
-use splat4d_cli::paths::View;
-use splat4d_cli::sequence::moments;
-use splat4d_cli::source::{Source, read_scene};
-use std::ffi::OsString;
+use splat4d_workflow::baking::{self, Baking};
+use splat4d_workflow::converting::{self, Conversion};
+use splat4d_workflow::draw::{Channel, Painter, antialias};
+use splat4d_workflow::editing::{EditOptions, edit};
+use splat4d_workflow::events::{Event, Listener};
+use splat4d_workflow::exporting;
+use splat4d_workflow::paths::View;
+use splat4d_workflow::sequence::moments;
+use splat4d_workflow::source::{Source, not_empty, read_scene};
+use std::cell::RefCell;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -79,6 +85,18 @@ impl Scene {
         })
         .or_raise()
     }
+}
+
+/// Runs a workflow and returns its warnings.
+fn listening(work: impl FnOnce(&dyn Listener) -> splat4d::Result<()>) -> anyhow::Result<Vec<String>> {
+    let warnings = RefCell::new(Vec::new());
+    let listen = |event: &Event<'_>| {
+        if let Event::Warning(text) = event {
+            warnings.borrow_mut().push((*text).to_owned());
+        }
+    };
+    work(&listen)?;
+    Ok(warnings.into_inner())
 }
 
 /// The scene's parameters. Errors: it is a playback file's.
@@ -341,11 +359,11 @@ impl Scene {
     /// Writes one seekable file that plays anywhere (.s4d); `tolerance`: largest error of a Gaussian, pixels.
     #[pyo3(signature = (path, *, tolerance=None))]
     fn bake(&self, py: Python<'_>, path: PathBuf, tolerance: Option<f64>) -> PyResult<()> {
-        self.with_file(py, |file, _| {
-            let mut words: Vec<OsString> = vec!["bake".into(), file.into(), "-o".into(), path.into_os_string()];
-            words.extend(tolerance.map(|px| OsString::from(format!("--tolerance={px}"))));
-            splat4d_cli::call(&words).map(drop)
-        })
+        let options = Options { tolerance: tolerance.unwrap_or(TOLERANCE), ..Options::default() };
+        let baking = Baking { options, tolerance, ..Baking::default() };
+        let work =
+            |file: &Path, _: &Path| listening(|listener| baking::bake(file, &path, None, &baking, listener).map(drop));
+        crate::errors::warn(py, &self.with_file(py, work)?)
     }
 
     /// Writes a file in the format of its extension: .html (player and scene as one page), .ply (at time t, in the
@@ -353,17 +371,26 @@ impl Scene {
     #[pyo3(signature = (path, t=None))]
     fn export(&self, py: Python<'_>, path: PathBuf, t: Option<f64>) -> PyResult<()> {
         t.map(time).transpose()?;
-        self.with_file(py, |file, _| {
-            let ending = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
-            let (from, out) = (file.into(), path.into_os_string());
-            let mut words: Vec<OsString> = match ending.as_deref() {
-                Some("html") => vec!["export".into(), from, "--html".into(), "-o".into(), out],
-                Some("ply") => vec!["export".into(), from, "-o".into(), out],
-                _ => vec!["convert".into(), from, out],
-            };
-            words.extend(t.map(|t| OsString::from(format!("--time={t}"))));
-            splat4d_cli::call(&words).map(drop)
-        })
+        let ending = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
+        let export = |file: &Path, listener: &dyn Listener| match (ending.as_deref(), t) {
+            (Some("html"), Some(_)) => {
+                Err(splat4d::Error::input("a page holds the whole scene").at(path.display()).remedy("Leave t out"))
+            }
+            (Some("html"), None) => exporting::page(file, &path, None, listener),
+            (Some("ply"), _) => {
+                let source = Source::open(file)?;
+                source.keep(file, &path, &[])?;
+                let scene = &source.scene;
+                not_empty(scene, file)?;
+                let t = t.unwrap_or(scene.clip[0]);
+                let count = exporting::moment(scene, t, false, &path)?;
+                exporting::warn_of_empty(scene, t, count, listener);
+                Ok(())
+            }
+            _ => converting::run(&Conversion { time: t, ..Conversion::new(file, &path) }, listener),
+        };
+        let work = |file: &Path, _: &Path| listening(|listener| export(file, listener));
+        crate::errors::warn(py, &self.with_file(py, work)?)
     }
 
     /// The scene with a list of edits replayed (docs/edit.md), in no file yet. `edits`: the text of a list, or the path of
@@ -372,6 +399,7 @@ impl Scene {
         let text: Option<String> =
             edits.extract().ok().filter(|text: &String| text.contains('\n') || text.contains('='));
         let path: PathBuf = if text.is_some() { PathBuf::new() } else { edits.extract()? };
+        let mut warnings = Vec::new();
         let scene = self.with_file(py, |file, folder| {
             let list = match text {
                 Some(text) => {
@@ -383,9 +411,16 @@ impl Scene {
                 None => path,
             };
             let out = folder.join("edited.safetensors");
-            splat4d_cli::call(&["edit".into(), file.into(), list.into_os_string(), "-o".into(), out.clone().into()])?;
+            let options = EditOptions {
+                scene: file.to_owned(),
+                list: Some(list),
+                output: Some(out.clone()),
+                ..EditOptions::default()
+            };
+            warnings = listening(|listener| edit(&options, listener))?;
             Ok(read_scene(&out)?)
         })?;
+        crate::errors::warn(py, &warnings)?;
         Ok(Self::made(scene, self.views.clone()))
     }
 

@@ -11,11 +11,11 @@ use crate::settings::set;
 use pyo3::prelude::*;
 use pyo3::types::{PyBool, PyDict};
 use splat4d::Result;
-use splat4d_cli::run_folder;
 use splat4d_train::event::Event;
 use splat4d_train::output::{Found, OutputFolder};
 use splat4d_train::recipe::{MotionName, Quality, Recipe};
 use splat4d_train::run::{self, Outcome, Stopwatch, TrainOptions, open_capture};
+use splat4d_workflow::run_folder;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 

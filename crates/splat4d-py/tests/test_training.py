@@ -36,6 +36,21 @@ class Training(InFolder):
         scores = run.evaluate()
         self.assertEqual(scores["PSNR"], run.results["PSNR"])
         self.assertGreater(scores["PSNR"], 10)
+        self.assertTrue(run.status()["finished"])
+        self.assertIn("PSNR", pathlib.Path(run.report()).read_text())
+        rows = splat4d.compare([run.path], [self.folder / "table.csv"])
+        self.assertEqual(rows[0]["scores"]["PSNR"], run.results["PSNR"])
+        self.assertTrue((self.folder / "table.csv").is_file())
+
+    def test_a_run_is_compressed_and_only_a_cut_one_predicted(self):
+        run = self.train("whole")
+        small = run.compress(self.folder / "small", prune=0.5, fine_tune=4, evaluate=False)
+        self.assertTrue((small.path / "scene.s4d").is_file())
+        self.assertLess(len(small.scene()), len(run.scene()))
+        for work in (lambda: run.compress(self.folder / "x", prune=0.5, level=1), run.predict, run.label):
+            with self.assertRaises(splat4d.Error) as raised:
+                work()
+            self.assertEqual(raised.exception.kind, "bad_input")
 
     def test_a_capture_is_trained_as_it_was_opened_unless_told(self):
         capture = splat4d.Capture(KNIGHT, downscale=8, hold_out="camera=0")

@@ -1,5 +1,5 @@
 //! The stages of training outside the renderer, and searches and measures that training uses, on synthetic data:
-//! `cargo bench -p splat4d-train`. `splat4d bench` measures whole steps on real scenes.
+//! `cargo bench -p splat4d-train`. `studies bench` measures whole steps on real scenes.
 
 use divan::Bencher;
 use splat4d::layers::{Layer, LayerTape};

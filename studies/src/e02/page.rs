@@ -3,7 +3,7 @@
 use super::cells::Variant;
 use super::{Found, Study};
 use crate::tables::{number, table};
-use splat4d_cli::report::chart::{self, Series};
+use splat4d_workflow::report::chart::{self, Series};
 
 type Get = fn(&Found) -> Option<f64>;
 

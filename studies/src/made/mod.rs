@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 use splat4d::Error;
 use splat4d::math::Rng;
 use splat4d::math::se3::{dot, norm, sub};
-use splat4d_cli::files;
+use splat4d_workflow::files;
 use std::path::Path;
 use world::{Pinhole, V3};
 

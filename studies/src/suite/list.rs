@@ -4,8 +4,8 @@
 use crate::made;
 use serde::Deserialize;
 use splat4d::{Error, Result};
-use splat4d_cli::files;
 use splat4d_train::capture::HoldOut;
+use splat4d_workflow::files;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 

@@ -11,16 +11,17 @@ use serde::{Deserialize, Serialize};
 use serde_json::json;
 use splat4d::{Error, ErrorKind, Result};
 use splat4d_cli::console::Console;
-use splat4d_cli::files::{self, human_seconds};
-use splat4d_cli::run_folder::Run;
-use splat4d_cli::source::read_scene;
-use splat4d_cli::{finish, interrupt};
+use splat4d_cli::interrupt;
 use splat4d_train::capture::{Capture, ImageStore};
 use splat4d_train::eval::run::{EvalOptions, Scores, assess};
 use splat4d_train::event::Event;
 use splat4d_train::output::OutputFolder;
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::{self, TrainOptions, checkpoint, open_capture, with_found};
+use splat4d_workflow::evaluating;
+use splat4d_workflow::files::{self, human_seconds};
+use splat4d_workflow::run_folder::Run;
+use splat4d_workflow::source::read_scene;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -255,7 +256,7 @@ fn measure(order: &Order<'_>, args: &Args, stop: &AtomicBool, console: &Console)
         found => found.map_err(|e| e.at(args.output.display()).remedy("The same command goes on with it."))?,
     };
     if args.playback || args.tier == Tier::Full {
-        finish::playback(&run, console)?;
+        evaluating::playback(&run, console)?;
         found.playback_psnr = Run::open(&run)?.number("playback_psnr");
     }
     // The scene stays, to look at; checkpoints are three times its size.

@@ -1,7 +1,7 @@
 //! What the suite found, as a Markdown table.
 
 use super::Found;
-use splat4d_cli::files::grouped;
+use splat4d_workflow::files::grouped;
 use std::fmt::Write;
 
 /// The table: a line a cell, then their mean.

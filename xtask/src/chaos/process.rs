@@ -7,8 +7,17 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// A call that takes longer hangs.
+/// Processor time from which a call hangs: undisturbed ones take up to three seconds (studies/records/2026-11-27-reliability.md). Time
+/// on the clock says nothing on a machine that is shared.
+const BUSY: f64 = 60.0;
+/// A call that waits so long without using a processor hangs.
+const IDLE: Duration = Duration::from_secs(60);
+/// Where the system does not say how much processor time a process has used, a call hangs after this time.
 const HANGS: Duration = Duration::from_secs(120);
+/// Time between two readings of the processor time.
+const READING: Duration = Duration::from_millis(500);
+/// Ticks a second in which Linux counts processor time, on all of its architectures.
+const TICKS: f64 = 100.0;
 /// Time between two looks whether a call has ended.
 const LOOK: Duration = Duration::from_millis(2);
 /// Threads of a call: the machine may be shared.
@@ -79,6 +88,11 @@ impl Call {
         Ok(self.child.try_wait()?.is_none())
     }
 
+    /// Processor time of the process and of those that it waited for, seconds; `None`: the system does not say.
+    fn seconds(&self) -> Option<f64> {
+        processor_time(&std::fs::read_to_string(format!("/proc/{}/stat", self.child.id())).ok()?)
+    }
+
     /// kill -9.
     pub(crate) fn kill(mut self) -> Result<()> {
         self.child.kill()?;
@@ -87,9 +101,17 @@ impl Call {
     }
 
     pub(crate) fn end(mut self) -> Result<Ending> {
-        if self.wait(HANGS)? {
-            let _ = self.child.kill();
-            bail!("it hangs: {:?}", self.words);
+        let (mut used, mut moved) = (self.seconds(), Instant::now());
+        while self.wait(READING)? {
+            let now = self.seconds();
+            if now > used {
+                (used, moved) = (now, Instant::now());
+            }
+            let idle = if used.is_some() { IDLE } else { HANGS };
+            if used.is_some_and(|s| s > BUSY) || moved.elapsed() > idle {
+                let _ = self.child.kill();
+                bail!("it hangs after {:.1} s of processor time: {:?}", used.unwrap_or_default(), self.words);
+            }
         }
         let code = self.child.wait()?.code();
         let said = self.said.take().and_then(|s| s.join().ok()).unwrap_or_default();
@@ -102,6 +124,14 @@ impl Drop for Call {
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
+}
+
+/// Seconds of a line of `/proc/PID/stat`: user and system time, own and of children.
+fn processor_time(stat: &str) -> Option<f64> {
+    // The name in parentheses may hold anything; the numbers behind it begin with the third, the state.
+    let numbers: Vec<&str> = stat.rsplit_once(')')?.1.split_ascii_whitespace().collect();
+    let ticks: Option<Vec<f64>> = numbers.get(11..15)?.iter().map(|n| n.parse().ok()).collect();
+    Some(ticks?.iter().sum::<f64>() / TICKS)
 }
 
 /// A folder of this process that goes at the end.
@@ -123,5 +153,26 @@ impl Scratch {
 impl Drop for Scratch {
     fn drop(&mut self) {
         let _ = std::fs::remove_dir_all(&self.0);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn processor_time_is_that_of_the_process_and_its_children() {
+        let stat = "7 (a) b) R 1 7 7 0 -1 4194304 100 0 0 0 150 50 20 30 20 0 1 0 100 1000 10";
+        assert_eq!(processor_time(stat), Some(2.5));
+        assert_eq!(processor_time("7 (a) R 1"), None);
+        #[cfg(target_os = "linux")]
+        assert!(processor_time(&std::fs::read_to_string("/proc/self/stat").unwrap()).is_some());
+    }
+
+    #[test]
+    #[cfg(target_os = "linux")]
+    fn a_call_that_ends_says_how() {
+        let ended = Program("/bin/false".into()).run(&[], Path::new("."), None).unwrap();
+        assert_eq!(ended.code, Some(1));
     }
 }

@@ -1,13 +1,11 @@
 //! `bake`: a run or a scene becomes one file for playback.
 
-use crate::baking::{Baking, bake_into, title};
 use crate::console::Console;
-use crate::files::{self, parse_bytes};
-use crate::playable;
-use crate::source::{Source, not_empty};
 use splat4d::Error;
 use splat4d::bake::{MAX_REPEAT, Options, SEGMENT, TOLERANCE};
 use splat4d::format::playback::{MAX_PALETTE, WriteConfig};
+use splat4d_workflow::baking::{Baking, bake};
+use splat4d_workflow::files::parse_bytes;
 use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
@@ -55,18 +53,10 @@ pub(crate) struct Args {
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let out = &args.output;
-    if !playable::is_named(out) && !out.starts_with("/dev") {
-        return Err(Error::input("the name does not end in .s4d").at(out.display()).remedy("Use -o NAME.s4d.").into());
-    }
     if !(1..=MAX_REPEAT).contains(&args.repeat) || !(1..=MAX_PALETTE).contains(&args.palette) {
         return Err(Error::input("--repeat or --palette is out of range")
             .remedy(format!("Give 1 to {MAX_REPEAT} rounds and 1 to {MAX_PALETTE} entries."))
             .into());
-    }
-    let source = Source::open(&args.source)?;
-    not_empty(&source.scene, &args.source)?;
-    for file in std::iter::once(out).chain(&args.report) {
-        source.keep(&args.source, file, &[])?;
     }
     let baking = Baking {
         options: Options {
@@ -81,11 +71,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         poster: !args.no_poster,
         ..Baking::default()
     };
-    let report = bake_into(&source, &title(&source, &args.source), out, &baking, console)?;
-    if let Some(path) = &args.report {
-        files::write(path, serde_json::to_string_pretty(&report)?.as_bytes())?;
-        console.written(path);
-    }
+    bake(&args.source, out, args.report.as_deref(), &baking, console)?;
     console.next("view", out);
     Ok(())
 }

@@ -1,16 +1,15 @@
 //! `compress`: a trained run becomes one that is many times smaller and faster to play, measured before and after.
 
-use crate::compressing::{Order, Work};
 use crate::console::Console;
-use crate::device::{self, Device};
-use crate::finish;
-use crate::paths::parse_size;
-use crate::run_folder::{self, Run};
-use splat4d::{Error, Result};
+use crate::device::Device;
+use crate::interrupt;
+use crate::measuring::MeasureArgs;
 use splat4d_train::compress::{Compression, Level, MOST_PRUNED};
-use splat4d_train::path_text::in_command;
-use std::ffi::OsStr;
-use std::path::{Path, PathBuf};
+use splat4d_workflow::compressing::{CompressOptions, GUARD, Work};
+use splat4d_workflow::device::chosen;
+use splat4d_workflow::measure::SIZE;
+use splat4d_workflow::paths::parse_size;
+use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -23,9 +22,6 @@ Examples:
 
 The result is a run: DIR/scene.s4d plays anywhere, DIR/report.html compares before and after. The original run is \
 unchanged. docs/compression.md explains the settings.";
-
-/// Default of `--guard`, dB: less is not seen in a moving image.
-const GUARD: f64 = 0.5;
 
 /// Make a trained run smaller and faster to play: prune, mask, quantise, fine-tune; measured before and after
 #[derive(Debug, clap::Args)]
@@ -79,83 +75,36 @@ pub(crate) struct Args {
     #[arg(long, value_enum, default_value = "cpu", help_heading = "Device")]
     device: Device,
     #[command(flatten)]
-    measure: finish::Measure,
+    measure: MeasureArgs,
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     args.measure.check()?;
     let work = match &args.resume {
         Some(dir) => Work::reopen(dir)?,
-        None => begin(args, console)?,
+        None => Work::begin(args.run.as_ref().expect("clap asks for a run"), &options(args), console)?,
     };
-    let work = work.timed_at(args.size.unwrap_or(crate::measure::SIZE));
-    work.on(device::to_train(args.device, console)).run(!args.no_eval, &args.measure, console)
+    let work = work.timed_at(args.size.unwrap_or(SIZE)).on(chosen(args.device.into(), "training", console));
+    let stop = interrupt::flag("stopping");
+    work.run(!args.no_eval, &args.measure.options(), &stop, console)?;
+    Ok(())
 }
 
-/// Settles what is to be done, and where, before anything is computed.
-fn begin(args: &Args, console: &Console) -> anyhow::Result<Work> {
-    let source = args.run.as_ref().expect("clap asks for a run");
-    let run = Run::open(source)?;
-    if !Run::is_finished(source) {
-        return Err(Error::input("the run is unfinished")
-            .at(source.display())
-            .remedy(format!("Finish it first: splat4d train --resume {}", in_command(source)))
-            .into());
-    }
-    let iterations = run.iteration().or_else(|| run.recipe().ok().map(|r| r.run.iterations)).unwrap_or(1);
-    let order = Order {
-        source: std::path::absolute(source)?,
+/// What is to be done.
+fn options(args: &Args) -> CompressOptions {
+    CompressOptions {
+        output: args.output.clone(),
+        force: args.force,
         level: args.level,
-        guard: args.guard,
+        prune: args.prune,
+        score: args.score.clone(),
         max_bytes: args.max_mb.map(|mb| (mb * 1e6) as u64),
+        fine_tune: args.fine_tune,
+        guard: args.guard,
         unpruned: args.unpruned,
-        asked: args.prune.is_some() || args.set.iter().any(|s| s.trim_start().starts_with("prune")),
-        free: args.set.is_empty() && args.fine_tune.is_none(),
-        settings: settings(args, iterations)?,
-        tried: Vec::new(),
-    };
-    let dir = place(args, source, console)?;
-    Ok(Work::begin(dir, order, args.force)?)
-}
-
-/// The level, then the options, then every --set.
-fn settings(args: &Args, iterations: usize) -> Result<Compression> {
-    let mut settings = Compression::level(Level::new(args.level)?, iterations);
-    if let Some(share) = args.prune {
-        if args.level < 2 {
-            return Err(Error::input(format!("--prune belongs to level 2, not to level {}", args.level))
-                .remedy("Leave --level out."));
-        }
-        settings.prune = share;
+        set: args.set.clone(),
+        ..CompressOptions::default()
     }
-    if let Some(steps) = args.fine_tune {
-        // As the level shares its own steps.
-        let all = settings.steps();
-        settings.fine_tune = (settings.fine_tune * steps).checked_div(all).unwrap_or(0);
-        settings.quantise = steps - settings.fine_tune;
-    }
-    if let Some(name) = &args.score {
-        settings.set(&format!("spatial={name}")).map_err(|e| e.at("--score"))?;
-    }
-    for assignment in &args.set {
-        settings.set(assignment).map_err(|e| e.at("--set"))?;
-    }
-    if !settings.codec {
-        return Err(Error::input("`codec` = false is for studies: it makes no file").remedy("Use `splat4d lab e03`."));
-    }
-    Ok(settings)
-}
-
-/// Where the result goes. A folder that the user named is never silently taken over.
-fn place(args: &Args, source: &Path, console: &Console) -> Result<PathBuf> {
-    let Some(dir) = &args.output else {
-        let mut name = source.file_name().unwrap_or(OsStr::new("run")).to_owned();
-        name.push("-compressed");
-        let dir = run_folder::free_folder(&source.with_file_name(name));
-        console.say(&format!("the result is written to {}", dir.display()));
-        return Ok(dir);
-    };
-    Ok(dir.clone())
 }
 
 fn number(text: &str, fits: impl Fn(f64) -> bool, need: &str) -> Result<f64, String> {

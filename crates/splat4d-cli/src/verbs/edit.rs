@@ -1,18 +1,9 @@
 //! `edit`: a list of edits replayed on any scene, and single edits from the command line.
 
-use super::convert;
-use crate::baking::title;
 use crate::console::Console;
-use crate::editing::{self, Bring};
-use crate::files::grouped;
-use crate::source::{Source, not_empty};
-use serde_json::json;
-use splat4d::edit::{Context, Edits, Expr, Step, count, replay};
-use splat4d::{Error, Result};
-use std::path::{Path, PathBuf};
-
-/// Moments of the clip for which --count prints how many are visible.
-const MOMENTS: usize = 5;
+use splat4d::edit::Step;
+use splat4d_workflow::editing::{EditOptions, edit};
+use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -87,66 +78,15 @@ impl Args {
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
-    // What cannot be written is better known before the work.
-    if let Some(output) = &args.output {
-        convert::check_output(output)?;
-    }
-    let list = args.edits.as_deref().map(editing::read).transpose()?.unwrap_or_default();
-    let edits = editing::with_steps(list, args.steps());
-    let mut source = Source::open(&args.scene)?.finite();
-    not_empty(&source.scene, &args.scene)?;
-    source.warnings.lines().iter().for_each(|w| console.warn(&format!("{w}.")));
-    let listed: Vec<&Path> = args.edits.iter().map(PathBuf::as_path).collect();
-    for file in args.output.iter().chain(&args.save) {
-        // A list may be saved with more steps in its own place.
-        let others = if args.save.as_ref() == Some(file) { &[] } else { &listed[..] };
-        source.keep(&args.scene, file, others)?;
-    }
-    let title = title(&source, &args.scene);
-    edits.check(&title)?;
-    if edits.steps.is_empty() && args.count.is_none() {
-        return Err(Error::input("nothing to do")
-            .remedy("Give a list of edits, or an option such as --delete; see --help.")
-            .into());
-    }
-    let bring = Bring::new(&source, args.edits.as_deref(), console)?;
-    let before = source.scene.len();
-    let (scene, done) = replay(&edits.steps, source.scene.clone(), &bring, &mut |done, all| {
-        console.phase("editing", done, all);
-    })?;
-    console.clear();
-    for step in &done {
-        console.say(&format!("{}: {} Gaussians", step.step, grouped(step.selected)));
-    }
-    if let Some(text) = &args.count {
-        return Ok(tell(text, &scene, &bring, console)?);
-    }
-    console.say(&format!("{} Gaussians of {} in {} layers", grouped(scene.len()), grouped(before), scene.layers.len()));
-    console.emit(&json!({"type": "edited", "before": before, "gaussians": scene.len(), "layers": scene.layers.len(),
-        "steps": done}));
-    source.scene = scene;
-    let earlier = source.provenance.take();
-    source.provenance = (!args.no_provenance).then(|| editing::provenance(&source, earlier, &edits, args.note.clone()));
-    if let Some(path) = &args.save {
-        editing::write(path, &Edits { scene: Some(title), ..edits })?;
-        console.written(path);
-    }
-    let output = args.output.clone().expect("clap asks for an output where nothing is counted");
-    convert::write(&convert::Args::plain(args.scene.clone(), output), source, console)
-}
-
-/// How many a selection holds, and of them how many can be seen when.
-fn tell(text: &str, scene: &splat4d::layers::Scene<f32>, context: &dyn Context, console: &Console) -> Result<()> {
-    let [start, end] = scene.clip;
-    let mut times: Vec<f64> = (0..MOMENTS).map(|i| start + (end - start) * i as f64 / (MOMENTS - 1) as f64).collect();
-    times.dedup();
-    let (all, seen) = count(&Expr::parse(text)?, scene, &times, context)?;
-    console.clear();
-    console.say(&format!("{text}: {} of {} Gaussians", grouped(all), grouped(scene.len())));
-    for (t, n) in times.iter().zip(&seen) {
-        console.say(&format!("{t:>9.3} s  {} visible", grouped(*n)));
-    }
-    console.emit(&json!({"type": "count", "selection": text, "gaussians": all, "of": scene.len(),
-        "seen": times.iter().zip(&seen).map(|(t, n)| json!([t, n])).collect::<Vec<_>>()}));
-    Ok(())
+    let options = EditOptions {
+        scene: args.scene.clone(),
+        list: args.edits.clone(),
+        steps: args.steps(),
+        output: args.output.clone(),
+        count: args.count.clone(),
+        note: args.note.clone(),
+        no_provenance: args.no_provenance,
+        save: args.save.clone(),
+    };
+    Ok(edit(&options, console)?)
 }

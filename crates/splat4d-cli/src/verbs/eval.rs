@@ -1,19 +1,19 @@
 //! `eval`: measures a run again, perhaps next to a scene that stands still.
 
 use crate::console::Console;
-use crate::deadline::Deadline;
-use crate::device::{self, Device};
-use crate::finish;
-use crate::run_folder::{Run, cameras_json};
-use crate::source::{Source, not_empty, read_scene};
-use serde_json::{Value, json};
-use splat4d::ErrorKind;
-use splat4d_train::eval::run::{EvalOptions, Measured};
-use splat4d_train::output::{Input, Mixes, OutputFolder, Request};
-use splat4d_train::recipe::{MotionName, Recipe};
-use splat4d_train::run::{self, TrainOptions, open_capture};
-use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use crate::device::Device;
+use crate::interrupt;
+use crate::measuring::MeasureArgs;
+use splat4d_train::eval::run::Measured;
+use splat4d_train::output::OutputFolder;
+use splat4d_workflow::deadline::Deadline;
+use splat4d_workflow::device::chosen;
+use splat4d_workflow::evaluating::{self, Measure};
+use splat4d_workflow::foreign::{self, ForeignOptions};
+use splat4d_workflow::run_folder::Run;
+use splat4d_workflow::source::read_scene;
+use splat4d_workflow::still_baseline::baseline;
+use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -28,9 +28,6 @@ Examples:
 Results are in RUN/results.json and RUN/per_view.json (keys as in 3DGS), images in RUN/test/ours_N. --split and \
 --background only compute scores; results of another split or background have their own entry and folder, such as \
 `val` or `test-black`.";
-
-/// Folder of the still scene, in the run.
-const BASELINE: &str = "baseline";
 
 /// What transparent pixels are composited on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -118,7 +115,7 @@ pub(crate) struct Args {
     #[arg(long, value_enum, default_value = "cpu", help_heading = "Device")]
     device: Device,
     #[command(flatten)]
-    measure: finish::Measure,
+    measure: MeasureArgs,
 
     #[arg(short = 'm', long = "model-path", alias = "model_path", hide = true, conflicts_with = "run")]
     model: Option<PathBuf>,
@@ -126,124 +123,40 @@ pub(crate) struct Args {
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     args.measure.check()?;
-    let lpips_weights = args.measure.lpips_weights.clone();
-    let measure = finish::Measure { lpips_weights, device: device::chosen(args.device, "measuring", console) };
+    let measure = Measure { device: chosen(args.device.into(), "measuring", console), ..args.measure.options() };
     let path = args.run.as_ref().or(args.model.as_ref()).expect("clap asks for a run");
     if let Some(capture) = &args.capture {
-        return on_capture(args, path, capture, &measure, console);
+        let options = ForeignOptions {
+            hold_out: args.hold_out.clone(),
+            downscale: args.downscale,
+            output: args.output.clone(),
+            force: args.force,
+            measured: args.split.unwrap_or(Split::Test).measured(),
+            backgrounds: args.background.map_or(&[][..], Background::colors),
+        };
+        return Ok(foreign::score(path, capture, &options, &measure, console)?);
     }
     let run = Run::open(path)?;
     run.scene_file()?;
     let folder = OutputFolder::amend(path, "eval")?;
     if let Some(truth) = &args.truth {
-        return finish::trajectory(path, truth, console);
+        return Ok(evaluating::trajectory(path, truth, console)?);
     }
     if args.split.is_some() || args.background.is_some() {
         let split = args.split.unwrap_or(Split::Test).measured();
         let backgrounds = args.background.map_or(&[][..], Background::colors);
-        finish::scores_on(path, split, backgrounds, &measure, console)?;
-        return finish::write_page(path, console);
+        evaluating::scores_on(path, split, backgrounds, &measure, console)?;
+        return Ok(evaluating::write_page(path, console)?);
     }
     if args.baseline {
-        baseline(&folder, &run, &measure, console)?;
+        let stop = interrupt::flag("stopping");
+        interrupt::ends("the same command begins again");
+        baseline(&folder, &run, &measure, &stop, console)?;
     }
     if args.no_film {
         let scene = read_scene(&run.scene_file()?)?;
-        finish::scores(path, &scene, &measure, console)?;
-        return finish::write_report(path, console);
+        evaluating::scores(path, &scene, &measure, console)?;
+        return Ok(evaluating::write_report(path, console)?);
     }
-    finish::all(path, &measure, &Deadline::default(), console)
-}
-
-/// Scores any scene on the views of a capture.
-fn on_capture(
-    args: &Args,
-    path: &Path,
-    capture: &Path,
-    measure: &finish::Measure,
-    console: &Console,
-) -> anyhow::Result<()> {
-    let mut recipe = Recipe::default();
-    let wanted = [
-        ("hold_out", args.hold_out.as_ref().map(|v| format!("{v:?}"))),
-        ("downscale", args.downscale.map(|k| k.to_string())),
-    ];
-    for (name, value) in wanted {
-        value.map_or(Ok(()), |value| recipe.set(&format!("{name}={value}")))?;
-    }
-    let source = Source::open(path)?.finite();
-    not_empty(&source.scene, path)?;
-    source.warnings.lines().iter().for_each(|w| console.warn(&format!("{w}.")));
-    if let Some(run) = &source.run {
-        recipe.appearance.antialias = run.recipe()?.appearance.antialias;
-    }
-    let folder = args.output.as_ref().map(|output| {
-        let inputs = [
-            Input { may_hold: source.run.is_some(), ..Input::new(path, "the scene") },
-            Input::new(capture, "the capture"),
-        ];
-        let asked = format!("{} on {}", path.display(), capture.display());
-        let request =
-            Request { command: "eval", inputs: &inputs, asked: &asked, force: args.force, mixes: Mixes::Anything };
-        OutputFolder::begin(output, &request).map(|(folder, _)| folder)
-    });
-    let folder = folder.transpose()?;
-    let split = args.split.unwrap_or(Split::Test).measured();
-    let backgrounds = args.background.map_or(&[][..], Background::colors);
-    let out = folder.as_ref().map(OutputFolder::path);
-    finish::foreign_scores(
-        source.scene,
-        &open_capture(capture, &recipe)?,
-        &recipe,
-        out,
-        split,
-        backgrounds,
-        measure,
-        console,
-    )?;
-    if let Some(folder) = folder {
-        folder.finished();
-    }
-    Ok(())
-}
-
-/// Trains the still scene unless it is there, and measures it.
-fn baseline(out: &OutputFolder, run: &Run, measure: &finish::Measure, console: &Console) -> anyhow::Result<()> {
-    let path = out.path();
-    let folder = path.join(BASELINE);
-    let recipe = run.recipe()?.with(|r| r.run.motion = MotionName::of("still"));
-    let cached = Run::is_finished(&folder)
-        && Run::open(&folder).and_then(|b| b.recipe()).is_ok_and(|b| b.resolve() == recipe.resolve());
-    if !cached {
-        console.say("training a still scene with the same recipe, to compare");
-        out.clear_inner(BASELINE)?;
-        let (capture, _) = run.open_capture()?;
-        crate::files::make_folder(&folder)?;
-        crate::files::write(&folder.join("cameras.json"), &serde_json::to_vec(&cameras_json(&capture))?)?;
-        let stop = crate::interrupt::flag("stopping");
-        let options = TrainOptions::default();
-        let outcome =
-            run::train(Arc::new(capture), recipe, &folder, &options, &stop, &mut |event| console.event(event))?;
-        console.clear();
-        if outcome.interrupted {
-            return Err(splat4d::Error::new(ErrorKind::Interrupted, "the still scene is unfinished")
-                .remedy("Run `splat4d eval --baseline` again; it trains again.")
-                .into());
-        }
-        crate::interrupt::ends("the still scene is kept, and the same command makes what is missing");
-    }
-    let scene = read_scene(&Run::open(&folder)?.scene_file()?)?;
-    let evaluation = finish::scores(&folder, &scene, measure, console)?;
-    let scores: Value = evaluation.report.results()[evaluation.report.method()].clone();
-    let results = path.join("results.json");
-    let mut all = if results.is_file() {
-        crate::camera_file::json(&crate::files::read_text(&results)?).map_err(|e| e.at(results.display()))?
-    } else {
-        json!({})
-    };
-    if let Some(map) = all.as_object_mut() {
-        map.insert(EvalOptions::STILL.into(), scores);
-    }
-    crate::files::write(&results, serde_json::to_string_pretty(&all)?.as_bytes())?;
-    Ok(())
+    Ok(evaluating::all(path, &measure, &Deadline::default(), console)?)
 }

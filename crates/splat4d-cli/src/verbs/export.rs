@@ -1,21 +1,18 @@
 //! `export`: moments of a scene as plain 3DGS .ply files, the whole of it as one page with its player, or where its
 //! Gaussians, or points that are asked for, go as JSON or CSV.
 
-use crate::asked::{self, Answer};
 use crate::console::Console;
-use crate::files;
-use crate::playable::{Playable, is_named};
-use crate::run_folder::Run;
-use crate::sequence;
-use crate::source::{Source, keep, not_empty};
 use serde_json::json;
+use splat4d::Error;
 use splat4d::flow::tracks::{Tracks, every, nearest};
 use splat4d::layers::Scene;
-use splat4d::layers::freeze;
 use splat4d::math::Rng;
 use splat4d::scene::{RowEdit, Space, Time, labels};
-use splat4d::{Error, format};
-use splat4d_serve::{Page, SceneIn};
+use splat4d_workflow::exporting;
+use splat4d_workflow::files;
+use splat4d_workflow::point_queries::{self, Answer};
+use splat4d_workflow::sequence;
+use splat4d_workflow::source::{Source, not_empty};
 use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
@@ -133,7 +130,8 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
                 .remedy("First write a file with that label only: splat4d edit RUN --crop 'label(NAME)' -o part.s4d.")
                 .into());
         }
-        return page(path, args, console);
+        let out = args.output.as_ref().expect("clap asks for an output");
+        return Ok(exporting::page(path, out, args.link.as_deref(), console)?);
     }
     if args.link.is_some() {
         return Err(Error::input("--link needs a page").remedy("Add -o NAME.html.").into());
@@ -151,13 +149,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     }
     let scene = &source.scene;
     not_empty(scene, path)?;
-    let write = |time: f64, out: &Path| -> anyhow::Result<usize> {
-        let params = freeze(scene, Time(time))?;
-        let mut bytes = Vec::new();
-        format::ply::write_placed(&params, (scene.offset, args.world), &mut bytes)?;
-        files::write(out, &bytes)?;
-        Ok(params.len())
-    };
+    let write = |time: f64, out: &Path| exporting::moment(scene, time, args.world, out);
     if let Some(out) = &args.tracks {
         return match &args.points {
             Some(points) => followed(&source, args, [points, out], console),
@@ -189,12 +181,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     }
     let time = args.time.unwrap_or(scene.clip[0]);
     let n = write(time, out)?;
-    if n == 0 {
-        console.warn(&format!(
-            "no Gaussian is active at {time} s: the file is empty. The scene lasts from {} to {} s.",
-            scene.clip[0], scene.clip[1]
-        ));
-    }
+    exporting::warn_of_empty(scene, time, n, console);
     console.say(&format!("{} Gaussians at {time} s", files::grouped(n)));
     console.emit(&json!({"type": "exported", "gaussians": n, "time": time}));
     console.written(out);
@@ -222,7 +209,8 @@ fn followed(source: &Source, args: &Args, [points, out]: [&PathBuf; 2], console:
     let (scene, json) = (&source.scene, is_json(out)?);
     let (_, times) = sequence::moments(scene, args.fps, [args.from, args.to])?;
     let views = source.views()?;
-    let asked = asked::read(&files::read_text(points)?, &views, scene.clip).map_err(|e| e.at(points.display()))?;
+    let asked =
+        point_queries::read(&files::read_text(points)?, &views, scene.clip).map_err(|e| e.at(points.display()))?;
     if asked.len().saturating_mul(times.len()).saturating_mul(3) > MOST_NUMBERS {
         return Err(Error::input(format!("{} points at {} times are too many", asked.len(), times.len()))
             .remedy("Give fewer points, or fewer times with --fps, --from or --to.")
@@ -283,85 +271,4 @@ fn tracks(scene: &Scene<f32>, args: &Args, out: &Path, console: &Console) -> any
     console.emit(&json!({"type": "exported", "tracks": members.len(), "moments": times.len()}));
     console.written(out);
     Ok(())
-}
-
-/// Writes the page, and the scene next to it where that is wanted.
-fn page(path: &Path, args: &Args, console: &Console) -> anyhow::Result<()> {
-    let out = args.output.as_ref().expect("clap asks for an output");
-    if !["html", "htm"].iter().any(|e| out.extension().is_some_and(|own| own.eq_ignore_ascii_case(e)))
-        && !out.starts_with("/dev")
-    {
-        return Err(Error::input("a page's name ends in .html").at(out.display()).remedy("Use -o NAME.html.").into());
-    }
-    let run = Run::is(path).then(|| Run::open(path)).transpose()?;
-    keep(path, run.as_ref(), out, &[])?;
-    if let Some(link) = args.link.as_ref().filter(|link| !is_named(link)) {
-        return Err(Error::input("the name does not end in .s4d")
-            .at(link.display())
-            .remedy("Use --link NAME.s4d.")
-            .into());
-    }
-    // A playback file may lie next to its page as it is.
-    let is_read = |link: &&PathBuf| link.canonicalize().ok().is_some_and(|l| path.canonicalize().is_ok_and(|p| p == l));
-    if let Some(link) = args.link.as_ref().filter(|link| !is_read(link)) {
-        keep(path, run.as_ref(), link, &[])?;
-    }
-    let address = args.link.as_ref().map(|link| address(link, out)).transpose()?;
-    let scene = Playable::open(path, console)?;
-    let bytes = scene.bytes()?;
-    let inside = SceneIn::Inside(&bytes);
-    let html = Page { title: &scene.title, scene: address.as_deref().map_or(inside, SceneIn::Linked) }.html()?;
-    if let Some(link) = &args.link {
-        files::write(link, &bytes)?;
-        console.written(link);
-    }
-    files::write(out, html.as_bytes())?;
-    console.say(&format!("a page of {}", files::human_bytes(html.len() as u64)));
-    console.written(out);
-    if args.link.is_some() {
-        console.say("put both on a web server: browsers do not let a page opened from disk read another file");
-    }
-    Ok(())
-}
-
-/// How the page names the file: relative to its own folder, percent-encoded.
-fn address(link: &Path, page: &Path) -> anyhow::Result<String> {
-    let folder = |path: &Path| -> anyhow::Result<PathBuf> {
-        let parent = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        Ok(std::fs::canonicalize(parent).map_err(|e| files::cannot_write(path, e))?)
-    };
-    let (at, below) = (folder(page)?, folder(link)?);
-    let (Ok(below), Some(name)) = (below.strip_prefix(&at), link.file_name()) else {
-        return Err(Error::input("is not in the page's folder")
-            .at(link.display())
-            .remedy("Give --link a file in the page's folder or below it.")
-            .into());
-    };
-    let parts = below.iter().chain([name]).map(|part| percent(&part.to_string_lossy()));
-    Ok(format!("./{}", parts.collect::<Vec<_>>().join("/")))
-}
-
-/// A part of an address (RFC 3986): everything but unreserved characters as bytes in hexadecimal.
-fn percent(text: &str) -> String {
-    let one = |b: u8| {
-        let plain = b.is_ascii_alphanumeric() || b"-._~".contains(&b);
-        if plain { char::from(b).to_string() } else { format!("%{b:02X}") }
-    };
-    text.bytes().map(one).collect()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_page_names_its_scene_from_where_it_lies() {
-        let folder = tempfile::tempdir().unwrap();
-        std::fs::create_dir(folder.path().join("a b")).unwrap();
-        let at = |name: &str| folder.path().join(name);
-        assert_eq!(address(&at("x.s4d"), &at("page.html")).unwrap(), "./x.s4d");
-        assert_eq!(address(&at("a b/ü#?.s4d"), &at("page.html")).unwrap(), "./a%20b/%C3%BC%23%3F.s4d");
-        assert!(address(&at("x.s4d"), &at("a b/page.html")).is_err(), "browsers would ask above the page");
-        assert!(address(&at("none/x.s4d"), &at("page.html")).is_err());
-    }
 }

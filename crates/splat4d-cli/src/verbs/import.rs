@@ -2,7 +2,6 @@
 
 use crate::console::Console;
 use crate::interrupt;
-use crate::report::doctor;
 use serde_json::json;
 use splat4d::{Error, ErrorKind};
 use splat4d_import::board::Board;
@@ -15,6 +14,7 @@ use splat4d_train::event::Progress;
 use splat4d_train::output::{Input, OutputFolder, check_apart, written};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::open_capture;
+use splat4d_workflow::report::doctor;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;

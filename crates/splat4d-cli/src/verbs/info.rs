@@ -3,12 +3,7 @@
 mod doctor;
 mod playback;
 
-use crate::chunked;
 use crate::console::Console;
-use crate::files::{self, grouped, human_bytes, human_seconds};
-use crate::run_folder::{Origin, Run};
-use crate::source::{Source, bundle, cloud};
-use crate::verbs::status;
 use serde_json::{Value, json};
 use splat4d::Error;
 use splat4d::format::sog;
@@ -25,6 +20,10 @@ use splat4d_train::path_text::{in_command, to_text};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::chunks::Outlook;
 use splat4d_train::run::{Stopwatch, memory_estimate, open_capture};
+use splat4d_workflow::files::{self, grouped, human_bytes, human_seconds};
+use splat4d_workflow::run_folder::{Origin, Run};
+use splat4d_workflow::source::{Source, bundle, cloud};
+use splat4d_workflow::{chunked, status};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -428,7 +427,7 @@ fn of_run(path: &Path) -> anyhow::Result<Told> {
         "iterations": total, "changed_knobs": changed, "info": run.info, "results": run.all_results,
     });
     if let Ok(file) = run.scene_file() {
-        let scene = crate::source::read_scene(&file)?;
+        let scene = splat4d_workflow::source::read_scene(&file)?;
         let inner = of_scene(&scene);
         text.push_str(&inner.text);
         troubles.extend(inner.troubles);

@@ -1,11 +1,12 @@
 //! `join`: the finished chunks of a long take become one scene and one file.
 
-use crate::chunked;
 use crate::console::Console;
-use crate::deadline::Deadline;
-use crate::{finish, interrupt};
+use crate::interrupt;
+use crate::measuring::MeasureArgs;
 use splat4d_train::output::OutputFolder;
 use splat4d_train::run::chunks::Chunked;
+use splat4d_workflow::chunked;
+use splat4d_workflow::deadline::Deadline;
 use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
@@ -24,7 +25,7 @@ pub(crate) struct Args {
     #[arg(long)]
     no_eval: bool,
     #[command(flatten)]
-    measure: finish::Measure,
+    measure: MeasureArgs,
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
@@ -33,7 +34,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     interrupt::ends("all parts are kept, and the same command joins them");
     let chunked = Chunked::open(&args.run)?;
     let _folder = OutputFolder::amend(&args.run, "join")?;
-    chunked::join(&args.run, &chunked, args.no_eval, &args.measure, &Deadline::default(), &stop, console)?;
+    chunked::join(&args.run, &chunked, args.no_eval, &args.measure.options(), &Deadline::default(), &stop, console)?;
     console.next("view", &args.run);
     Ok(())
 }

@@ -1,9 +1,7 @@
 //! `label`: labels and features learnt into a trained run from masks and images of features.
 
 use crate::console::Console;
-use crate::run_folder::Run;
-use crate::{finish, labelling};
-use splat4d_train::output::OutputFolder;
+use splat4d_workflow::labelling;
 use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
@@ -31,9 +29,5 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
-    Run::open(&args.run)?;
-    let _folder = OutputFolder::amend(&args.run, "label")?;
-    labelling::label(&args.run, args.from.as_deref(), args.rounds.map(usize::from), console)?;
-    finish::playback(&args.run, console)?;
-    finish::write_page(&args.run, console)
+    Ok(labelling::label(&args.run, args.from.as_deref(), args.rounds.map(usize::from), console)?)
 }

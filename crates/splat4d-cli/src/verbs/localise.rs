@@ -1,17 +1,17 @@
 //! `localise`: from where and when images of a scene were taken.
 
-use crate::camera_file;
 use crate::console::Console;
-use crate::files;
-use crate::paths::View;
-use crate::run_folder::{view_json, views_in};
-use crate::source::{Source, not_empty};
 use serde_json::{Value, json};
 use splat4d::render::Antialias;
 use splat4d::scene::{Camera, Intrinsics, Planes};
 use splat4d::{Error, Result};
 use splat4d_train::capture::Rgb8;
 use splat4d_train::eval::localise::{Located, Question, SURE, localise};
+use splat4d_workflow::camera_file;
+use splat4d_workflow::files;
+use splat4d_workflow::paths::View;
+use splat4d_workflow::run_folder::{view_json, views_in};
+use splat4d_workflow::source::{Source, not_empty};
 use std::path::{Path, PathBuf};
 
 /// Largest difference of the shapes (width over height) of an image and a start's.

@@ -1,7 +1,6 @@
 //! One file per command: its options, its help and its work.
 
 pub(crate) mod bake;
-pub(crate) mod bench;
 pub(crate) mod compare;
 pub(crate) mod completions;
 pub(crate) mod compress;

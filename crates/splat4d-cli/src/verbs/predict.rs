@@ -1,15 +1,13 @@
 //! `predict`: how a run that saw a part of its take goes on, compared with the part that it did not see.
 
 use crate::console::Console;
-use crate::files;
-use crate::predicting::{Order, Work};
-use crate::run_folder::Run;
 use splat4d::{Error, Result};
 use splat4d_dynamics::actions::Actions;
 use splat4d_dynamics::learnt::Training;
 use splat4d_dynamics::models::Model;
 use splat4d_dynamics::nodes::MAX_NODES;
-use splat4d_train::output::OutputFolder;
+use splat4d_workflow::files;
+use splat4d_workflow::predicting::{NODES, PredictOptions, STEPS, predict};
 use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
@@ -27,8 +25,6 @@ koopman (decaying oscillations), causal (state space), graph (messages along edg
 predict.json, dynamics.safetensors and the predicted scene as scene.s4d and scene.safetensors. With several models, the \
 scene uses the one with the best forecasts within the observed part.";
 
-/// Default of `--nodes`.
-const NODES: usize = 48;
 /// Largest horizon, frames: a minute at 60 frames a second.
 const MAX_HORIZON: usize = 3600;
 /// Most members of an ensemble.
@@ -58,7 +54,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "N", default_value_t = NODES as u32, value_parser = clap::value_parser!(u32).range(1..=MAX_NODES as i64))]
     nodes: u32,
     /// Training steps of causal and graph
-    #[arg(long, value_name = "STEPS", default_value_t = 1500, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    #[arg(long, value_name = "STEPS", default_value_t = STEPS as u32, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     steps: u32,
     /// Give causal and graph the down direction
     #[arg(long)]
@@ -80,7 +76,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         name => name.split(',').map(|n| Model::from_name(n.trim())).collect::<Result<_>>()?,
     };
     let read = |path: &PathBuf| Actions::parse(&files::read_text(path)?).map_err(|e: Error| e.at(path.display()));
-    let order = Order {
+    let options = PredictOptions {
         run: args.run.clone(),
         horizon: args.horizon.map(|h| h as usize),
         models,
@@ -93,7 +89,6 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         oracle: args.oracle.clone(),
         film: !args.no_film,
     };
-    Run::open(&args.run)?;
-    let _folder = OutputFolder::amend(&args.run, "predict")?;
-    Work::open(order, console)?.run(console)
+    predict(options, console)?;
+    Ok(())
 }

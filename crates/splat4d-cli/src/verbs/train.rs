@@ -1,13 +1,10 @@
 //! `train`: a capture becomes a run: trained, measured, filmed and reported.
 
-use crate::chunked::{self, Wanted};
 use crate::console::Console;
-use crate::deadline::Deadline;
-use crate::device::{self, Device};
-use crate::files::{self, human_bytes, parse_bytes};
-use crate::run_folder::{self, Asked, Run, cameras_json};
+use crate::device::Device;
+use crate::interrupt;
+use crate::measuring::MeasureArgs;
 use crate::serving::{self, Control, Place, Watch};
-use crate::{finish, interrupt, labelling};
 use serde_json::json;
 use splat4d::{Error, ErrorKind};
 use splat4d_import::shipped;
@@ -20,6 +17,12 @@ use splat4d_train::run::chunks::{Chunked, Outlook, look_ahead};
 use splat4d_train::run::{self, Outcome, Stopwatch, TrainOptions};
 use splat4d_train::run::{memory_estimate, open_capture, open_frames};
 use splat4d_train::settings::{Knob, nearest};
+use splat4d_workflow::chunked::{self, Wanted};
+use splat4d_workflow::deadline::Deadline;
+use splat4d_workflow::device::chosen;
+use splat4d_workflow::files::{self, human_bytes, parse_bytes};
+use splat4d_workflow::run_folder::{self, Asked, Run, write_cameras};
+use splat4d_workflow::{evaluating, labelling};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -149,7 +152,7 @@ pub struct Args {
     #[arg(long, value_enum, default_value = "cpu", help_heading = "Device")]
     device: Device,
     #[command(flatten)]
-    measure: finish::Measure,
+    measure: MeasureArgs,
     /// Show the scene in the browser during training, and on a terminal afterwards until Ctrl-C
     #[arg(long, help_heading = "Serving")]
     view: bool,
@@ -215,7 +218,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         let opened = Run::open(run)?;
         let watch = watch(&opened.name(), images(&opened).as_ref());
         let folder = OutputFolder::amend(run, "train --resume")?;
-        let device = device::to_train(args.device, console);
+        let device = chosen(args.device.into(), "training", console);
         let clock = clock.clone();
         let options = TrainOptions { device, snapshots: snapshots(&watch), clock, ..TrainOptions::default() };
         interrupt::asks(SAVING);
@@ -254,7 +257,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         let outlook = match at_once {
             true => None,
             false => {
-                let finish = finish::steps(&capture, &recipe, args.no_eval);
+                let finish = evaluating::steps(&capture, &recipe, args.no_eval);
                 let listen = &mut |event: &Event| console.event(event);
                 Outlook::new(&capture, &recipe, minutes, finish, false, &clock, listen)?
             }
@@ -281,7 +284,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             let chunked = begun.expect("a take that has a plan is learnt by it").paced(outlook.pacing);
             let _folder = match folder {
                 Ok(own) => {
-                    files::write(&run.join("cameras.json"), &serde_json::to_vec(&cameras_json(&once(&capture)))?)?;
+                    write_cameras(&run, &once(&capture))?;
                     own.share()
                 }
                 Err(shared) => shared,
@@ -303,9 +306,9 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         describe(&whole, memory_estimate(&whole, &recipe), console);
         let watch = watch(&whole.name, Some(&whole));
         let options = TrainOptions {
-            device: device::to_train(args.device, console),
+            device: chosen(args.device.into(), "training", console),
             minutes,
-            finish: finish::steps(&whole, &recipe, args.no_eval),
+            finish: evaluating::steps(&whole, &recipe, args.no_eval),
             predict,
             clock: clock.clone(),
             own_loss: None,
@@ -322,7 +325,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         } else {
             // The recipe first: whatever comes to pass from here on, the folder is known for what it is.
             files::write(&run.join("recipe.toml"), recipe.to_toml().as_bytes())?;
-            files::write(&run.join("cameras.json"), &serde_json::to_vec(&cameras_json(&whole))?)?;
+            write_cameras(&run, &whole)?;
             run::train(whole, recipe, &run, &options, &stop, &mut hear)
         };
         match run_folder::left(folder, &run, &trained) {
@@ -335,7 +338,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     };
     console.clear();
     let outcome: Outcome = trained?;
-    finish::amend(&run, [("notes".into(), json!(console.warnings()))])?;
+    evaluating::amend(&run, [("notes".into(), json!(console.warnings()))])?;
     if outcome.interrupted {
         let resume = format!("splat4d train --resume {}", in_command(&run));
         watch.stopped(outcome.iteration, &resume);
@@ -351,18 +354,18 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         "the scene is trained and saved: splat4d eval {name} makes the scores, the film and the report"
     ));
     console.say(&format!("wrote {}", run.join("scene.safetensors").display()));
-    finish::say_refined(&run, console)?;
+    evaluating::say_refined(&run, console)?;
     if labelling::has_any(&Run::open(&run)?.open_capture()?.0) {
-        labelling::label(&run, None, None, console)?;
+        labelling::learn_into(&run, None, None, console)?;
     }
     let deadline = match &args.resume {
-        Some(run) => finish::rest_of(&Run::open(run)?, clock),
+        Some(run) => evaluating::rest_of(&Run::open(run)?, clock),
         None => Deadline::of(clock, args.minutes),
     };
     if args.no_eval {
-        finish::playback_by(&run, &deadline, console)?;
+        evaluating::playback_by(&run, &deadline, console)?;
     } else {
-        finish::all(&run, &args.measure, &deadline, console)?;
+        evaluating::all(&run, &args.measure.options(), &deadline, console)?;
     }
     folder.finished();
     watch.show(&run, outcome.iteration);
@@ -387,7 +390,7 @@ fn in_chunks(
     console: &Console,
 ) -> anyhow::Result<()> {
     let options = TrainOptions {
-        device: device::to_train(args.device, console),
+        device: chosen(args.device.into(), "training", console),
         clock: clock.clone(),
         minutes: args.minutes,
         snapshots: watch.is_on().then_some(SNAPSHOT_INTERVAL),
@@ -414,7 +417,7 @@ fn in_chunks(
             // The other workers are done with it, or wait for the same.
             let _owner = Owner::wait(run, JOIN, &mut |_| !stop.load(Ordering::Relaxed))?;
             let deadline = Deadline::of(clock, args.minutes);
-            chunked::join(run, chunked, args.no_eval, &args.measure, &deadline, stop, console)?;
+            chunked::join(run, chunked, args.no_eval, &args.measure.options(), &deadline, stop, console)?;
             console.next("view", run);
             console.emit(&json!({"type": "done", "run": run.to_string_lossy()}));
         }

@@ -1,20 +1,20 @@
 //! `view`: a scene in the browser's player.
 
-use crate::baking::{Baking, pack, title};
-use crate::capture_page;
 use crate::console::Console;
-use crate::editor::Editor;
 use crate::interrupt;
-use crate::playable::Playable;
-use crate::run_folder::Run;
 use crate::serving::{self, Place};
-use crate::source::{Source, not_empty};
 use serde_json::json;
 use splat4d::Error;
 use splat4d_serve::{Config, Content, Editing};
 use splat4d_train::capture::{Capture, is_metadata};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::open_capture;
+use splat4d_workflow::baking::{Baking, pack, title};
+use splat4d_workflow::capture_page;
+use splat4d_workflow::editor::{self, Editor};
+use splat4d_workflow::playable::Playable;
+use splat4d_workflow::run_folder::Run;
+use splat4d_workflow::source::{Source, not_empty};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -55,7 +55,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
                 .remedy("Download it first.")
                 .into());
         }
-        token = Some(serving::token()?);
+        token = Some(editor::token()?);
         editing(Path::new(&args.source), file, token.clone().expect("it was just made"), console)?
     } else if let Some(address) = address {
         let name = address.split(['?', '#']).next().and_then(|path| path.rsplit('/').next()).unwrap_or_default();

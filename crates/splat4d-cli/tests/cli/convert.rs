@@ -251,7 +251,7 @@ fn plain_files_keep_their_bits_and_orders_that_cannot_be_are_refused() {
     assert_ne!(turned.layers[0].params, params);
 
     let refused = |args: &[&str]| splat4d(args).run_in(work.path()).refused();
-    assert!(refused(&["convert", "a.ply", "a.sog"]).contains("not written"));
+    assert!(refused(&["convert", "a.ply", "a.pt"]).contains("not written"));
     assert!(refused(&["convert", "a.ply", "a.obj"]).contains(".splatv"));
     assert!(refused(&["convert", "a.ply", "f_%d.ply"]).contains("--frames"));
     assert!(refused(&["convert", "a.ply", "b.spz", "--frames"]).contains("pattern"));

@@ -102,6 +102,6 @@ fn mistakes_are_reported_and_the_old_file_stays() {
         std::fs::write(&list, text).unwrap();
         tell(&[&list], &[word]);
     }
-    let error = splat4d(&["edit", &birds, "--delete", "all", "-o", &at("out.glb")]).run().refused();
+    let error = splat4d(&["edit", &birds, "--delete", "all", "-o", &at("out.ksplat")]).run().refused();
     assert!(error.contains("not written"), "{error}");
 }

@@ -5,9 +5,9 @@ use crate::{TINY, str};
 use splat4d::format::ply;
 use splat4d::scene::params::QUAT;
 use splat4d::scene::{GEOMETRY, LifeKind, Params};
-use splat4d_cli::run_folder::Asked;
 use splat4d_train::output::Owner;
 use splat4d_train::recipe::{MotionName, Recipe};
+use splat4d_workflow::run_folder::Asked;
 use std::path::Path;
 
 /// A file of one Gaussian.
@@ -218,6 +218,15 @@ fn no_output_replaces_what_a_capture_reads_from_elsewhere() {
         let said = splat4d(words).run().refused();
         assert!(said.contains(how), "{words:?}: {said}");
     }
+    // A capture that can no longer be opened keeps what the run recorded.
+    std::fs::write(capture.join("capture.json"), "{").unwrap();
+    let info = serde_json::json!({"version": "0", "capture": str(&capture), "capture_elsewhere": [str(&images), str(&points)]});
+    std::fs::write(run.join("run.json"), info.to_string()).unwrap();
+    refused(&images.join("cam1/0000.png"));
+    let said = splat4d(&["export", str(&run), "--sequence", str(&new)]).run().refused();
+    assert!(said.contains("lies inside a folder of the capture's images"), "{said}");
+    let said = splat4d(&["export", str(&run), "-o", str(&points)]).run().refused();
+    assert!(said.contains("is a file of the capture"), "{said}");
     // The frames that are read are those that would be written.
     let frames = at("frames");
     splat4d(&["convert", str(&at("a.ply")), str(&frames), "--frames"]).run().ok();

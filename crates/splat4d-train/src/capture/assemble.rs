@@ -8,7 +8,7 @@ use super::{
     Capture, CaptureKind, CaptureOptions, Exif, Extent, FlowFile, Frame, HoldOut, PointCloud, RawFrame, Rig, Split,
     Take, Timing,
 };
-use super::{borders, evidence, lookup, masks, options, panorama, picture, plausible, pose};
+use super::{borders, evidence, lookup, masks, options, panorama, picture, plausible, pose, rig};
 use splat4d::math::se3::{norm, normalize};
 use splat4d::scene::{Camera, Lens, Time};
 use splat4d::{Error, Result};
@@ -52,6 +52,9 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
     check_poses(&mut take, &cameras)?;
     check_duplicates(&mut take, &cameras).map_err(located)?;
     shared_images(&mut take);
+    if take.points.is_none() && !in_part {
+        unread_clouds(&mut take);
+    }
     let (has_alpha, turned, unsure) = fit_pictures(&mut take, options)?;
     check_masks(&take, has_alpha)?;
     let background = options.background.or(take.background).or(has_alpha.then_some(WHITE)).filter(|_| has_alpha);
@@ -112,6 +115,20 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
         all.retain(|&i| options.lists(frames[i].index));
     }
     Ok(capture)
+}
+
+/// Names point clouds next to the capture's files, where it has no points: nothing says that they are in its world.
+fn unread_clouds(take: &mut Take) {
+    let clouds: Vec<String> =
+        rig::file_names(&take.root).into_iter().filter(|n| n.to_ascii_lowercase().ends_with(".ply")).collect();
+    if !clouds.is_empty() {
+        let what = format!(
+            "Point clouds in the folder that the capture does not name: {}. To begin with one, name it (ply_file_path in \
+             transforms.json, points in capture.json).",
+            first_names(&clouds)
+        );
+        take.account.add(Aspect::NotRead, Severity::Note, what);
+    }
 }
 
 /// Points nearer than this share of all that a training camera sees may be wrong ones.

@@ -5,7 +5,7 @@
 //! first; else the one file that fits is taken, and one remark counts such names. Several files that fit are an error.
 
 use super::account::Severity;
-use super::account::{Account, Aspect};
+use super::account::{Account, Aspect, first_names};
 use super::{CaptureOptions, rig};
 use splat4d::{Error, Result};
 use std::cell::RefCell;
@@ -70,6 +70,8 @@ pub(super) struct Lookup {
     /// Files that were not found by their exact name, and the name that led there.
     loose: RefCell<BTreeMap<PathBuf, String>>,
     ways: RefCell<BTreeMap<Way, usize>>,
+    /// Files that were read for names without an ending, and the others that fit as well.
+    bare: RefCell<BTreeMap<PathBuf, Vec<String>>>,
 }
 
 /// A name as all its spellings have it: composed (NFC) and in lower case.
@@ -132,6 +134,7 @@ impl Lookup {
             listings: RefCell::default(),
             loose: RefCell::default(),
             ways: RefCell::default(),
+            bare: RefCell::default(),
         })
     }
 
@@ -330,7 +333,9 @@ impl Lookup {
         let listing = self.listing(&folder);
         if let Some(name) = one(listing.names.get(&fold(file)), file, &folder)? {
             let path = folder.join(name);
-            return Ok(path.is_file().then_some(path));
+            if path.is_file() {
+                return Ok(Some(path));
+            }
         }
         let stem = fold(without_ending(file));
         let images = listing.stems.get(&stem);
@@ -338,7 +343,13 @@ impl Lookup {
             // No ending is stated: the usual order of endings decides.
             let ends = |name: &&String, ending: &str| fold(name).ends_with(&format!(".{ending}"));
             let found = rig::IMAGE_ENDINGS.iter().find_map(|e| images?.iter().find(|n| ends(n, e)));
-            return Ok(found.map(|name| folder.join(name)));
+            let Some(name) = found else { return Ok(None) };
+            let others: Vec<String> = images.into_iter().flatten().filter(|n| *n != name).cloned().collect();
+            let path = folder.join(name);
+            if !others.is_empty() {
+                self.bare.borrow_mut().insert(path.clone(), others);
+            }
+            return Ok(Some(path));
         }
         Ok(one(images, file, &folder)?.map(|name| folder.join(name)))
     }
@@ -367,6 +378,17 @@ impl Lookup {
 
     /// Says in one remark which names were not exact.
     pub(super) fn tell(&self, account: &mut Account) {
+        let bare = self.bare.borrow();
+        if let Some((file, others)) = bare.iter().next() {
+            let what = format!(
+                "{} names have no ending and fit several images each, for instance {}: it is read, and {} is not. Remove the images \
+                 that are not meant.",
+                bare.len(),
+                file.strip_prefix(&self.root).unwrap_or(file).display(),
+                first_names(others)
+            );
+            account.add(Aspect::Assumed, Severity::Warning, what);
+        }
         let (loose, ways) = (self.loose.borrow(), self.ways.borrow());
         let Some((file, name)) = loose.iter().next().filter(|_| !ways.is_empty()) else { return };
         let ways: Vec<String> = ways.iter().map(|(way, n)| format!("{} ({n})", way.in_words())).collect();
@@ -501,6 +523,13 @@ mod tests {
         let refuse = |name: &str| there.image(&there.bases(), name).unwrap_err().to_string();
         assert!(refuse("a.png").contains("A.png, a.PNG") && refuse("b.jpg").contains("b.png, b.webp"));
         assert!(there.image(&there.bases(), "b").unwrap().unwrap().ends_with("b.png"), "no ending is stated");
+        let mut account = Account::default();
+        there.tell(&mut account);
+        let said = &account.remarks[0];
+        assert!(
+            said.severity == Severity::Warning && said.what.contains("b.png: it is read, and b.webp is not"),
+            "{said:?}"
+        );
         let (_dir, there) = lookup(&["images/0001.jpg"]);
         assert!(there.image(&there.bases(), "/x/cam0/0001.jpg").unwrap().is_some());
         let two = there.image(&there.bases(), "/x/cam1/0001.jpg").unwrap_err().to_string();

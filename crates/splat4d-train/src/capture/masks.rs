@@ -5,8 +5,8 @@
 
 use super::account::Severity;
 use super::account::{Aspect, first_names};
-use super::lookup::{fold, key, may_hold_masks, without_ending};
-use super::{CaptureKind, Take, rig};
+use super::lookup::{fold, is_image_folder, key, may_hold_masks, without_ending};
+use super::{CaptureKind, RawFrame, Take, rig};
 use splat4d::{Error, Result};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -31,6 +31,15 @@ pub(super) fn fill(take: &mut Take) -> Result<()> {
     let mut files = Vec::new();
     list(&folder, String::new(), 0, &mut files);
     if files.is_empty() {
+        let others: Vec<String> = rig::file_names(&folder).into_iter().filter(|n| folder.join(n).is_file()).collect();
+        if !others.is_empty() {
+            let what = format!(
+                "{} files in {name}/, none of which is an image ({}): training runs without masks. Write them as PNG.",
+                others.len(),
+                first_names(&others)
+            );
+            take.account.add(Aspect::NotRead, Severity::Warning, what);
+        }
         return Ok(());
     }
     let stated: BTreeSet<PathBuf> = take.frames.iter().filter_map(|f| f.mask.clone()).collect();
@@ -89,15 +98,35 @@ fn below(root: &Path, image: &Path) -> String {
 /// Names folders that may hold masks and are not read, where no frame has one.
 fn tell_of_others(take: &mut Take, folders: &[String]) {
     let others: Vec<&String> = folders.iter().filter(|n| may_hold_masks(n)).collect();
-    if others.is_empty() || take.frames.iter().any(|f| f.mask.is_some()) {
-        return;
-    }
     let images: BTreeSet<String> = take.frames.iter().map(|f| image_key(&below(&take.root, &f.image))).collect();
     let fits = |folder: &&&String| {
         let mut files = Vec::new();
         list(&take.root.join(folder), String::new(), 0, &mut files);
         files.iter().filter(|file| images.contains(&image_key(file))).count() >= take.frames.len().div_ceil(2)
     };
+    let read = |folder: &String| {
+        let folder = take.root.join(folder);
+        let maps = |f: &RawFrame| {
+            [f.depth.as_ref().map(|d| d.path.clone()), f.mask.clone(), f.labels.clone(), f.features.clone()]
+        };
+        take.frames
+            .iter()
+            .any(|f| f.image.starts_with(&folder) || maps(f).iter().flatten().any(|p| p.starts_with(&folder)))
+    };
+    let usual =
+        |n: &&String| !may_hold_masks(n) && !is_image_folder(&fold(n)) && !n.starts_with('.') && !rig::is_plain(n);
+    let like: Vec<&String> = folders.iter().filter(usual).filter(|n| !read(n)).filter(|n| fits(&n)).collect();
+    if !like.is_empty() {
+        let what = format!(
+            "Folders whose files are named like the images: {}. Masks are read from a folder called masks; capture.json names \
+             depth, labels and others.",
+            first_names(&like)
+        );
+        take.account.add(Aspect::NotRead, Severity::Note, what);
+    }
+    if others.is_empty() || take.frames.iter().any(|f| f.mask.is_some()) {
+        return;
+    }
     let (severity, what) = match others.iter().find(fits) {
         Some(folder) => (
             Severity::Warning,

@@ -98,7 +98,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
 
 /// Frames a second of a camera whose frames `train` extracted, by the notes that it keeps of that.
 fn extracted_rate(root: &Path, camera: &str) -> Option<f64> {
-    let note = std::fs::read(root.join(NOTES).join(format!("{camera}.json"))).ok()?;
+    let note = crate::files::read(&root.join(NOTES).join(format!("{camera}.json"))).ok()?;
     let note: serde_json::Value = serde_json::from_slice(&note).ok()?;
     let rate = 1.0 / note.get("interval")?.as_f64()?;
     let whole = (rate / WHOLE_RATE).round() * WHOLE_RATE;

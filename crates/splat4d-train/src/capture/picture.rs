@@ -375,18 +375,26 @@ fn upright(mut picture: DynamicImage, orientation: Orientation) -> Raster {
     Raster { width, height, channels, samples }
 }
 
+/// The largest number that is a label, not a brightness.
+const LABELS: u16 = 16;
+
 /// A mask's values from 0 to 1, one per pixel, from the alpha channel if `use_alpha`, else from the first channel.
 ///
-/// Some tools write masks of zeros and ones into 8 bits: where no value is above 1, one counts as white.
+/// Some tools write masks of zeros and ones, or of the numbers of labels: where no value is above 16, all but 0 count as
+/// white. Others write the mask into the alpha of an image of one colour.
 pub(super) fn mask_values(raster: &Raster, use_alpha: bool) -> Vec<f32> {
-    let channel = if use_alpha { raster.alpha().unwrap_or(0) } else { 0 };
     let n = raster.width * raster.height;
-    let ones = match &raster.samples {
-        Samples::Eight(s) => !use_alpha && (0..n).all(|p| s[p * raster.channels] <= 1),
-        Samples::Sixteen(_) => false,
+    let of = |channel: usize, p: usize| match &raster.samples {
+        Samples::Eight(s) => u16::from(s[p * raster.channels + channel]),
+        Samples::Sixteen(s) => s[p * raster.channels + channel],
     };
-    let scale = if ones { 255.0 } else { 1.0 };
-    (0..n).map(|p| scale * raster.get(p, channel)).collect()
+    let even = |channel: usize| (1..n).all(|p| of(channel, p) == of(channel, 0));
+    let in_alpha = raster.alpha().filter(|&alpha| use_alpha || even(0) && !even(alpha));
+    let channel = in_alpha.unwrap_or(0);
+    if !use_alpha && (0..n).all(|p| of(channel, p) <= LABELS) {
+        return (0..n).map(|p| f32::from(u8::from(of(channel, p) > 0))).collect();
+    }
+    (0..n).map(|p| raster.get(p, channel)).collect()
 }
 
 /// Whether a mask (or, with `use_alpha`, an image's alpha channel) shows anything. Images without alpha do.

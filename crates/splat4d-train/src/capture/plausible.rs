@@ -72,7 +72,11 @@ fn odd_bend(camera: &Camera) -> Option<String> {
         let ratio = at[0].hypot(at[1]) / ray[0].hypot(ray[1]).max(f64::MIN_POSITIVE);
         Some(ratio.max(1.0 / ratio))
     };
-    let most = sides.into_iter().filter_map(bend).fold(1.0, f64::max);
+    let bends: Option<Vec<f64>> = sides.into_iter().map(bend).collect();
+    let Some(bends) = bends else {
+        return Some("no ray reaches the middle of a side: the lens folds before it".into());
+    };
+    let most = bends.into_iter().fold(1.0, f64::max);
     (most > MOST_BEND).then(|| format!("the lens moves the middle of a side by a factor of {most:.1} from the centre"))
 }
 

@@ -5,6 +5,7 @@ use super::pose::FARTHEST;
 use rayon::prelude::*;
 use splat4d::Result;
 use splat4d::format::ply;
+use std::borrow::Cow;
 use std::path::Path;
 
 /// Colour of points that have none.
@@ -16,7 +17,7 @@ pub(super) fn read_ply(path: &Path) -> Result<PointCloud> {
 }
 
 fn cloud(bytes: &[u8]) -> Result<PointCloud> {
-    let read = ply::read_points(bytes)?;
+    let read = ply::read_points(&plain_names(bytes))?;
     let mut cloud = PointCloud::default();
     for (i, point) in read.positions.iter().enumerate() {
         let seen = read.times.get(i).copied();
@@ -25,6 +26,29 @@ fn cloud(bytes: &[u8]) -> Result<PointCloud> {
         cloud.push(*point, read.colors.get(i).copied().unwrap_or([GREY; 3]), seen);
     }
     Ok(cloud)
+}
+
+/// Names that MeshLab, VisualSFM and others give to colours, and what they are otherwise called.
+const COLOR_PREFIX: &[u8] = b" diffuse_";
+/// Bytes in which the header of a cloud ends: few properties are usual.
+const HEADER: usize = 1 << 14;
+
+/// The file with colours under their usual names.
+fn plain_names(bytes: &[u8]) -> Cow<'_, [u8]> {
+    let head = &bytes[..bytes.len().min(HEADER)];
+    let find = |what: &[u8], from: &[u8]| from.windows(what.len()).position(|w| w == what);
+    let Some(end) = find(b"end_header", head).filter(|&end| find(COLOR_PREFIX, &head[..end]).is_some()) else {
+        return Cow::Borrowed(bytes);
+    };
+    let mut out = Vec::with_capacity(bytes.len());
+    let mut header = &head[..end];
+    while let Some(at) = find(COLOR_PREFIX, header) {
+        out.extend_from_slice(&header[..=at]);
+        header = &header[at + COLOR_PREFIX.len()..];
+    }
+    out.extend_from_slice(header);
+    out.extend_from_slice(&bytes[end..]);
+    Cow::Owned(out)
 }
 
 /// Coloured points, some with the time at which they were seen.
@@ -177,6 +201,11 @@ mod tests {
             binary.extend(f32::to_le_bytes(time));
         }
         assert_eq!(cloud(&binary).unwrap(), read);
+        // As MeshLab calls colours.
+        let diffuse = ["red", "green", "blue"].iter().fold(ascii.to_owned(), |text, color| {
+            text.replace(&format!("uchar {color}"), &format!("uchar diffuse_{color}"))
+        });
+        assert_eq!(cloud(diffuse.as_bytes()).unwrap(), read);
         let message = cloud(&binary[..binary.len() - 1]).unwrap_err().to_string();
         assert!(message.contains("claims 3 rows"), "{message}");
     }

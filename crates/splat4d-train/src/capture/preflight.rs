@@ -1,6 +1,6 @@
 //! Checks of a capture before hours of training: few cameras, narrow coverage, uneven clocks.
 
-use super::account::Severity;
+use super::account::{Severity, first_names};
 use super::{Aspect, Capture, Frame};
 use splat4d::math::mat3::solve;
 use splat4d::math::se3::{dot, norm, normalize, sub};
@@ -22,6 +22,8 @@ pub struct Finding {
 const FEW_CAMERAS: usize = 6;
 /// Narrower rigs see little parallax, degrees.
 const NARROW_DEGREES: f64 = 20.0;
+/// Seconds from which f32 has steps of a millisecond.
+const FAR_CLOCK: f64 = 1e4;
 /// Gaps between instants may differ by this factor before the clock is called uneven.
 const UNEVEN: f64 = 1.5;
 /// Angle and relative distance below which two cameras add little to each other.
@@ -172,6 +174,11 @@ impl Capture {
 
     fn check_clock(&self, findings: &mut Vec<Finding>) {
         let times = self.times();
+        if let Some(first) = times.first().filter(|first| first.abs() > FAR_CLOCK) {
+            let what = format!("The first image is at {first} s: f32 lifespans resolve milliseconds no more there.");
+            findings.push(finding(Severity::Warning, what, "Give times from the start of the clip."));
+        }
+        self.check_ranges(findings);
         let gaps: Vec<f64> = times.windows(2).map(|w| w[1] - w[0]).collect();
         let (low, high) = gaps.iter().fold((f64::INFINITY, 0.0f64), |(l, h), &g| (l.min(g), h.max(g)));
         if !self.fixed_cameras() || gaps.len() < 2 || high <= UNEVEN * low {
@@ -182,6 +189,29 @@ impl Capture {
             format!("The instants are unevenly spaced: gaps from {low:.4} s to {high:.4} s."),
             "Check frame numbers and time offsets; missing frames and unsynchronised cameras blur fast motion.",
         ));
+    }
+
+    /// Fixed cameras whose images are all before or after those of most others.
+    fn check_ranges(&self, findings: &mut Vec<Finding>) {
+        let mut ranges = vec![[f64::INFINITY, f64::NEG_INFINITY]; self.cameras.len()];
+        for frame in &self.frames {
+            let range = &mut ranges[frame.camera];
+            *range = [range[0].min(frame.time.0), range[1].max(frame.time.0)];
+        }
+        let films: Vec<usize> =
+            (0..ranges.len()).filter(|&c| self.cameras[c].fixed && ranges[c][0] < ranges[c][1]).collect();
+        let apart = |&&c: &&usize| {
+            let others = films.iter().filter(|&&o| ranges[o][0] > ranges[c][1] || ranges[o][1] < ranges[c][0]);
+            2 * others.count() > films.len()
+        };
+        let late: Vec<&str> = films.iter().filter(apart).map(|&c| self.cameras[c].name.as_str()).collect();
+        if films.len() > 2 && !late.is_empty() {
+            findings.push(finding(
+                Severity::Warning,
+                format!("Cameras recorded at other times than most others: {}.", first_names(&late)),
+                "Check their clocks: what moves is seen by them at no time that others see.",
+            ));
+        }
     }
 
     fn check_completeness(&self, findings: &mut Vec<Finding>) {

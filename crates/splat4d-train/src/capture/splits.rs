@@ -5,7 +5,7 @@ use super::Split;
 use super::account::Severity;
 use super::account::{Account, Aspect, first_names};
 use super::json::{self, Node};
-use super::lookup::key;
+use super::lookup::{key, without_ending};
 use crate::text;
 use splat4d::{Error, Result};
 use std::collections::{BTreeMap, BTreeSet};
@@ -45,10 +45,18 @@ impl Lists {
                 .collect())
         };
         let of = |name: &str| list(&root.join(name));
+        // Other data sets keep numbers or scenes in files of these names.
+        let images = |name: &str| -> Result<Vec<String>> {
+            let found = of(name)?;
+            Ok(if found.iter().all(|line| without_ending(line) != line) { found } else { Vec::new() })
+        };
         let mut out =
             Self { train: of("train_list.txt")?, test: of("test_list.txt")?, validation: of("validation_list.txt")? };
         if out.test.is_empty() {
             out.test = list(&model.join("test.txt"))?;
+        }
+        if [&out.train, &out.test, &out.validation].iter().all(|l| l.is_empty()) {
+            out = Self { train: images("train.txt")?, test: images("test.txt")?, validation: images("val.txt")? };
         }
         Ok(out)
     }

@@ -189,6 +189,9 @@ impl Document {
                 format!("Keys of the transforms file that are not read: {}. Rename them.", first_names(&mistaken));
             account.add(Aspect::NotRead, Severity::Warning, what);
         }
+        if let Some(what) = frame::contradiction(top, &entries)? {
+            account.add(Aspect::Assumed, Severity::Warning, what);
+        }
         let (mut points, mut warning) = (None, None);
         if let Some(name) = top.opt("ply_file_path")? {
             let path = lookup.file(name.text()?)?;

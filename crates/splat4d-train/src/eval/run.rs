@@ -466,12 +466,21 @@ fn foreground(stored: &StoredPicture) -> Option<Vec<bool>> {
 
 fn load_lpips(path: &Path) -> Result<Lpips> {
     let bytes = crate::files::read(path).map_err(|e| e.at("the LPIPS weights"))?;
-    let file = SafeTensors::read(&bytes).map_err(|e| e.at(path.display()))?;
+    lpips_of(&bytes).map_err(|e| e.at(path.display()))
+}
+
+fn lpips_of(bytes: &[u8]) -> Result<Lpips> {
+    let file = SafeTensors::read(bytes)?;
     let tensor = |name: &str| {
         let tensor = file.tensor(name).ok()?;
         Some((tensor.shape().to_vec(), tensor.as_f32().ok()?.to_vec()))
     };
-    Lpips::load(tensor).map_err(|e| e.at(path.display()))
+    Lpips::load(tensor)
+}
+
+/// Refuses bytes that are not LPIPS weights. Errors: what is wrong with them.
+pub fn check_lpips(bytes: &[u8]) -> Result<()> {
+    lpips_of(bytes).map(drop)
 }
 
 fn file_name(place: usize) -> String {

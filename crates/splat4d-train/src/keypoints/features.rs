@@ -81,28 +81,38 @@ pub fn find(grey: &Planes<f32>, limits: Limits, wanted: &dyn Fn(usize, usize) ->
     let start = if double { doubled(grey) } else { grey.clone() };
     let mut base = blurred(&start, (SIGMA * SIGMA - had * had).sqrt());
     let first = pixel;
-    let mut out = Vec::new();
+    let mut out: Vec<Feature> = Vec::new();
     while base.width.min(base.height) >= SMALLEST {
         let octave = Octave::new(base);
+        let mut points = Vec::new();
         for at in octave.extrema(limits.contrast) {
             let Some(point) = octave.refine(at, limits.contrast) else { continue };
             // Coarser octaves keep the first pixel of two, and its place.
             let place = [point.x, point.y].map(|k| k * pixel + 0.5 * first);
             let inside = place[0] >= 0.0 && place[1] >= 0.0;
             let [x, y] = place.map(|k| k as usize);
-            if !inside || x >= grey.width || y >= grey.height || !wanted(x, y) {
-                continue;
+            if inside && x < grey.width && y < grey.height && wanted(x, y) {
+                points.push((point.contrast as f32, place, point));
+            }
+        }
+        // Descriptions take most of the time: only those of points that can be among the `most` are made.
+        points.sort_by(|a, b| b.0.total_cmp(&a.0));
+        let finer = out.len();
+        for (contrast, place, point) in points {
+            let before = out[..finer].partition_point(|f| f.contrast >= contrast) + out.len() - finer;
+            if before >= limits.most {
+                break;
             }
             for angle in octave.angles(&point) {
                 let descriptor = octave.describe(&point, angle);
-                out.push(Feature { pixel: place, contrast: point.contrast as f32, descriptor });
+                out.push(Feature { pixel: place, contrast, descriptor });
             }
         }
+        out.sort_by(|a, b| b.contrast.total_cmp(&a.contrast));
+        out.truncate(limits.most);
         base = every_second(&octave.blurred[INTERVALS]);
         pixel *= 2.0;
     }
-    out.sort_by(|a, b| b.contrast.total_cmp(&a.contrast));
-    out.truncate(limits.most);
     out
 }
 
@@ -311,4 +321,27 @@ impl Octave {
 fn shares(k: f64) -> [(isize, f64); 2] {
     let low = k.floor();
     [(low as isize, 1.0 - (k - low)), (low as isize + 1, k - low)]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use splat4d::math::Rng;
+
+    #[test]
+    fn a_limit_leaves_out_the_weakest_and_changes_none() {
+        let mut grey = Planes::<f32>::new(1, 60, 80);
+        let rng = Rng::new(1, "noise", 0);
+        grey.data.iter_mut().enumerate().for_each(|(i, v)| *v = rng.uniform(i as u64) as f32);
+        let grey = blurred(&grey, 1.5);
+        let of = |most: usize| {
+            let found = find(&grey, Limits { contrast: 0.002, most }, &|_, _| true);
+            found.into_iter().map(|f| (f.pixel, f.contrast, f.descriptor)).collect::<Vec<_>>()
+        };
+        let all = of(usize::MAX);
+        assert!(all.len() > 100, "{}", all.len());
+        for most in [1, 7, 50, all.len() - 1] {
+            assert!(of(most) == all[..most], "{most}");
+        }
+    }
 }

@@ -4,6 +4,7 @@ use crate::optim::Moments;
 use rayon::prelude::*;
 use splat4d::math::Real;
 use splat4d::scene::{Grads, Key, Params, Planes, Space};
+use splat4d::simd::{Kernel, Simd, dispatch, each};
 
 /// Columns of a camera: its matrix without the identity, row by row, then an offset a channel.
 const COLUMNS: usize = 12;
@@ -11,6 +12,10 @@ const COLUMNS: usize = 12;
 const OFFSET: usize = 9;
 /// Pixels of a piece of parallel work: sums are by piece and in order, so that they do not depend on the threads.
 const PIECE: usize = 8192;
+/// Pixels that are computed together: a register of AVX-512.
+const LANES: usize = 16;
+/// Groups of [`LANES`] pixels after which a lane's sums in f32 are added to those in f64.
+const RUN: usize = 32;
 
 /// A colour matrix I + M and an offset c a camera: the colour x that is drawn is shown as (I + M)x + c. The mean over the
 /// cameras is held at the identity, so that the scene keeps the rig's mean colours and held-out cameras are drawn with them.
@@ -46,6 +51,80 @@ fn pieces(picture: &mut Planes<f32>) -> impl IndexedParallelIterator<Item = [&mu
     let (green, blue) = rest.split_at_mut(pixels);
     let cut = |plane| <[f32]>::par_chunks_mut(plane, PIECE);
     cut(red).zip(cut(green)).zip(cut(blue)).map(|((r, g), b)| [r, g, b])
+}
+
+/// Shows the colours of a piece in place.
+struct Respond<'a> {
+    row: &'a [f32; COLUMNS],
+    colors: [&'a mut [f32]; 3],
+}
+
+impl Kernel for Respond<'_> {
+    type Out = ();
+
+    #[inline(always)]
+    fn run<const FMA: bool>(self) {
+        let Self { row, colors } = self;
+        let [(r, r_rest), (g, g_rest), (b, b_rest)] = colors.map(<[f32]>::as_chunks_mut::<LANES>);
+        for ((r, g), b) in r.iter_mut().zip(g).zip(b) {
+            // By value, so that LLVM need not ask whether the channels overlap.
+            let x = [*r, *g, *b];
+            let shown = |c: usize| -> [f32; LANES] {
+                let m = [row[3 * c], row[3 * c + 1], row[3 * c + 2]];
+                each(|l| x[c][l] + m[0] * x[0][l] + m[1] * x[1][l] + m[2] * x[2][l] + row[OFFSET + c])
+            };
+            [*r, *g, *b] = [shown(0), shown(1), shown(2)];
+        }
+        for ((r, g), b) in r_rest.iter_mut().zip(g_rest).zip(b_rest) {
+            [*r, *g, *b] = shown(row, [*r, *g, *b]);
+        }
+    }
+}
+
+/// The VJP of [`Respond`] in a piece, in place. Returns the sum of the gradients to the row.
+struct RespondBackward<'a> {
+    row: &'a [f32; COLUMNS],
+    drawn: [&'a [f32]; 3],
+    d: [&'a mut [f32]; 3],
+}
+
+impl Kernel for RespondBackward<'_> {
+    type Out = [f64; COLUMNS];
+
+    #[inline(always)]
+    fn run<const FMA: bool>(self) -> [f64; COLUMNS] {
+        let Self { row, drawn, d } = self;
+        let mut sums = [0.0; COLUMNS];
+        let [(xr, xr_rest), (xg, xg_rest), (xb, xb_rest)] = drawn.map(<[f32]>::as_chunks::<LANES>);
+        let [(r, r_rest), (g, g_rest), (b, b_rest)] = d.map(<[f32]>::as_chunks_mut::<LANES>);
+        let x = xr.chunks(RUN).zip(xg.chunks(RUN)).zip(xb.chunks(RUN));
+        let d = r.chunks_mut(RUN).zip(g.chunks_mut(RUN)).zip(b.chunks_mut(RUN));
+        for (((r, g), b), ((xr, xg), xb)) in d.zip(x) {
+            let mut lanes = [[0.0f32; LANES]; COLUMNS];
+            for (((r, g), b), ((xr, xg), xb)) in r.iter_mut().zip(g).zip(b).zip(xr.iter().zip(xg).zip(xb)) {
+                let (x, d) = ([*xr, *xg, *xb], [*r, *g, *b]);
+                let to_drawn = |k: usize| -> [f32; LANES] {
+                    let m = [row[k], row[3 + k], row[6 + k]];
+                    each(|l| d[k][l] + m[0] * d[0][l] + m[1] * d[1][l] + m[2] * d[2][l])
+                };
+                [*r, *g, *b] = [to_drawn(0), to_drawn(1), to_drawn(2)];
+                for i in 0..OFFSET {
+                    lanes[i] = each(|l| lanes[i][l] + d[i / 3][l] * x[i % 3][l]);
+                }
+                for c in 0..3 {
+                    lanes[OFFSET + c] = each(|l| lanes[OFFSET + c][l] + d[c][l]);
+                }
+            }
+            (0..COLUMNS).for_each(|k| sums[k] += lanes[k].iter().map(|x| f64::from(*x)).sum::<f64>());
+        }
+        let x = xr_rest.iter().zip(xg_rest).zip(xb_rest);
+        for (((r, g), b), ((xr, xg), xb)) in r_rest.iter_mut().zip(g_rest).zip(b_rest).zip(x) {
+            let (d_x, d_row) = shown_backward(row, [*xr, *xg, *xb], [*r, *g, *b]);
+            [*r, *g, *b] = d_x;
+            (0..COLUMNS).for_each(|k| sums[k] += f64::from(d_row[k]));
+        }
+        sums
+    }
 }
 
 impl Exposure {
@@ -91,29 +170,35 @@ impl Exposure {
 
     /// Turns the colours `color` into those that camera `rig` shows.
     pub(crate) fn respond(&self, rig: usize, color: &mut Planes<f32>) {
-        let row = self.response(rig);
-        pieces(color).for_each(|[r, g, b]| {
-            for ((r, g), b) in r.iter_mut().zip(g).zip(b) {
-                [*r, *g, *b] = shown(&row, [*r, *g, *b]);
+        let (row, simd) = (self.response(rig), Simd::detect());
+        pieces(color).for_each(|colors| dispatch(simd, Respond { row: &row, colors }));
+    }
+
+    /// Writes the colours that camera `rig` shows of what was drawn.
+    pub(crate) fn show(&self, rig: usize, drawn: &Planes<f32>, out: &mut Planes<f32>) {
+        let (row, simd) = (self.response(rig), Simd::detect());
+        if (out.channels, out.height, out.width) != (drawn.channels, drawn.height, drawn.width) {
+            out.reset(drawn.channels, drawn.height, drawn.width);
+        }
+        pieces(out).enumerate().for_each(|(piece, mut colors)| {
+            for (c, out) in colors.iter_mut().enumerate() {
+                let first = piece * PIECE;
+                out.copy_from_slice(&drawn.plane(c)[first..first + out.len()]);
             }
+            dispatch(simd, Respond { row: &row, colors });
         });
     }
 
     /// The VJP of [`respond`](Self::respond) at what was drawn: turns the gradient to the shown colours into that to the
     /// drawn ones, and adds to the camera's.
     pub(crate) fn respond_backward(&mut self, rig: usize, drawn: &Planes<f32>, d_color: &mut Planes<f32>) {
-        let row = self.response(rig);
+        let (row, simd) = (self.response(rig), Simd::detect());
         let sums: Vec<[f64; COLUMNS]> = pieces(d_color)
             .enumerate()
-            .map(|(piece, [r, g, b])| {
-                let (mut sums, first) = ([0.0; COLUMNS], piece * PIECE);
-                for (i, ((r, g), b)) in r.iter_mut().zip(g).zip(b).enumerate() {
-                    let x = [0, 1, 2].map(|c| drawn.plane(c)[first + i]);
-                    let (d_x, d_row) = shown_backward(&row, x, [*r, *g, *b]);
-                    [*r, *g, *b] = d_x;
-                    (0..COLUMNS).for_each(|k| sums[k] += f64::from(d_row[k]));
-                }
-                sums
+            .map(|(piece, d)| {
+                let of_piece = piece * PIECE..piece * PIECE + d[0].len();
+                let drawn = [0, 1, 2].map(|c| &drawn.plane(c)[of_piece.clone()]);
+                dispatch(simd, RespondBackward { row: &row, drawn, d })
             })
             .collect();
         let sum = |k: usize| sums.iter().map(|s| s[k]).sum::<f64>();
@@ -203,9 +288,28 @@ mod tests {
             assert!(rows[0][k] != 0.0 && rows.iter().map(|r| r[k]).sum::<f32>().abs() < 1e-6, "column {k}");
         }
         let drawn = picture("drawn");
+        let at = |picture: &Planes<f32>, p: usize| [0, 1, 2].map(|c| picture.plane(c)[p]);
         for p in [0, PIECE - 1, PIECE, drawn.pixels() - 1] {
-            let at = |picture: &Planes<f32>| [0, 1, 2].map(|c| picture.plane(c)[p]);
-            assert_eq!(at(&color), shown(&rows[2], at(&drawn)), "pixel {p}");
+            assert_eq!(at(&color, p), shown(&rows[2], at(&drawn, p)), "pixel {p}");
+        }
+        // Out of place, and the gradient, pixel by pixel and as a sum in f64.
+        let mut exposure = Exposure::new(4, vec![0, 2, 3]);
+        let key = exposure.key();
+        exposure.params[key].write(2, 0, rows[2]);
+        let (mut out, mut d) = (Planes::default(), picture("gradient 0"));
+        exposure.show(2, &drawn, &mut out);
+        assert_eq!(out, color);
+        let before = d.clone();
+        exposure.respond_backward(2, &drawn, &mut d);
+        let mut sums = [0.0; COLUMNS];
+        for p in 0..drawn.pixels() {
+            let (d_x, d_row) = shown_backward(&rows[2], at(&drawn, p), at(&before, p));
+            assert_eq!(at(&d, p), d_x, "pixel {p}");
+            (0..COLUMNS).for_each(|k| sums[k] += f64::from(d_row[k]));
+        }
+        let got = exposure.grads.table(key).read::<COLUMNS>(2, 0);
+        for (k, sum) in sums.iter().enumerate() {
+            assert!((f64::from(got[k]) / sum - 1.0).abs() < 1e-5, "column {k}: {} {sum}", got[k]);
         }
     }
 }

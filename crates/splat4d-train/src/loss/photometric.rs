@@ -82,9 +82,12 @@ impl<F: Real> Photometric<F> {
             d_render.reset(channels, height, width);
         }
         let pixels = render.pixels();
+        let rows = height.div_ceil(height.div_ceil(STRIP_ROWS).max(1)).next_multiple_of(GROUP_ROWS);
+        let strips = height.div_ceil(rows.max(1));
+        self.sums.resize(channels * strips, [0.0; 3]);
         let total_weight = match weight {
             None => pixels as f64,
-            Some(w) => w.data.iter().map(|x| x.f64()).sum(),
+            Some(w) => total(&w.data, (rows * width).max(1), &mut self.sums[..strips]),
         } * channels as f64;
         if total_weight <= 0.0 {
             d_render.data.fill(F::ZERO);
@@ -92,12 +95,9 @@ impl<F: Real> Photometric<F> {
         }
 
         let lambda = f64::from(self.lambda_dssim);
-        let rows = height.div_ceil(height.div_ceil(STRIP_ROWS).max(1)).next_multiple_of(GROUP_ROWS);
-        let strips = height.div_ceil(rows.max(1));
         while self.scratch.len() < rayon::current_num_threads() {
             self.scratch.push(Mutex::new(Scratch::new()));
         }
-        self.sums.resize(channels * strips, [0.0; 3]);
         let (simd, scratch, taps) = (self.simd, &self.scratch, self.taps);
         let weight = weight.map(|w| w.data.as_slice());
         let (d_l1, d_ssim) = (F::of((1.0 - lambda) / total_weight), F::of(-lambda / total_weight));
@@ -122,6 +122,18 @@ impl<F: Real> Photometric<F> {
         let [l1, ssim, mse] = total.map(|x| x / total_weight);
         LossValue { total: (1.0 - lambda) * l1 + lambda * (1.0 - ssim), l1, ssim, mse }
     }
+}
+
+/// The sum of weights, strip by strip of `length` numbers; `sums` has room for one a strip.
+fn total<F: Real>(weight: &[F], length: usize, sums: &mut [[f64; 3]]) -> f64 {
+    const LANES: usize = 8;
+    weight.par_chunks(length).zip(&mut *sums).for_each(|(strip, sum)| {
+        let (chunks, rest) = strip.as_chunks::<LANES>();
+        let mut lanes = [0.0; LANES];
+        chunks.iter().for_each(|chunk| (0..LANES).for_each(|l| lanes[l] += chunk[l].f64()));
+        sum[0] = lanes.iter().sum::<f64>() + rest.iter().map(|x| x.f64()).sum::<f64>();
+    });
+    sums.iter().map(|sum| sum[0]).sum()
 }
 
 impl<F: Real> ImageTerm<F> for Photometric<F> {

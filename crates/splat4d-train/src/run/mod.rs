@@ -16,6 +16,7 @@ mod minutes;
 mod open;
 mod points;
 mod priors;
+pub mod probe;
 mod refine;
 mod session;
 mod snapshot;
@@ -25,6 +26,7 @@ mod start;
 pub(crate) mod tests;
 
 pub use clock::Stopwatch;
+pub use info::recorded_elsewhere;
 pub use memory::{available_memory, memory_estimate, peak_memory};
 #[cfg(test)]
 pub(crate) use open::OpenCapture;

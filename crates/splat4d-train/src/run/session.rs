@@ -5,7 +5,7 @@ use super::checkpoint::{self, Identity, RunState, write_atomically};
 use super::clock::Stopwatch;
 use super::corrected;
 use super::identity::fingerprint;
-use super::info::read_info;
+use super::info::{ELSEWHERE, elsewhere, read_info};
 use super::memory::peak_memory;
 use super::metrics::{Metrics, STAGE_NAMES, Totals, psnr};
 use super::open::OpenCapture;
@@ -436,6 +436,7 @@ impl Session<'_> {
             "capture": to_text(&root),
             "capture_name": capture.name,
             "capture_fingerprint": fingerprint(capture),
+            ELSEWHERE: elsewhere(capture),
             "motion": recipe.run.motion.as_str(),
             "seed": recipe.run.seed,
             "simd": self.opened.simd.name(),

@@ -76,8 +76,7 @@ impl ImageTerm for StepLoss<'_> {
         let run = &mut *self.run;
         let mut shown = *drawn;
         if let Some(exposure) = &self.exposure {
-            run.exposed.clone_from(drawn.color);
-            exposure.respond(view.rig, &mut run.exposed);
+            exposure.show(view.rig, drawn.color, &mut run.exposed);
             shown.color = &run.exposed;
         }
         let mut total = 0.0;

@@ -33,9 +33,9 @@ const FOREIGN: [Foreign; 10] = [
         remedy: "Export .ply from its program.",
     },
     Foreign {
-        is: |b| b.starts_with(b"PXR-USDC") || b.starts_with(b"#usda"),
-        what: "a USD stage",
-        remedy: "Export .ply from the program that wrote it.",
+        is: |b| b.starts_with(b"PXR-USDC"),
+        what: "a binary USD layer (.usdc), which is not read",
+        remedy: "Convert it to text with `usdcat IN.usdc -o OUT.usda`.",
     },
     Foreign {
         is: |b| b.starts_with(b"\x93NUMPY"),
@@ -65,29 +65,23 @@ const FOREIGN: [Foreign; 10] = [
 ];
 
 /// Endings of formats without a mark.
-const ENDINGS: [(&str, &str, &str); 5] = [
+const ENDINGS: [(&str, &str, &str); 3] = [
     (".ksplat", "a .ksplat of GaussianSplats3D", "Convert it to .ply first, for instance with splat-transform."),
-    (".usdz", "a USD archive", "Export .ply from the program that wrote it."),
     (
         ".splat4d",
         "a .splat4d of another program: those of splat4d begin with S4D",
         "Convert it to numbered .ply or .splat files with the program that wrote it.",
     ),
     (".4dgs", "a .4dgs of another program", "Convert it to numbered .ply files with the program that wrote it."),
-    (".gltf", "a glTF", "Export .ply or .spz from the program that wrote it."),
 ];
 
 /// Names of files in archives of other programs, by their ends: what such an archive is, and what to do with it.
-const ARCHIVES: [(&str, &str, &str); 3] = [
-    (
-        ".npy",
-        "a NumPy archive (.npz), not a SOG scene",
-        "Write its Gaussians as a 3DGS .ply; gsplat's export_splats does so. Points, depths and tracks in .npz belong to a \
+const ARCHIVES: [(&str, &str, &str); 1] = [(
+    ".npy",
+    "a NumPy archive (.npz), not a SOG scene",
+    "Write its Gaussians as a 3DGS .ply; gsplat's export_splats does so. Points, depths and tracks in .npz belong to a \
          capture.",
-    ),
-    ("data.pkl", "a checkpoint of PyTorch, which may hold code and is not read", "Export .ply from its program."),
-    (".usdc", "a USD archive", "Export .ply from the program that wrote it."),
-];
+)];
 
 /// Says what a file is that no reader takes. `name`: the file's, for formats without a mark; may be empty.
 pub fn unread(name: &str, bytes: &[u8]) -> Option<Error> {
@@ -138,7 +132,6 @@ mod tests {
         let names = |names: &[&str]| names.iter().map(|n| (*n).to_owned()).collect::<Vec<_>>();
         let error = archive(&names(&["means3d.npy", "viewmats.npy"])).unwrap().to_string();
         assert!(error.contains(".npz"), "{error}");
-        assert!(archive(&names(&["archive/data.pkl"])).unwrap().to_string().contains("PyTorch"));
         assert!(archive(&names(&["means_l.webp"])).is_none());
     }
 }

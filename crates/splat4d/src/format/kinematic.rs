@@ -65,6 +65,8 @@ pub(super) struct Moving {
     pub(super) center: f64,
     /// s of exp(−((u − centre)/s)²).
     pub(super) width: f64,
+    /// Layer and row of the scene that it was taken from.
+    pub(super) source: [usize; 2],
 }
 
 impl Moving {
@@ -99,7 +101,7 @@ pub(super) fn rows(
     let mut out = Vec::with_capacity(scene.len());
     let (mut shaded, mut fitted, mut unseen) = (0, 0, 0);
     let powers: [f64; 3] = std::array::from_fn(|k| clock.duration.powi(k as i32 + 1));
-    for layer in &scene.layers {
+    for (number, layer) in scene.layers.iter().enumerate() {
         let converted = with_polynomial(layer).map_err(|e| e.at(format_args!("layer `{}`", layer.name)))?;
         let absorbed = converted.with_frame_absorbed();
         let layer = absorbed.as_ref();
@@ -148,6 +150,7 @@ pub(super) fn rows(
                 turn: [0.0; 4],
                 center: (center - clock.clip[0]) / clock.duration,
                 width: (fade.width / clock.duration).clamp(NARROWEST, FOREVER),
+                source: [number, row],
             };
             if fade.opacity != seen.opacity {
                 moving.opacity_logit = (fade.opacity / (1.0 - fade.opacity)).ln().max(LEAST_LOGIT) as f32;

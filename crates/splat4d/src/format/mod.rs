@@ -4,10 +4,14 @@
 //! with the bytes present before anything is allocated.
 
 pub(crate) mod arrays;
+mod base64;
 mod bytes;
+pub mod checkpoint;
 pub mod dialect;
+pub mod dynamic3d;
 mod fade;
 pub mod foreign;
+mod freetime;
 pub mod gltf;
 mod half;
 mod kinematic;
@@ -27,6 +31,8 @@ pub mod sog;
 pub mod splat;
 pub mod splatv;
 pub mod spz;
+mod torch;
+pub mod usd;
 pub(crate) mod warnings;
 pub mod zip;
 
@@ -44,11 +50,18 @@ pub const DIALECTS: &[Dialect] = &[
     ply::DIALECT,
     ply::COMPRESSED,
     ply::STG,
+    ply::FTGS,
     spz::DIALECT,
     splat::DIALECT,
     splatv::DIALECT,
     sog::DIALECT,
     gltf::DIALECT,
+    gltf::TEXT,
+    gltf::COMPRESSED,
+    usd::TEXT,
+    usd::ARCHIVE,
+    dynamic3d::DIALECT,
+    checkpoint::DIALECT,
 ];
 
 /// The scene in a file of any kind that says by its first bytes what it is: `.s4d`, .ply (3DGS, compressed, Spacetime

@@ -194,6 +194,7 @@ fn unpack(b: &[u8]) -> Moving {
         turn: std::array::from_fn(|k| half(52 + 2 * k)),
         center: half(60),
         width: half(62),
+        source: [0; 2],
     }
 }
 

@@ -1,4 +1,5 @@
-//! Just enough of zip for `.sog` and `.npz`: stored and deflated files, named in the central directory.
+//! Just enough of zip for `.sog`, `.npz` and `.usdz`: stored and deflated files, named in the central directory, are read;
+//! stored ones are written.
 //!
 //! [`Archive::open`] reads the directory alone and refuses files whose bytes overlap; a file is inflated when it is asked for,
 //! up to the length that its format needs. An archive of 200 kB whose files share one body would otherwise become 200 GB.
@@ -11,7 +12,7 @@ use crate::{Error, ErrorKind, Result};
 use flate2::read::DeflateDecoder;
 use std::borrow::Cow;
 use std::collections::BTreeMap;
-use std::io::Read;
+use std::io::{Read, Write};
 use std::ops::Range;
 
 /// The files of an archive: name → bytes.
@@ -106,6 +107,11 @@ impl<'a> Archive<'a> {
         self.entries.keys().cloned().collect()
     }
 
+    /// Name of the file whose bytes stand first.
+    pub fn first(&self) -> Option<&str> {
+        self.entries.iter().min_by_key(|(_, e)| e.body.start).map(|(name, _)| name.as_str())
+    }
+
     /// Length of a file in the archive, bytes.
     pub fn packed(&self, name: &str) -> Option<usize> {
         self.entries.get(name).map(|e| e.body.len())
@@ -164,6 +170,77 @@ impl Entry {
     }
 }
 
+/// Version 2.0 of the format, which stored files need.
+const VERSION: [u8; 2] = [20, 0];
+/// No time, and 1 January 1980, the earliest day of the format.
+const TIME: [u8; 4] = [0, 0, 0x21, 0];
+/// Extra field that fills up to an alignment (usdz specification; Android's zipalign has the same).
+const FILL: u16 = 0x1986;
+/// Length of an extra field's own header.
+const EXTRA: usize = 4;
+
+/// Writes files as they are; the bytes of each begin at a multiple of `align`.
+///
+/// Errors: more than 4 GiB; the sink's.
+pub(super) fn write(files: &[(&str, &[u8])], align: usize, out: &mut dyn Write) -> Result<()> {
+    let failed = |e| Error::io("the archive could not be written", e);
+    let (mut at, mut directory) = (0usize, Vec::new());
+    let count = (files.len() as u16).to_le_bytes();
+    for (name, bytes) in files {
+        let mut crc = flate2::Crc::new();
+        crc.update(bytes);
+        let length = u32::try_from(bytes.len()).ok().filter(|_| at + bytes.len() < ZIP64 as usize);
+        let length = length.ok_or_else(too_long)?.to_le_bytes();
+        let body = at + LOCAL_HEADER + name.len();
+        let gap = body.next_multiple_of(align) - body;
+        let gap = if gap == 0 || gap >= EXTRA { gap } else { gap + align.max(EXTRA) };
+        let mut extra = Vec::new();
+        if gap > 0 {
+            extra.extend(FILL.to_le_bytes());
+            extra.extend(((gap - EXTRA) as u16).to_le_bytes());
+            extra.resize(gap, 0);
+        }
+        let shared = [&[0; 4][..], &TIME, &crc.sum().to_le_bytes(), &length, &length].concat();
+        let name_length = (name.len() as u16).to_le_bytes();
+        let head = [&MAGIC[..], &VERSION, &shared, &name_length, &(gap as u16).to_le_bytes(), name.as_bytes(), &extra];
+        let head = head.concat();
+        let place = (at as u32).to_le_bytes();
+        let entry = [&ENTRY[..], &VERSION, &VERSION, &shared, &name_length, &[0; 12], &place, name.as_bytes()];
+        directory.extend(entry.concat());
+        out.write_all(&head).and_then(|()| out.write_all(bytes)).map_err(failed)?;
+        at += head.len() + bytes.len();
+    }
+    let place = u32::try_from(at).map_err(|_| too_long())?.to_le_bytes();
+    let length = (directory.len() as u32).to_le_bytes();
+    let end = [&END[..], &[0; 4], &count, &count, &length, &place, &[0; 2]].concat();
+    out.write_all(&directory).and_then(|()| out.write_all(&end)).map_err(failed)
+}
+
+fn too_long() -> Error {
+    Error::input("the archive would be longer than 4 GiB")
+        .remedy("Write fewer frames (--from, --to) or fewer Gaussians.")
+}
+
 fn damaged(what: impl std::fmt::Display) -> Error {
     Error::input(format!("the zip archive is damaged: {what}")).remedy("Copy or save it again.")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn written_archives_are_read_and_aligned() {
+        let files: [(&str, &[u8]); 3] = [("scene.usda", b"#usda 1.0\n"), ("b/c.bin", &[7; 300]), ("empty", b"")];
+        for align in [1, 4, 64] {
+            let mut zip = Vec::new();
+            write(&files, align, &mut zip).unwrap();
+            let archive = Archive::open(&zip).unwrap();
+            assert_eq!(archive.first(), Some("scene.usda"));
+            for (name, bytes) in files {
+                assert_eq!(&archive.file(name, 300).unwrap().unwrap()[..], bytes);
+                assert!(archive.entries[name].body.start.is_multiple_of(align), "{name} at {align}");
+            }
+        }
+    }
 }

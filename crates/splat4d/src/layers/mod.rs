@@ -1,6 +1,7 @@
 //! A scene is a sum of layers, each a set of Gaussians with one motion model and one kind of lifespan, rendered
 //! together.
 
+mod constant;
 mod convert;
 mod cross_fade;
 mod envelope;
@@ -12,6 +13,7 @@ mod rotate;
 #[cfg(test)]
 mod tests;
 
+pub use constant::{Constant, HIDDEN};
 pub(crate) use convert::with_polynomial;
 pub use convert::{to_native4d, to_spacetime};
 pub use evaluation::{Evaluation, sweep};

@@ -68,6 +68,13 @@ impl Sim3 {
         }
     }
 
+    /// x = Rᵀ (y − t) / s
+    pub(crate) fn inverse(&self) -> Self {
+        let (scale, rotation) = (1.0 / self.scale, transpose(&self.rotation));
+        let translation = mat_vec(&rotation, self.translation).map(|x| -scale * x);
+        Self { scale, rotation, translation }
+    }
+
     /// The pose `cam_from_world` of a camera in the world that this leads to.
     pub fn pose(&self, pose: &Se3) -> Se3 {
         let center = self.apply(pose.inverse().translation);

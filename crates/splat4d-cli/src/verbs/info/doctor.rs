@@ -2,10 +2,10 @@
 
 use super::Told;
 use crate::console::Console;
-use crate::report::doctor::{about, made, sentence, summary};
 use serde_json::json;
 use splat4d_import::doctor::Grade;
 use splat4d_train::capture::Capture;
+use splat4d_workflow::report::doctor::{about, made, sentence, summary};
 use std::fmt::Write;
 use std::path::Path;
 

@@ -1,61 +1,102 @@
-//! Focal lengths: the one that right poses need for matches to lie on their epipolar lines.
+//! Focal lengths: the ones at which matches lie on their epipolar lines and colours of points are those of the images.
 
+use super::super::Capture;
 use super::super::account::Severity;
 use super::super::preflight::Finding;
 use super::Aspect;
 use super::look::Look;
 use super::pairs::{self, Match};
+use super::points;
 use splat4d::math::Se3;
 
 /// Factors that are tried are powers of this, up to so many both ways: a quarter to four times.
 const STEP: f64 = 1.189_207_115_002_721;
 const STEPS: i32 = 8;
-/// Steps from the focal length as read within which it is right: between them a few more matches fit by chance.
-const RIGHT: i32 = 2;
-/// How many times as many matches fit another focal length, where that is right; and how many at least, of all.
+/// Steps to half and to twice the length.
+const OCTAVE: i32 = 4;
+/// Steps from the focal length as read within which it is right.
+const RIGHT: i32 = 1;
+/// Distance from its epipolar line at which a match counts nothing, pixels of the small image; nearer ones count more.
+const REACH: f64 = 1.0;
+/// How many times as well matches fit another focal length, where that is right; and their least weight and share.
 const BETTER: f64 = 1.5;
-const ENOUGH: usize = 30;
-const SHARE: f64 = 0.2;
-/// Of the matches that fit, how many may fit half and twice the focal length where matches tell it.
+const ENOUGH: f64 = 30.0;
+const SHARE: f64 = 0.15;
+/// How well matches may fit half or twice the focal length, of as read, where they tell it.
 const FLAT: f64 = 0.7;
+/// By how much colours of points fit another focal length better, where that is right.
+const COLOURS: f64 = 0.1;
 
-/// A warning where matches need another focal length; a note where they fit any. `None`: it is right, or too few match.
-pub(super) fn check(matches: &[Match], looks: &[Look], poses: &[Se3]) -> Option<Finding> {
-    let steps: Vec<i32> = (-STEPS..=STEPS).collect();
-    let factors: Vec<f64> = steps.iter().map(|&k| STEP.powi(k)).collect();
-    let fitting = pairs::by_focal(matches, looks, poses, &factors);
-    let of = |step: i32| fitting[(step + STEPS) as usize];
-    // The nearest of equals.
-    let best = steps.iter().copied().max_by_key(|&k| (of(k), -k.abs()))?;
-    if of(best) < ENOUGH.max((SHARE * matches.len() as f64) as usize) {
+/// What the factors by which focal lengths are tried give, by steps.
+struct Tried(Vec<f64>);
+
+impl Tried {
+    fn new(of: impl Fn(f64) -> f64) -> Self {
+        Self((-STEPS..=STEPS).map(|k| of(STEP.powi(k))).collect())
+    }
+
+    fn at(&self, step: i32) -> f64 {
+        self.0[(step + STEPS) as usize]
+    }
+
+    /// The best step; the nearest of equals.
+    fn best(&self) -> i32 {
+        let better = |a: &i32, b: &i32| self.at(*a).total_cmp(&self.at(*b)).then(b.abs().cmp(&a.abs()));
+        (-STEPS..=STEPS).max_by(better).unwrap_or(0)
+    }
+}
+
+/// A warning where points or matches need other focal lengths; a note where matches fit any. `None`: they are right, or there
+/// is no evidence. `matches`: none were looked for where points have shown that poses are right.
+pub(super) fn check(capture: &Capture, matches: Option<&[Match]>, looks: &[Look], poses: &[Se3]) -> Option<Finding> {
+    by_points(capture, looks, poses).or_else(|| by_matches(matches?, looks, poses))
+}
+
+fn by_points(capture: &Capture, looks: &[Look], poses: &[Se3]) -> Option<Finding> {
+    capture.points.as_ref()?;
+    let gains = Tried::new(|times| points::gain_of_focal(capture, looks, poses, times).unwrap_or(0.0));
+    let best = gains.best();
+    let wrong = best.abs() > RIGHT && gains.at(best) >= points::CONVINCES.1 && gains.at(best) >= gains.at(0) + COLOURS;
+    let percent = |step: i32| 100.0 * gains.at(step).max(0.0);
+    wrong.then(|| {
+        let how = format!("colours of initial points fit their images by {:.0} %", percent(best));
+        warning(&how, best, looks, &format!("by {:.0} % as read", percent(0)))
+    })
+}
+
+fn by_matches(matches: &[Match], looks: &[Look], poses: &[Se3]) -> Option<Finding> {
+    let weight = |residual: f64| (1.0 - (residual / REACH).powi(2)).max(0.0);
+    let fit = Tried::new(|times| pairs::residuals(matches, looks, poses, times).into_iter().map(weight).sum());
+    let best = fit.best();
+    if fit.at(best) < ENOUGH.max(SHARE * matches.len() as f64) {
         return None;
     }
-    let octave = 4;
-    if best.abs() > RIGHT && of(best) as f64 >= BETTER * of(0) as f64 {
-        let own = looks[0].camera.intrinsics.fx;
-        let what = format!(
-            "Focal lengths are probably wrong: of {} matches between images {} fit if they are {:.2} times as long ({:.0} px in \
-             place of {own:.0} px), and {} as read.",
-            matches.len(),
-            of(best),
-            STEP.powi(best),
-            STEP.powi(best) * own,
-            of(0)
-        );
-        let remedy = "State the focal length for images of this size, in pixels of these images.".into();
-        return Some(Finding { severity: Severity::Warning, aspect: Some(Aspect::Assumed), what, remedy });
+    if best.abs() > RIGHT && fit.at(best) >= BETTER * fit.at(0) {
+        let how = format!("matches between images fit {:.1} times as well", fit.at(best) / fit.at(0).max(1.0));
+        return Some(warning(&how, best, looks, "than as read"));
     }
-    let flat = of(octave).min(of(-octave)) as f64 >= FLAT * of(0) as f64;
+    let flat = fit.at(OCTAVE).max(fit.at(-OCTAVE)) >= FLAT * fit.at(0);
+    let percent = |step: i32| 100.0 * fit.at(step) / fit.at(0).max(1.0);
     flat.then(|| Finding {
         severity: Severity::Note,
         aspect: Some(Aspect::NotChecked),
         what: format!(
-            "Whether focal lengths are right: of {} matches between images {} fit as read, {} at half and {} at twice the length.",
+            "Whether focal lengths are right: {} matches between images fit half the length {:.0} %, and twice the length {:.0} % \
+             as well as the lengths as read.",
             matches.len(),
-            of(0),
-            of(-octave),
-            of(octave)
+            percent(-OCTAVE),
+            percent(OCTAVE)
         ),
         remedy: String::new(),
     })
+}
+
+fn warning(how: &str, step: i32, looks: &[Look], as_read: &str) -> Finding {
+    let (times, own) = (STEP.powi(step), looks[0].camera.intrinsics.fx);
+    let what = format!(
+        "Focal lengths are probably wrong: {how} if they are {times:.2} times as long ({:.0} px in place of {own:.0} px), {as_read}.",
+        times * own
+    );
+    let remedy = "State the focal length for images of this size, in pixels of these images.".into();
+    Finding { severity: Severity::Warning, aspect: Some(Aspect::Assumed), what, remedy }
 }

@@ -1,7 +1,7 @@
 //! A few images, made small: their colours, foregrounds and features.
 
 use super::super::lens::Distortion;
-use super::super::picture::{self, Raster};
+use super::super::picture::{self, Raster, Samples};
 use super::super::{Capture, Frame};
 use crate::keypoints::features::{Feature, Limits, find};
 use crate::keypoints::raster::grey;
@@ -24,6 +24,8 @@ pub(super) const COARSE: Detail = Detail { side: 320, features: 350 };
 pub(super) const FINE: Detail = Detail { side: 640, features: 800 };
 /// Least contrast of a feature, as structure from motion takes it.
 const CONTRAST: f64 = 0.004;
+/// Weight of a mask or alpha from which a pixel shows something.
+const SHOWN: f32 = 0.5;
 /// Foreground below this share of an image, or above the other, says nothing of a place.
 const FOREGROUND: [f64; 2] = [0.001, 0.6];
 
@@ -89,14 +91,25 @@ pub(super) fn describe_each(looks: &mut [&mut Look], detail: Detail) {
 
 /// Means of boxes of one channel (or of alpha) of an image.
 fn reduced(raster: &Raster, channel: usize, k: usize) -> Vec<f32> {
+    let (sums, most) = match &raster.samples {
+        Samples::Eight(samples) => (box_sums(samples, raster, channel, k), 255.0),
+        Samples::Sixteen(samples) => (box_sums(samples, raster, channel, k), 65535.0),
+    };
+    let full = most * (k * k) as f64;
+    sums.into_iter().map(|sum| (sum as f64 / full) as f32).collect()
+}
+
+/// Sums of boxes: whole numbers, as most of the time of looking at a large image would go here.
+fn box_sums<T: Copy + Into<u64>>(samples: &[T], raster: &Raster, channel: usize, k: usize) -> Vec<u64> {
     let (width, height) = (raster.width / k, raster.height / k);
-    let mut out = vec![0.0; width * height];
+    let mut out = vec![0u64; width * height];
     for y in 0..height * k {
-        for x in 0..width * k {
-            out[y / k * width + x / k] += raster.get(y * raster.width + x, channel);
+        let start = y * raster.width * raster.channels + channel;
+        let mut row = samples[start..].iter().step_by(raster.channels).copied();
+        for sum in &mut out[y / k * width..][..width] {
+            *sum += row.by_ref().take(k).map(Into::into).sum::<u64>();
         }
     }
-    out.iter_mut().for_each(|v| *v /= (k * k) as f32);
     out
 }
 
@@ -178,12 +191,23 @@ impl Look {
         self.camera.intrinsics.fx / self.factor as f64
     }
 
-    /// The colour at which a point of the world is seen from `pose`; `None`: outside.
-    pub(super) fn color_of(&self, pose: &Se3, point: [f64; 3]) -> Option<[f32; 3]> {
-        let [u, v] = pixel_of(&self.camera, &self.lens, pose, point)?;
+    /// The camera of its file if the focal length were `times` as long.
+    pub(super) fn zoomed(&self, times: f64) -> Camera {
+        let mut camera = self.camera.clone();
+        camera.intrinsics.fx *= times;
+        camera.intrinsics.fy *= times;
+        camera
+    }
+
+    /// The colour at which a point of the world is seen from `pose` by this camera of the file; `None`: outside, or
+    /// hidden by its mask or alpha.
+    pub(super) fn color_of(&self, camera: &Camera, pose: &Se3, point: [f64; 3]) -> Option<[f32; 3]> {
+        let [u, v] = pixel_of(camera, &self.lens, pose, point)?;
         let (x, y) = (u as usize / self.factor, v as usize / self.factor);
         let inside = x < self.color.width && y < self.color.height;
-        inside.then(|| std::array::from_fn(|c| self.color.get(c, y, x)))
+        // Points of what was cut out have the colours of another image.
+        let shown = |s: &Shown| s.weights[y * self.color.width + x] >= SHOWN;
+        (inside && self.shown.as_ref().is_none_or(shown)).then(|| std::array::from_fn(|c| self.color.get(c, y, x)))
     }
 }
 

@@ -4,6 +4,7 @@
 //! Each is measured for the poses as read, and as they would be in other conventions of the layout. A finding needs a
 //! convention that fits clearly better; nothing else raises a warning.
 
+mod copies;
 mod focal;
 mod look;
 mod motion;
@@ -59,9 +60,9 @@ impl Capture {
         let mut check = self.judge(&mut looks, &mut matches);
         if !check.misread {
             let poses: Vec<Se3> = looks.iter().map(|l| self.frames[l.frame].source.cam_from_world).collect();
-            // Without matches points have shown that focal lengths are right.
-            check.more.extend(matches.and_then(|m| focal::check(&m, &looks, &poses)));
+            check.more.extend(focal::check(self, matches.as_deref(), &looks, &poses));
             check.more.extend(check_masks(&looks, &poses));
+            check.more.extend(copies::check(self));
             let pixels: usize = looks.iter().map(|l| l.camera.width * l.camera.height).sum();
             check.more.extend(outliers::check(self, looks, PIXELS.saturating_sub(pixels)));
         }

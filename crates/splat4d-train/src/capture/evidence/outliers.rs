@@ -8,6 +8,7 @@ use super::super::preflight::Finding;
 use super::super::{Aspect, Capture, Frame};
 use super::look::{self, Look};
 use super::pairs::{self, Match};
+use super::points;
 use rayon::prelude::*;
 use splat4d::math::Se3;
 use splat4d::math::se3::{dot, norm, sub};
@@ -25,6 +26,13 @@ const OVERLAP: usize = 20;
 /// Share of these that fit right poses at least, and wrong ones at most: what moves and repeats itself leaves right poses less than
 /// all, and a wrong pose fits what is near its lines by chance. Between them nothing is said.
 const FITS: [f64; 2] = [0.4, 0.15];
+/// Gain of the colours of initial points from which an image alone shows that its pose is right: exchanged images of one scene
+/// gain 0.14 (see `points`). Looking for features takes forty times as long.
+const VOUCHED: f64 = 0.3;
+/// Gain of an image below which it does not fit the points, where the images in the middle gain so much.
+const STRANGE: (f64, f64) = (0.1, 0.35);
+/// Images that are compared with points for that, evenly chosen, and their pixels: a tenth of a second.
+const SEEN: (usize, usize) = (64, 8_000_000);
 /// A jump is this many times as far as usual steps and as the step over it, to and from; and a turn is so many degrees.
 const JUMP: f64 = 8.0;
 const TURN: f64 = 30.0;
@@ -63,6 +71,13 @@ pub(super) fn check(capture: &Capture, looks: Vec<Look>, pixels: usize) -> Vec<F
     let missing: Vec<usize> = frames.iter().copied().filter(|f| looks.iter().all(|l| l.frame != *f)).collect();
     looks.extend(look::take(capture, &missing, look::COARSE));
     looks.sort_by_key(|l| frames.iter().position(|f| *f == l.frame));
+    let pose = |l: &Look| capture.frames[l.frame].source.cam_from_world;
+    let gain = |l: &Look| points::gain_of(capture, std::slice::from_ref(l), &[pose(l)]);
+    let strange = strange(capture, &order, &looks, &gain);
+    let vouched = |l: &Look| gain(l).is_some_and(|gain| gain >= VOUCHED);
+    let place = |l: &Look| order.iter().position(|f| *f == l.frame).unwrap_or(0);
+    let doubtful: Vec<usize> = looks.par_iter().filter(|l| !vouched(l)).map(place).collect();
+    looks.retain(|l| doubtful.iter().any(|k| k.abs_diff(place(l)) <= BESIDE));
     // Positions of the images in the order; unreadable ones have none.
     let at: Vec<usize> = looks.iter().filter_map(|l| order.iter().position(|f| *f == l.frame)).collect();
     let mut bare: Vec<&mut Look> = looks.iter_mut().filter(|l| l.marks.is_empty()).collect();
@@ -91,7 +106,9 @@ pub(super) fn check(capture: &Capture, looks: Vec<Look>, pixels: usize) -> Vec<F
     let told = |k: usize| (capture.frames[looks[k].frame].image.display().to_string(), signs.get(&at[k]).copied());
     let wrong = wrong(looks.len(), &measured);
     let mut findings = Vec::new();
+    let known: Vec<usize> = wrong.iter().map(|&k| looks[k].frame).collect();
     findings.extend(warning(&wrong, &measured, &told));
+    findings.extend(strange.filter(|s| !s.frames.iter().any(|f| known.contains(f))).map(|s| s.finding(capture)));
     let good = |k: usize| measured.iter().any(|p| p.has(k) && p.share() >= FITS[0]);
     let open: Vec<String> = (0..looks.len())
         .filter(|&k| signs.get(&at[k]) == Some(&Sign::Identity) && !good(k) && !wrong.contains(&k))
@@ -120,6 +137,52 @@ pub(super) fn check(capture: &Capture, looks: Vec<Look>, pixels: usize) -> Vec<F
         )));
     }
     findings
+}
+
+/// Images that do not fit the initial points, while the others do.
+struct Strange {
+    frames: Vec<usize>,
+    /// Their best gain, and that of the image in the middle.
+    gains: [f64; 2],
+}
+
+impl Strange {
+    fn finding(&self, capture: &Capture) -> Finding {
+        let names: Vec<String> = self.frames.iter().map(|&f| capture.frames[f].image.display().to_string()).collect();
+        let what = format!(
+            "{} of the images do not fit the initial points: {}. Colours of points fit these by {:.0} %, and those of other images \
+             by {:.0} %.",
+            names.len(),
+            first_names(&names),
+            100.0 * self.gains[0].max(0.0),
+            100.0 * self.gains[1]
+        );
+        let remedy = "Check that the image shows what its name says, that it is not turned or black, and that its pose is right.";
+        Finding { severity: Severity::Warning, aspect: Some(Aspect::Assumed), what, remedy: remedy.into() }
+    }
+}
+
+/// Looks for such images among those that are read already and some more.
+fn strange(
+    capture: &Capture,
+    order: &[usize],
+    looks: &[Look],
+    gain: &(dyn Fn(&Look) -> Option<f64> + Sync),
+) -> Option<Strange> {
+    capture.points.as_ref()?;
+    let size = capture.frames.first().map_or(1, |f| f.source.width * f.source.height).max(1);
+    let most = SEEN.0.min(SEEN.1 / size).max(1);
+    let more = order.iter().step_by(order.len().div_ceil(most).max(1)).copied();
+    let more: Vec<usize> = more.filter(|f| looks.iter().all(|l| l.frame != *f)).collect();
+    let others = look::take(capture, &more, look::COARSE);
+    let all: Vec<&Look> = looks.iter().chain(&others).collect();
+    let mut gains: Vec<(f64, usize)> = all.par_iter().filter_map(|l| Some((gain(l)?, l.frame))).collect();
+    gains.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+    let middle = gains.get(gains.len() / 2)?.0;
+    let low: Vec<(f64, usize)> = gains.iter().copied().take_while(|(g, _)| *g < STRANGE.0).collect();
+    let few = low.len() as f64 <= (FEW * gains.len() as f64).max(1.0);
+    let (best, _) = *low.last().filter(|_| few && middle >= STRANGE.1)?;
+    Some(Strange { frames: low.iter().map(|(_, f)| *f).collect(), gains: [best, middle] })
 }
 
 /// Matches of two images.

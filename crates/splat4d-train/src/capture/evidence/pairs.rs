@@ -142,15 +142,21 @@ fn least(centers: &[[f64; 3]]) -> f64 {
     ONE_PLACE * (spread + norm(centers.first().copied().unwrap_or_default()))
 }
 
-/// Matches that fit if focal lengths are `times` as long, of each of the factors.
-pub(super) fn by_focal(matches: &[Match], looks: &[Look], poses: &[Se3], factors: &[f64]) -> Vec<usize> {
+/// How far every match is from its epipolar line if focal lengths are `times` as long, pixels of the small image; infinite
+/// where the rays do not meet in front of both cameras.
+pub(super) fn residuals(matches: &[Match], looks: &[Look], poses: &[Se3], times: f64) -> Vec<f64> {
     let centers: Vec<[f64; 3]> = poses.iter().map(|p| p.inverse().translation).collect();
     let least = least(&centers);
-    let with = |times: f64| {
-        let scaled = |m: &Match| Match { looks: m.looks, rays: m.rays.map(|ray| ray.map(|x| x / times)) };
-        matches.iter().filter(|m| fits_within(&scaled(m), looks, poses, least, NEAR / times)).count()
+    let residual = |m: &Match| {
+        let m = Match { looks: m.looks, rays: m.rays.map(|ray| ray.map(|x| x / times)) };
+        let [a, b] = m.looks;
+        let motion = poses[b].after(&poses[a].inverse());
+        let in_one_place = norm(motion.translation) <= least;
+        let in_front = in_one_place || meet(&m, &motion);
+        let focal = 0.5 * times * (looks[a].focal() + looks[b].focal());
+        if in_front { focal * offset(&m, &motion, in_one_place) } else { f64::INFINITY }
     };
-    factors.iter().map(|&times| with(times)).collect()
+    matches.iter().map(residual).collect()
 }
 
 /// The distance of a match from the place or line where a static scene has it, pixels of the small image.
@@ -180,21 +186,18 @@ fn offset(m: &Match, motion: &Se3, in_one_place: bool) -> f64 {
     dot(q, line).abs() / slope.max(f64::MIN_POSITIVE)
 }
 
-/// Whether two rays meet in front of both cameras.
+/// Whether two rays meet, in front of both cameras.
 fn fits(m: &Match, looks: &[Look], poses: &[Se3], least: f64) -> bool {
-    fits_within(m, looks, poses, least, NEAR)
-}
-
-/// [`fits`] within so many pixels of the small image.
-fn fits_within(m: &Match, looks: &[Look], poses: &[Se3], least: f64, near: f64) -> bool {
     let [a, b] = m.looks;
     let motion = poses[b].after(&poses[a].inverse());
-    let tolerance = near * 2.0 / (looks[a].focal() + looks[b].focal());
+    let tolerance = NEAR * 2.0 / (looks[a].focal() + looks[b].focal());
     let in_one_place = norm(motion.translation) <= least;
     let near = offset(m, &motion, in_one_place) <= tolerance;
-    if !near || in_one_place {
-        return near;
-    }
+    near && (in_one_place || meet(m, &motion))
+}
+
+/// Whether the rays of cameras in two places meet in front of both, where they say so.
+fn meet(m: &Match, motion: &Se3) -> bool {
     let [p, q] = m.rays.map(|[x, y]| [x, y, 1.0]);
     let t = normalize(motion.translation);
     let (from, to) = (normalize(mat_vec(&motion.rotation, p)), normalize(q));

@@ -16,7 +16,7 @@ use std::collections::BTreeSet;
 const CAMERAS: usize = 24;
 const POINTS: usize = 400;
 /// Share of points in images, and gain of colours, from which poses are right.
-const CONVINCES: (f64, f64) = (0.03, MISFIT);
+pub(super) const CONVINCES: (f64, f64) = (0.03, MISFIT);
 /// Gain of colours below which points do not fit their images, if that many were compared: chance gives 0, exchanged images of
 /// one scene 0.14, and real captures 0.38 and more (studies/records, 26 November 2026).
 const MISFIT: f64 = 0.2;
@@ -31,6 +31,8 @@ const ALONE: f64 = 10.0;
 /// By how much another convention's colours fit better at least, where points in images already say so; else alone.
 pub(super) const BETTER: f64 = 0.05;
 const COLOURS_ALONE: f64 = 0.15;
+/// Sum of the differences of three channels below which colours are one.
+const ONE_COLOUR: f64 = 0.02;
 /// Colours that are compared at least.
 const ENOUGH: usize = 60;
 
@@ -126,7 +128,7 @@ pub(super) fn measure(
         seen += chosen.iter().filter(|&&p| pixel_of(camera, &lens, pose, cloud.points[p]).is_some()).count();
     }
     let share = seen as f64 / (chosen.len() * frames.len()).max(1) as f64;
-    let (gain, compared) = gain(capture, &chosen, looks, look_poses).unzip();
+    let (gain, compared) = gain(capture, &chosen, looks, look_poses, 1.0).unzip();
     Measure { asked: chosen.len(), seen: share, gain, compared: compared.unwrap_or(0) }
 }
 
@@ -329,20 +331,32 @@ pub(super) fn unreadable_depth(capture: &Capture) -> Option<Error> {
 
 /// How much nearer colours of some points are to the images there than to those at other points.
 pub(super) fn gain_of(capture: &Capture, looks: &[Look], poses: &[Se3]) -> Option<f64> {
-    let count = capture.points.as_ref()?.points.len();
-    let chosen: Vec<usize> = (0..count).step_by(count.div_ceil(POINTS).max(1)).collect();
-    gain(capture, &chosen, looks, poses).map(|(gain, _)| gain)
+    gain_of_focal(capture, looks, poses, 1.0)
 }
 
-/// How much nearer colours are to the image there than to that at other points, and how many were compared. `None`: points
-/// have one colour, or too few are in images.
-fn gain(capture: &Capture, chosen: &[usize], looks: &[Look], poses: &[Se3]) -> Option<(f64, usize)> {
+/// The same if focal lengths are `times` as long.
+pub(super) fn gain_of_focal(capture: &Capture, looks: &[Look], poses: &[Se3], times: f64) -> Option<f64> {
+    let cloud = capture.points.as_ref()?;
+    let chosen: Vec<usize> = (0..cloud.points.len()).step_by(step(cloud)).collect();
+    gain(capture, &chosen, looks, poses, times).map(|(gain, _)| gain)
+}
+
+/// How much nearer colours are to the image there than to that at other points, and how many were compared; focal lengths
+/// are `times` as long as read. `None`: points have one colour, or too few are in images.
+fn gain(capture: &Capture, chosen: &[usize], looks: &[Look], poses: &[Se3], times: f64) -> Option<(f64, usize)> {
     let cloud = capture.points.as_ref()?;
     let apart = |a: &[f32; 3], b: &[f32; 3]| a.iter().zip(b).map(|(x, y)| f64::from((x - y).abs())).sum::<f64>();
     let (mut own, mut other, mut count) = (0.0, 0.0, 0);
+    // Points of one colour, such as those that have none, say nothing.
+    let first = chosen.first().map(|&p| cloud.colors[p])?;
+    if chosen.iter().all(|&p| apart(&cloud.colors[p], &first) < ONE_COLOUR) {
+        return None;
+    }
     for (look, pose) in looks.iter().zip(poses) {
+        let camera = look.zoomed(times);
+        let there = |p: usize| look.color_of(&camera, pose, cloud.points[p]);
         let pairs: Vec<([f32; 3], [f32; 3])> =
-            chosen.iter().filter_map(|&p| Some((cloud.colors[p], look.color_of(pose, cloud.points[p])?))).collect();
+            chosen.iter().filter_map(|&p| Some((cloud.colors[p], there(p)?))).collect();
         let n = pairs.len();
         if n < 2 {
             continue;

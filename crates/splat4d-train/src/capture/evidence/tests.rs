@@ -270,6 +270,13 @@ fn points_of_another_world_are_no_evidence_of_health() {
 }
 
 #[test]
+fn points_without_colours_raise_no_alarm() {
+    let mut capture = photos(true);
+    capture.points.as_mut().unwrap().colors.iter_mut().for_each(|c| *c = [0.5; 3]);
+    assert_eq!(warned(&capture), [""; 0]);
+}
+
+#[test]
 fn weak_evidence_is_not_checked() {
     let mut capture = photos(false);
     capture.train.truncate(1);
@@ -378,9 +385,9 @@ fn an_identity_pose_that_cannot_be_compared_is_not_checked() {
 }
 
 #[test]
-fn focal_lengths_are_only_judged_where_matches_can_judge_them() {
-    let focal = |factor: f64| {
-        let mut capture = photos(false);
+fn focal_lengths_are_named_by_points_and_by_matches() {
+    let focal = |factor: f64, points: bool| {
+        let mut capture = photos(points);
         for frame in &mut capture.frames {
             let k = &mut frame.source.intrinsics;
             (k.fx, k.fy) = (k.fx * factor, k.fy * factor);
@@ -389,10 +396,56 @@ fn focal_lengths_are_only_judged_where_matches_can_judge_them() {
         let all = check.more.into_iter().chain([check.finding]);
         all.filter(|f| f.what.to_lowercase().contains("focal lengths are")).collect::<Vec<_>>()
     };
-    assert!(focal(1.0).iter().all(|f| f.severity == Severity::Note), "what is right is not called wrong");
-    // The matches of this scene fit half the length as well.
-    let vague = focal(1.5);
-    assert!(vague.iter().any(|f| f.aspect == Some(Aspect::NotChecked)), "{vague:?}");
+    let warns = |found: &[Finding]| found.iter().any(|f| f.severity == Severity::Warning);
+    for points in [true, false] {
+        assert!(!warns(&focal(1.0, points)), "what is right is not called wrong");
+        for factor in [0.5, 0.65, 1.6, 2.0] {
+            let found = focal(factor, points);
+            eprintln!("{factor} {points}: {:?}", found.iter().map(|f| &f.what).collect::<Vec<_>>());
+            assert!(warns(&found), "{factor} {points}: {found:?}");
+            // It is told within a step of the search.
+            let times: f64 = found
+                .iter()
+                .find_map(|f| f.what.split(" if they are ").nth(1)?.split(' ').next()?.parse().ok())
+                .unwrap();
+            assert!((times * factor - 1.0).abs() < 0.25, "{factor} {points}: {found:?}");
+        }
+    }
+}
+
+#[test]
+fn black_turned_and_copied_images_are_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    ImageBuffer::from_pixel(WIDTH, HEIGHT, Rgb([0u8; 3])).save(at("black.png")).unwrap();
+    let original = photos(true);
+    let frame = original.train[4];
+    image::open(&original.frames[frame].image).unwrap().rotate180().save(at("turned.png")).unwrap();
+    for name in ["black.png", "turned.png"] {
+        let mut capture = photos(true);
+        capture.frames[frame].image = at(name);
+        let found = warned(&capture);
+        assert!(
+            found.iter().any(|w| w.contains("do not fit the initial points") && w.contains(name)),
+            "{name}: {found:?}"
+        );
+    }
+    std::fs::copy(&original.frames[original.train[1]].image, at("copy.png")).unwrap();
+    for points in [true, false] {
+        let mut capture = photos(points);
+        capture.frames[frame].image = at("copy.png");
+        let found = warned(&capture);
+        assert!(
+            found.iter().any(|w| w.contains("1 images are copies of others") && w.contains("copy.png")),
+            "{found:?}"
+        );
+    }
+    // A fixed camera may show the same again.
+    let mut capture = photos(true);
+    let first = capture.frames[0].clone();
+    capture.frames[1] = Frame { image: at("same.png"), ..first };
+    std::fs::copy(&capture.frames[0].image, at("same.png")).unwrap();
+    assert!(!warned(&capture).iter().any(|w| w.contains("copies of others")));
 }
 
 #[test]

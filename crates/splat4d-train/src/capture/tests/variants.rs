@@ -2,7 +2,7 @@
 //! folders. What is read is that of the capture as it was written, or an error; and never without a word.
 
 use super::super::*;
-use super::samples::{self, FOCAL, HEIGHT, Sample, WIDTH};
+use super::samples::{self, FOCAL, HEIGHT, PLY, Sample, WIDTH};
 use crate::capture::pose::same_pose;
 use serde_json::{Value, json};
 use std::path::PathBuf;
@@ -275,6 +275,14 @@ fn lists_of_splits_are_kept() {
     let capture = open(&sample);
     assert_eq!((capture.train.as_slice(), capture.held.as_slice()), (&[0, 2][..], &[1][..]));
     assert_said(&capture, Aspect::Assumed, Severity::Note, &["6 of 9", "left out"]);
+    // Lists of images at the top; not those of numbers.
+    let sample = colmap_at("sparse/0", &["images"]);
+    sample.write("test.txt", b"_DSC8680.png\n_DSC8683.png\n");
+    sample.write("train.txt", b"1\n2\n");
+    assert_eq!(open(&sample).held, [1, 4]);
+    // Keys of other programs are not kept, and named.
+    let other = with(json!({"train_ids": [0, 1, 2]}));
+    assert_said(&open(&other), Aspect::NotRead, Severity::Warning, &["train_ids (meant train_filenames?)"]);
     // DyCheck's lists and rate, and HyperNeRF's lists without ids.
     let sample = samples::nerfies();
     sample.edit("dataset.json", |v| *v = json!({"ids": ["000000", "000001", "000002", "000003"]}));
@@ -307,7 +315,7 @@ fn times_are_read_as_what_they_count() {
     let lettered = |i: usize| format!("{}.png", char::from(b'a' + i as u8));
     let steps = |step: f64| (0..9).map(|i| step * i as f64).collect::<Vec<f64>>();
     type Case<'a> = (Vec<f64>, Option<f64>, &'a dyn Fn(usize) -> String, f64, Severity, &'a str);
-    let cases: [Case<'_>; 10] = [
+    let cases: [Case<'_>; 12] = [
         // Frame numbers, as names tell, and as a stated rate makes likely.
         (steps(1.0), Some(30.0), &numbered, 8.0 / 30.0, Severity::Note, "frame numbers"),
         (steps(1.0), None, &numbered, 8.0 / 30.0, Severity::Note, "frame numbers"),
@@ -319,6 +327,9 @@ fn times_are_read_as_what_they_count() {
         // Parts of the capture.
         (steps(1.0 / 8.0), None, &lettered, 8.0 / 30.0, Severity::Note, "parts"),
         (steps(1.0 / 9.0), Some(24.0), &lettered, 8.0 / 9.0 * 8.0 / 24.0, Severity::Note, "parts"),
+        // Every third frame of a second, and a clock that counts from a date.
+        (steps(0.1).iter().map(|t| 0.5 * t).collect(), Some(60.0), &lettered, 0.4, Severity::Note, "seconds"),
+        (steps(0.1).iter().map(|t| 1.7e9 + t).collect(), Some(10.0), &lettered, 0.8, Severity::Note, "seconds"),
         // Another rate than the one that is stated.
         (steps(2.0 / 15.0), Some(9.0), &lettered, 8.0 * 2.0 / 15.0, Severity::Warning, "do not fit"),
         // Milliseconds.
@@ -327,7 +338,9 @@ fn times_are_read_as_what_they_count() {
     for (times, fps, name, length, severity, word) in cases {
         let capture = with(&times, fps, name);
         let (first, last) = capture.time_range();
-        assert!((last - first - length).abs() < 1e-9, "{times:?} at {fps:?}: {} s", last - first);
+        // A clock from a date has no more digits.
+        assert!((last - first - length).abs() < 1e-6, "{times:?} at {fps:?}: {} s", last - first);
+        assert!(first.abs() < 1e3, "{first}");
         assert_said(&capture, Aspect::Assumed, severity, &["Times are read as", word, "9 instants"]);
     }
     let rate = with(&steps(1.0 / 25.0), None, &lettered).fps;
@@ -336,6 +349,41 @@ fn times_are_read_as_what_they_count() {
     sample.edit("transforms.json", |v| (0..3).for_each(|i| v["frames"][i]["time"] = json!(i)));
     let told = CaptureOptions { times: Times::Frames, fps: Some(10.0), ..CaptureOptions::default() };
     assert!((read(sample.root(), &told).time_range().1 - 0.2).abs() < 1e-12);
+}
+
+#[test]
+fn contradictions_of_focal_lengths_and_unread_clouds_are_reported() {
+    let with = |angle: f64| {
+        let sample = samples::photos(4, |i| format!("{i}.png"), None);
+        sample.edit("transforms.json", |v| {
+            v["camera_angle_x"] = json!(angle);
+            v["fl_x"] = json!(FOCAL);
+            v["fl_y"] = json!(FOCAL);
+        });
+        sample.write("sparse_pc.ply", PLY.as_bytes());
+        sample
+    };
+    let angle = 2.0 * (0.5 * WIDTH as f64 / FOCAL).atan();
+    let right = open(&with(angle));
+    assert!(!right.warnings.iter().any(|w| w.contains("differ")), "{:?}", right.warnings);
+    assert_said(&right, Aspect::NotRead, Severity::Note, &["Point clouds", "sparse_pc.ply"]);
+    assert_said(
+        &open(&with(0.5 * angle)),
+        Aspect::Assumed,
+        Severity::Warning,
+        &["camera_angle_x and fl_x differ", "20.0 px"],
+    );
+}
+
+#[test]
+fn a_lens_that_folds_inside_the_image_is_reported() {
+    let with = |k1: f64| {
+        let sample = samples::photos(4, |i| format!("{i}.png"), None);
+        sample.edit("transforms.json", |v| v["k1"] = json!(k1));
+        open(&sample)
+    };
+    assert_said(&with(-2.0), Aspect::Assumed, Severity::Warning, &["look wrong", "the lens folds"]);
+    assert!(!with(-0.1).warnings.iter().any(|w| w.contains("look wrong")));
 }
 
 #[test]
@@ -431,6 +479,27 @@ fn masks_next_to_images_are_found_in_every_layout() {
         Severity::Warning,
         &["None of the 1 files in masks/", "cam0.png.png", "_mask"],
     );
+    // Masks that are no images, and images of another folder.
+    let arrays = samples::photos(3, |c| format!("cam{c}.png"), None);
+    arrays.write("masks/cam1.npy", b"x");
+    assert_said(&open(&arrays), Aspect::NotRead, Severity::Warning, &["1 files in masks/", "cam1.npy", "PNG"]);
+    (0..3).for_each(|c| arrays.mask(&format!("sam2/cam{c}.png"), |_, _| 255));
+    assert_said(&open(&arrays), Aspect::NotRead, Severity::Note, &["named like the images: sam2"]);
+    // A mask in the alpha of a white image, and one of the numbers of labels.
+    let half = |x: u32| if x < 12 { 255u8 } else { 0 };
+    let rgba = |x, _| image::Rgba([255, 255, 255, half(x)]);
+    let labels = |x, _| image::Luma([u16::from(half(x) > 0) * 3]);
+    let [width, height] = [WIDTH as u32, HEIGHT as u32];
+    let sample_of = |save: &dyn Fn(&Sample)| {
+        let sample = samples::photos(3, |c| format!("cam{c}.png"), None);
+        save(&sample);
+        let store = ImageStore::new(Arc::new(open(&sample)), 1 << 20);
+        let mask = store.load(1).unwrap().to_picture().mask.unwrap();
+        (mask.get(0, 3, 2), mask.get(0, 3, 20))
+    };
+    let in_alpha = sample_of(&|s| s.save("masks/cam1.png", image::ImageBuffer::from_fn(width, height, rgba)));
+    let of_labels = sample_of(&|s| s.save("masks/cam1.png", image::ImageBuffer::from_fn(width, height, labels)));
+    assert_eq!([in_alpha, of_labels], [(1.0, 0.0); 2]);
     ["masks/cam1_mask.png", "masks/mask_cam1.png"].iter().for_each(|name| sample.mask(name, |_, _| 255));
     assert!(refuse(&sample).contains("several masks"), "{}", refuse(&sample));
 }
@@ -480,7 +549,7 @@ fn standard_folders_of_colmap_are_read() {
     let sample = colmap_at("sparse/0", &["images"]);
     std::fs::remove_file(sample.path("sparse/0/points3D.txt")).unwrap();
     assert!(open(&sample).points.is_none());
-    sample.write("sparse/0/points3D.ply", samples::PLY.as_bytes());
+    sample.write("sparse/0/points3D.ply", PLY.as_bytes());
     let capture = open(&sample);
     assert_eq!(capture.points.as_ref().unwrap().points.len(), 2);
     assert!(capture.notes.iter().any(|n| n.contains("2 initial points are those of a .ply")), "{:?}", capture.notes);
@@ -552,7 +621,7 @@ fn multiview_models_pose_the_folders_of_their_numbers() {
     std::fs::remove_dir_all(sample.path("images")).unwrap();
     sample.write("sparse_/images.txt", renamed.as_bytes());
     std::fs::remove_file(sample.path("sparse_/points3D.txt")).unwrap();
-    sample.write("points3D_multipleview.ply", samples::PLY.as_bytes());
+    sample.write("points3D_multipleview.ply", PLY.as_bytes());
     let capture = open(&sample);
     assert_eq!((capture.frames.len(), capture.cameras.len(), capture.fixed_cameras()), (6, 3, true));
     assert_eq!((capture.timing, capture.times().len()), (Timing::Numbers, 2));

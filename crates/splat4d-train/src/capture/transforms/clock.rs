@@ -24,6 +24,9 @@ const BETWEEN: f64 = 0.1;
 /// Frames between neighbouring instants from which another unit than seconds is likelier than a time lapse.
 const MANY_FRAMES: f64 = 29.5;
 
+/// Seconds from which the start of a clock is subtracted: lifespans are f32, which has steps of a millisecond there.
+const FAR_CLOCK: f64 = 1e4;
+
 /// Frames per second.
 #[derive(Clone, Copy)]
 pub(super) struct Rate {
@@ -70,7 +73,15 @@ pub(super) fn told(
     let (cameras, of, named) = cameras(entries, &times);
     let reading = read(entries, (&times, &instants, &of), rate, options);
     tell(&reading, &instants, rate, account);
-    let place = |(camera, &t): (usize, &f64)| (camera, nearest(&instants, t), t * reading.scale);
+    let start = instants.first().map_or(0.0, |first| first * reading.scale);
+    let start = if start.abs() > FAR_CLOCK { start } else { 0.0 };
+    if start != 0.0 {
+        let what = format!(
+            "The clock begins at {start} s, as one that counts from a date: that is subtracted from all times."
+        );
+        account.add(Aspect::Assumed, Severity::Note, what);
+    }
+    let place = |(camera, &t): (usize, &f64)| (camera, nearest(&instants, t), t * reading.scale - start);
     let frames = of.into_iter().zip(&times).map(place).collect();
     Some((Order { cameras, frames, named, timing: Timing::Told }, reading.fps))
 }
@@ -116,6 +127,10 @@ fn read(
         let filled = (instants[count - 1] - instants[0]) * count as f64 / (count - 1) as f64;
         if filled >= FILLED {
             return of(Times::Fractions);
+        }
+        // Parts of a capture end at 1; these are a whole number of frames apart instead.
+        if rate.stated && (step * fps).round() >= 1.0 && is_frame(step, fps / (step * fps).round()) {
+            return of(Times::Seconds);
         }
         let usual = RATES.iter().filter(|r| is_frame(step, **r));
         let nearest = usual.min_by(|a, b| (step * *a - 1.0).abs().total_cmp(&(step * *b - 1.0).abs()));

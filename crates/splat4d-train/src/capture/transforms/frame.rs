@@ -160,6 +160,25 @@ fn focal(top: &Node<'_>, node: &Node<'_>, keys: [&str; 3], side: usize) -> Resul
     Ok(None)
 }
 
+/// By how much an angle of view and a focal length in pixels may differ: angles are sometimes of undistorted images.
+const SAME_FOCAL: f64 = 1.1;
+
+/// What to say where the file's angle of view is another than its focal length in pixels, which is the one that is read.
+pub(super) fn contradiction(top: &Node<'_>, entries: &[Entry]) -> Result<Option<String>> {
+    let (Some(angle), Some(entry)) = (top.opt("camera_angle_x")?, entries.first()) else { return Ok(None) };
+    let (angle, camera) = (angle.number()?, &entry.source);
+    let by_angle = 0.5 * camera.width as f64 / (0.5 * angle).tan();
+    let ratio = by_angle / camera.intrinsics.fx;
+    let equal = (1.0 / SAME_FOCAL..=SAME_FOCAL).contains(&ratio) || entry.by_angle;
+    Ok((!equal && ratio > 0.0).then(|| {
+        format!(
+            "camera_angle_x and fl_x differ: {angle:.4} rad of an image {} px wide is a focal length of {by_angle:.1} px, and fl_x is \
+             {:.1} px, which is read. One of them is of another image size.",
+            camera.width, camera.intrinsics.fx
+        )
+    }))
+}
+
 fn lens(top: &Node<'_>, node: &Node<'_>) -> Result<Lens> {
     let term = |key: &str| -> Result<f64> { Ok(number(top, node, key)?.unwrap_or(0.0)) };
     let mut k = [term("k1")?, term("k2")?, term("k3")?, term("k4")?, term("k5")?, term("k6")?];
@@ -316,6 +335,11 @@ const OTHER_WORDS: &[(&str, &str)] = &[
     ("ply_path", "ply_file_path"),
     ("train_files", "train_filenames"),
     ("test_files", "test_filenames"),
+    ("split", "train_filenames"),
+    ("train_ids", "train_filenames"),
+    ("train_split", "train_filenames"),
+    ("test_ids", "test_filenames"),
+    ("test_split", "test_filenames"),
     ("framerate", "fps"),
     ("frame_rate", "fps"),
 ];

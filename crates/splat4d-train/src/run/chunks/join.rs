@@ -6,10 +6,11 @@ use super::{Chunked, Part, SCENE, shared};
 use crate::Result;
 use crate::capture::{Capture, ImageStore};
 use crate::event::Event;
+use crate::path_text::to_text;
 use crate::recipe::Recipe;
 use crate::run::checkpoint::write_atomically_with;
 use crate::run::identity::recipe_print;
-use crate::run::info::{read_info, read_text};
+use crate::run::info::{read_info, read_text, recorded_elsewhere};
 use crate::vision::view::spread;
 use splat4d::device;
 use splat4d::layers::{Evaluation, Layer, Scene};
@@ -95,8 +96,10 @@ impl Chunked {
         })?;
         joined.gaussians = gaussians.values().sum();
         let done = [joined.iterations as f64, joined.gaussians as f64, joined.seconds];
-        let name = read_info(&self.run)?["capture_name"].as_str().unwrap_or_default().to_owned();
-        self.write_info(&name, Some(done))?;
+        let info = read_info(&self.run)?;
+        let name = info["capture_name"].as_str().unwrap_or_default();
+        let elsewhere = recorded_elsewhere(&info).iter().map(|path| to_text(path)).collect();
+        self.write_info(name, elsewhere, Some(done))?;
         Ok(joined)
     }
 

@@ -21,7 +21,7 @@ pub use plan::ChunkPlan;
 
 use super::checkpoint::write_atomically;
 use super::identity;
-use super::info::{read_info, read_text};
+use super::info::{ELSEWHERE, elsewhere, read_info, read_text};
 use super::open::{OpenCapture, learnable, open_frames};
 use super::session::{Outcome, TrainOptions};
 use crate::capture::{Capture, Lenses};
@@ -123,7 +123,7 @@ impl Chunked {
         write_atomically(&run.join("recipe.toml"), recipe.to_toml().as_bytes())?;
         let lenses = capture.lenses.clone();
         let begun = Self { run: run.to_owned(), source, recipe, plan, lenses, pacing: None };
-        begun.write_info(&capture.name, None)?;
+        begun.write_info(&capture.name, elsewhere(capture), None)?;
         // Last: whoever finds it finds the others.
         let text = serde_json::to_string_pretty(&begun.plan).expect("a plan is plain data");
         write_atomically(&run.join(FOLDER).join(PLAN), text.as_bytes())?;
@@ -354,12 +354,13 @@ impl Chunked {
     }
 
     /// run.json of the whole; `done`: steps, Gaussians and seconds of all chunks.
-    fn write_info(&self, name: &str, done: Option<[f64; 3]>) -> Result<()> {
+    fn write_info(&self, name: &str, elsewhere: Vec<String>, done: Option<[f64; 3]>) -> Result<()> {
         let mut info = json!({
             "version": env!("CARGO_PKG_VERSION"),
             "made_by": MADE_BY,
             "capture": to_text(&self.source),
             "capture_name": name,
+            ELSEWHERE: elsewhere,
             "motion": self.recipe.run.motion.as_str(),
             "seed": self.recipe.run.seed,
             "chunks": self.plan.len(),

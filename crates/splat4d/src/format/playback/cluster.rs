@@ -25,7 +25,7 @@ const TASK: usize = 1024;
 const SUMMED: usize = 64;
 
 /// Result of the clustering.
-pub(super) struct Clusters {
+pub(in crate::format) struct Clusters {
     /// [k, width]
     pub centroids: Vec<f32>,
     /// The entry of every point.
@@ -36,7 +36,7 @@ pub(super) struct Clusters {
 /// points that differ.
 ///
 /// Panics: no point, k = 0, or lengths that do not fit.
-pub(super) fn cluster<'a>(
+pub(in crate::format) fn cluster<'a>(
     points: impl Iterator<Item = (&'a [f32], f32)>,
     width: usize,
     k: usize,

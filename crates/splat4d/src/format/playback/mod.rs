@@ -5,7 +5,7 @@
 //! [`read()`] a whole file as a scene of one layer per page.
 
 mod block;
-mod cluster;
+pub(in crate::format) mod cluster;
 mod coder;
 mod deflate;
 mod depths;

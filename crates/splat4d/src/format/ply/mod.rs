@@ -7,6 +7,7 @@
 //! Source: the files of Kerbl et al. 2023.
 
 mod compressed;
+mod ftgs;
 mod header;
 mod pack;
 mod rows;
@@ -27,6 +28,7 @@ use rows::Rows;
 use std::io::Write;
 
 pub use compressed::COMPRESSED;
+pub use ftgs::FTGS;
 pub(crate) use pack::write_compressed;
 pub use stg::{STG, is_stg, read_stg, write_stg};
 

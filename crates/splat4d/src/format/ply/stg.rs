@@ -40,7 +40,7 @@ const SCALE: usize = 21;
 const ROTATION: usize = 24;
 const OMEGA: usize = 28;
 /// Comment in our files that gives their clock: `comment splat4d clip FIRST LAST fps N`.
-const CLOCK: &str = "splat4d clip";
+pub(super) const CLOCK: &str = "splat4d clip";
 
 /// The properties of a row, in the order of the file.
 fn names() -> [String; WIDTH] {
@@ -102,7 +102,7 @@ pub fn read_stg(bytes: &[u8]) -> Result<(Scene<f32>, Warnings)> {
 }
 
 /// Reads the comment that states the clock.
-fn clock(comment: &str) -> Option<Clock> {
+pub(super) fn clock(comment: &str) -> Option<Clock> {
     let mut words = comment.strip_prefix(CLOCK)?.split_ascii_whitespace();
     let mut number = || words.next()?.parse::<f64>().ok();
     let clip = [number()?, number()?];
@@ -124,6 +124,7 @@ fn unpack(x: &[f64; WIDTH]) -> Moving {
         turn: std::array::from_fn(|k| x[OMEGA + k]),
         center: x[TRBF],
         width: x[TRBF + 1].clamp(-100.0, 100.0).exp(),
+        source: [0; 2],
     }
 }
 

@@ -1,4 +1,4 @@
-//! SOG version 2 (PlayCanvas), read: Gaussians as lossless WebP images, in a zip file or in a folder.
+//! SOG version 2 (PlayCanvas): Gaussians as lossless WebP images, in a zip file or in a folder.
 //!
 //! `meta.json` has `version` 2, `count` and for each group the image's `files` and a range or a codebook. Pixel i of a
 //! image belongs to Gaussian i. means_l, means_u: low and high bytes of 16 bits between mins and maxs of
@@ -11,6 +11,7 @@ pub mod levels;
 mod pictures;
 #[cfg(test)]
 pub(super) mod tests;
+mod write;
 
 use super::bytes::logit_of_byte;
 use super::dialect::{Dialect, Opened, Writer, Y_DOWN};
@@ -33,7 +34,7 @@ pub const DIALECT: Dialect = Dialect {
     moves: false,
     mark: Some(|bytes| bytes.starts_with(&ZIP_MAGIC)),
     read: |bytes| read(&unzip(bytes)?).map(Opened::from),
-    writer: Writer::None("Write .compressed.ply or .spz; splat-transform makes SOG of either."),
+    writer: Writer::Moment(|params, _, out| write::write(params, out)),
     world: false,
 };
 

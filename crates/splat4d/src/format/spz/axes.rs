@@ -21,6 +21,9 @@ const ALONG: f64 = 1.0 - 1e-6;
 /// Coefficients of spherical harmonics that change sign with x: those with an odd power of it.
 const ODD_IN_X: [usize; 6] = [3, 4, 7, 10, 13, 15];
 
+/// Beginning of the remark that a file does not name its axes.
+pub(crate) const ASSUMED: &str = "the file does not name its axes";
+
 /// A coordinate system, by its number.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Axes(usize);
@@ -99,7 +102,7 @@ pub(super) fn read(bytes: &[u8], warnings: &mut Warnings) -> Option<Axes> {
 /// Says what is assumed, makes a left-handed world right-handed, and returns which way is up.
 pub(super) fn settle(axes: Option<Axes>, params: &mut Params, warnings: &mut Warnings) -> [f64; 3] {
     let Some(axes) = axes else {
-        warnings.say("the file does not name its axes: those of .ply are assumed (y down); --up y or z corrects that");
+        warnings.say(format!("{ASSUMED}: those of .ply are assumed (y down); --up y or z corrects that"));
         return Y_DOWN;
     };
     if axes.is_mirrored() {

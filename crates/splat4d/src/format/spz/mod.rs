@@ -22,6 +22,7 @@ use super::warnings::Warnings;
 use crate::math::sh::degree_of;
 use crate::scene::{Params, SH};
 use crate::{Error, ErrorKind, Result};
+pub(super) use axes::ASSUMED as AXES_ASSUMED;
 use std::io::Write;
 
 /// .spz, versions 2 to 4.

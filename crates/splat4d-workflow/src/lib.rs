@@ -1,0 +1,84 @@
+//! What the `splat4d` command does beyond parsing and printing, as functions for Rust and Python: open runs and scenes, render
+//! their channels, bake, convert, export, evaluate, compress, label, predict, edit and report. Functions take typed options, report
+//! [`events::Event`]s and print nothing.
+//!
+//! ```no_run
+//! use splat4d_workflow::baking::{self, Baking};
+//! use splat4d_workflow::events::Event;
+//! use splat4d_workflow::source::Source;
+//! use std::path::Path;
+//!
+//! # fn main() -> splat4d::Result<()> {
+//! let run = Path::new("runs/knight");
+//! let source = Source::open(run)?;
+//! let listen = |event: &Event<'_>| if let Event::Warning(text) = event { eprintln!("{text}") };
+//! baking::bake_into(&source, "knight", Path::new("knight.s4d"), &Baking::default(), &listen)?;
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! # Code map
+//!
+//! A module imports only modules above it; `xtask/tests/tidy.rs` checks the order.
+//!
+//! | module | content |
+//! |---|---|
+//! | `events.rs` | what workflows report, and listeners |
+//! | `files.rs`, `deadline.rs` | files and numbers in words; the time that is left of `--minutes` |
+//! | `camera_file.rs`, `paths/` | camera files; orbits, data-set cameras and key-framed camera paths |
+//! | `run_folder.rs`, `status.rs`, `sequence.rs` | run folders; how far a run is; numbered files |
+//! | `source.rs`, `source/` | scenes of runs and files, of other programs' folders and archives |
+//! | `device.rs`, `draw.rs`, `video.rs`, `raw_values.rs`, `rendering.rs` | renders a scene's channels as images, films, arrays |
+//! | `capture_page.rs` | cameras, images and points of a capture, for the player's page |
+//! | `point_queries.rs` | points followed through a scene |
+//! | `measure.rs`, `measure/` | how scenes and files play: frames per second, bytes, Gaussians alive |
+//! | `baking.rs`, `baking/` | a scene as a playback file, within bytes and likeness |
+//! | `playable.rs`, `growing.rs` | anything that plays as a playback file; that of a long capture, which grows during training |
+//! | `converting.rs`, `exporting.rs` | formats of other programs; one time as .ply, the whole as a page |
+//! | `comparing.rs`, `report/`, `comparison.rs` | scores of several runs; `report.html`, drawn without a library; tables |
+//! | `evaluating.rs`, `foreign.rs`, `still_baseline.rs` | what follows training: scores, playback file, film, report; scores of any scene; of a static one |
+//! | `labelling.rs`, `chunked.rs`, `compressing.rs` | labels, long captures in chunks, compression with a guard |
+//! | `predicting.rs`, `predicting/` | forecasts, compared with what came |
+//! | `editing.rs`, `picking.rs`, `editor.rs` | lists of edits; edits from a page of the player |
+//! | `texts.rs` | texts that users write, for the fuzz targets |
+
+#![allow(missing_docs)] // its interface is not stable yet
+
+pub mod baking;
+pub mod camera_file;
+pub mod capture_page;
+pub mod chunked;
+pub mod comparing;
+pub mod comparison;
+pub mod compressing;
+pub mod converting;
+pub mod deadline;
+pub mod device;
+pub mod draw;
+pub mod editing;
+pub mod editor;
+pub mod evaluating;
+pub mod events;
+pub mod exporting;
+pub mod files;
+pub mod foreign;
+pub mod growing;
+pub mod labelling;
+pub mod measure;
+pub mod paths;
+mod picking;
+pub mod playable;
+pub mod point_queries;
+pub mod predicting;
+pub mod raw_values;
+pub mod rendering;
+pub mod report;
+pub mod run_folder;
+pub mod sequence;
+pub mod source;
+pub mod status;
+pub mod still_baseline;
+pub mod texts;
+pub mod video;
+
+pub use splat4d::{Error, ErrorKind, Result};
