@@ -386,7 +386,7 @@ fn asks_which_model(line: &str, variant: &str, name: &str) -> bool {
     compared || behind || told
 }
 
-/// A new motion model is its own files and its entries: nobody else may ask which one it is. Capabilities answer what
+/// A new motion model is its own files and its entries: no other code may ask which one it is. Capabilities answer what
 /// others need to know.
 #[test]
 fn motion_models_are_named_only_in_their_modules() {
@@ -421,7 +421,7 @@ const DIALECT_LIST: &str = "crates/splat4d/src/format/mod.rs";
 const DIALECT_NAMES: [(&str, &str); 1] =
     [("crates/splat4d-workflow/src/source/bundle.rs", "a SOG scene may lie in a folder")];
 
-/// A new dialect is its own file and its entry in the list: nobody else may name one. Its properties answer what others
+/// A new dialect is its own file and its entry in the list: no other code may name one. Its properties answer what others
 /// need to know.
 #[test]
 fn dialects_are_named_only_in_their_modules() {

@@ -6,13 +6,16 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::{Value, json};
 use splat4d::text;
 use splat4d_train::event::Event;
+use splat4d_train::output::rfc3339;
 use splat4d_train::path_text::in_command;
 use splat4d_workflow::events::{Listener, linked};
 use splat4d_workflow::files::{grouped, human_bytes, human_seconds};
+use std::borrow::Cow;
 use std::cell::RefCell;
 use std::io::{IsTerminal, Write};
 use std::path::Path;
-use std::time::{Duration, Instant};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant, SystemTime};
 
 /// How much is said.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -27,6 +30,10 @@ pub enum Loudness {
 
 /// Seconds between progress lines where stderr is no terminal.
 const PLAIN_INTERVAL: Duration = Duration::from_secs(10);
+/// Time between two objects of one phase, with `--json`.
+const JSON_INTERVAL: Duration = Duration::from_secs(1);
+/// A shorter phase shows no time left.
+const LEAST_PACE: Duration = Duration::from_secs(3);
 /// Redraws of a bar a second: often enough to look alive, cheap over slow remote shells.
 const BAR_RATE: u8 = 8;
 
@@ -39,8 +46,17 @@ pub struct Console {
     state: RefCell<State>,
 }
 
+/// When a phase began, and how much was done then.
+#[derive(Debug)]
+struct Pace {
+    name: String,
+    first: usize,
+    began: Instant,
+}
+
 #[derive(Debug, Default)]
 struct State {
+    pace: Option<Pace>,
     bar: Option<ProgressBar>,
     phase: String,
     last_line: Option<Instant>,
@@ -101,7 +117,7 @@ impl Console {
     /// A result, on stdout; not with `--json`, not when quiet.
     pub fn say(&self, text: &str) {
         if !self.json && self.loudness > Loudness::Quiet {
-            self.above_bar(|| print(text));
+            self.above_bar(|| print(&stamped(text)));
         }
     }
 
@@ -132,8 +148,14 @@ impl Console {
         if let Some(objects) = &mut self.state.borrow_mut().objects {
             objects.push(value.clone());
         } else if self.json {
-            print(&one_json_line(value));
+            self.emit_now(value.clone());
         }
+    }
+
+    /// One JSON line with the time at which it was printed.
+    fn emit_now(&self, mut value: Value) {
+        value["time"] = json!(rfc3339(SystemTime::now()));
+        print(&one_json_line(&value));
     }
 
     /// A file was written.
@@ -189,9 +211,11 @@ impl Console {
         if let Event::Warning { message } = event {
             return self.warn(message);
         }
+        if let (Event::Phase { name, done, total }, true) = (event, self.json) {
+            return self.phase(name, *done, *total);
+        }
         if self.json {
-            let value = serde_json::to_value(event).expect("events are plain data");
-            return print(&one_json_line(&value));
+            return self.emit(&serde_json::to_value(event).expect("events are plain data"));
         }
         match event {
             Event::Phase { name, done, total } => self.phase(name, *done, *total),
@@ -280,13 +304,40 @@ impl Console {
     /// Progress of a preparation or of rendering.
     pub fn phase(&self, name: &str, done: usize, total: usize) {
         if self.json {
-            return self.emit(&json!({"type": "phase", "name": name, "done": done, "total": total}));
+            if self.is_due(name, done, total) {
+                self.emit(&json!({"type": "phase", "name": name, "done": done, "total": total}));
+            }
+            return;
         }
-        let words = String::new();
+        let left = self.left(name, done, total).map(|s| format!("about {} left", human_seconds(s)));
+        let words = left.unwrap_or_default();
         self.advance(name, done, total, &words, || match total {
             0 => format!("{name} ..."),
-            _ => format!("{name} {done}/{total}"),
+            _ => format!("{name} {done}/{total}{}{words}", if words.is_empty() { "" } else { ", " }),
         });
+    }
+
+    /// Whether an object is printed: at the start and the end of a phase, and once a second between them.
+    fn is_due(&self, name: &str, done: usize, total: usize) -> bool {
+        let mut state = self.state.borrow_mut();
+        let ends = total > 0 && done >= total;
+        let due = state.phase != name || ends || state.last_line.is_none_or(|t| t.elapsed() >= JSON_INTERVAL);
+        if due {
+            state.phase = name.to_owned();
+            state.last_line = Some(Instant::now());
+        }
+        due
+    }
+
+    /// Seconds that are left of a phase, by its pace so far; none: too early to say.
+    fn left(&self, name: &str, done: usize, total: usize) -> Option<f64> {
+        let mut state = self.state.borrow_mut();
+        let fresh = state.pace.as_ref().is_none_or(|p| p.name != name || done < p.first);
+        if fresh {
+            state.pace = Some(Pace { name: name.to_owned(), first: done, began: Instant::now() });
+        }
+        let pace = state.pace.as_ref().expect("it was just set");
+        time_left(pace.began.elapsed(), done.saturating_sub(pace.first), total.saturating_sub(done))
     }
 
     fn advance(&self, name: &str, done: usize, total: usize, words: &str, line: impl FnOnce() -> String) {
@@ -338,6 +389,10 @@ impl Console {
     }
 }
 
+fn time_left(elapsed: Duration, done: usize, left: usize) -> Option<f64> {
+    (elapsed >= LEAST_PACE && done > 0 && left > 0).then(|| elapsed.as_secs_f64() * left as f64 / done as f64)
+}
+
 fn bar(total: usize) -> ProgressBar {
     let bar = ProgressBar::with_draw_target(Some(total as u64), ProgressDrawTarget::stderr_with_hz(BAR_RATE));
     let style = ProgressStyle::with_template("{prefix} {bar:28} {pos}/{len}  {msg}").expect("the template is fixed");
@@ -386,14 +441,49 @@ fn print_shown(line: &str) {
     }
 }
 
-/// Prints a line on stderr, safe for a terminal; where that is closed there is nobody to tell.
+/// Prints a line on stderr, safe for a terminal; nothing happens if that is closed.
 pub(crate) fn eprint_line(line: &str) {
-    let _ = writeln!(std::io::stderr().lock(), "{}", text::shown(line));
+    let _ = writeln!(std::io::stderr().lock(), "{}", text::shown(&stamped(line)));
+}
+
+/// Whether lines begin with the time.
+static LOG_TIME: AtomicBool = AtomicBool::new(false);
+
+/// From now on lines of progress, warnings and errors begin with the time.
+pub(crate) fn log_time() {
+    LOG_TIME.store(true, Ordering::Relaxed);
+}
+
+/// A line with the time before it, where that is wanted.
+fn stamped(line: &str) -> Cow<'_, str> {
+    match LOG_TIME.load(Ordering::Relaxed) {
+        true => format!("{} {line}", rfc3339(SystemTime::now())).into(),
+        false => line.into(),
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn machines_are_told_the_ends_of_a_phase_and_little_between() {
+        let console = Console::keeping_objects();
+        (0..=100).for_each(|done| console.phase("baking", done, 100));
+        console.phase("writing", 0, 0);
+        let told = console.into_objects();
+        assert!((3..=5).contains(&told.len()), "{told:?}");
+        assert_eq!(told[0], json!({"type": "phase", "name": "baking", "done": 0, "total": 100}));
+        assert!(told.iter().any(|o| o["done"] == 100) && told.last().unwrap()["name"] == "writing");
+    }
+
+    #[test]
+    fn phases_tell_their_time_left_once_they_have_a_pace() {
+        assert_eq!(time_left(Duration::from_secs(10), 2, 6), Some(30.0));
+        for (seconds, done, left) in [(1, 2, 6), (10, 0, 6), (10, 6, 0)] {
+            assert_eq!(time_left(Duration::from_secs(seconds), done, left), None);
+        }
+    }
 
     #[test]
     fn trouble_and_verdict_have_colours() {

@@ -89,6 +89,9 @@ pub struct Globals {
     /// Print only warnings and errors
     #[arg(short, long, global = true)]
     quiet: bool,
+    /// Begin every line of progress, warnings and errors with the time (UTC); with --json every object has `time`
+    #[arg(long, global = true)]
+    log_time: bool,
     /// Number of threads [default: all cores]; the result does not depend on it
     #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     pub threads: Option<u16>,
@@ -165,7 +168,7 @@ pub fn call(words: &[OsString]) -> anyhow::Result<Vec<serde_json::Value>> {
     Ok(console.into_objects())
 }
 
-/// Parses the arguments of a program with the command's manners, does what `work` makes of them, and tells errors.
+/// Parses the arguments of a program with the command's manners, does what `work` makes of them, and prints errors.
 pub fn parsed<C, W>(work: impl FnOnce(C) -> (Globals, W)) -> ExitCode
 where
     C: Parser,
@@ -197,6 +200,9 @@ where
         (_, true) => Loudness::Verbose,
         _ => Loudness::Normal,
     };
+    if globals.log_time {
+        console::log_time();
+    }
     let console = Console::new(loudness, globals.json);
     match threads(globals.threads).and_then(|()| work(&console)) {
         Ok(()) => DONE,

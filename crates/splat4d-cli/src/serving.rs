@@ -1,17 +1,24 @@
 //! The player's server as verbs use it: options, what is said about it, the browser, and a run that is being watched.
 
 use crate::console::Console;
-use serde_json::json;
-use splat4d_serve::{Config, News, Running, Server};
+use serde_json::{Value, json};
+use splat4d::{Error, Result};
+use splat4d_serve::{Config, EditAnswer, Editing, News, Running, Server};
+use splat4d_train::capture::Capture;
 use splat4d_train::event::Event;
-use splat4d_workflow::playable;
+use splat4d_train::run::Stopwatch;
+use splat4d_workflow::editor::token;
+use splat4d_workflow::{capture_page, playable};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
 
 /// How often a waiting program looks whether Ctrl-C was pressed.
 const LOOK: Duration = Duration::from_millis(50);
+/// Time for the last news to reach pages before the server ends.
+const FAREWELL: Duration = Duration::from_millis(250);
 
 /// Where to serve.
 #[derive(Clone, Debug, Default, clap::Args)]
@@ -37,23 +44,14 @@ impl Place {
     }
 }
 
-/// Starts a server, says where, and opens the browser.
-pub(crate) fn start(config: Config, place: &Place, console: &Console) -> splat4d::Result<Running> {
-    start_for(config, place, None, console)
-}
-
-/// The same; the page that is opened here may edit by this token.
-pub(crate) fn start_for(
-    config: Config,
-    place: &Place,
-    token: Option<&str>,
-    console: &Console,
-) -> splat4d::Result<Running> {
+/// Starts a server, prints its address, and opens the browser; that page may edit, or control the run, by the token.
+pub(crate) fn start_for(config: Config, place: &Place, token: Option<&str>, console: &Console) -> Result<Running> {
     let host = place.host.clone().unwrap_or(config.host);
+    let right = if config.editing.is_some() { "edit" } else { "control" };
     let running =
         Server::start(Config { host, port: place.port, player_folder: place.player_folder.clone(), ..config })?;
     // Behind `#` a browser sends nothing to anybody, and pages that are linked to do not see it.
-    let url = token.map_or(running.url().to_owned(), |token| format!("{}#edit={token}", running.url()));
+    let url = token.map_or(running.url().to_owned(), |token| format!("{}#{right}={token}", running.url()));
     console.say(&format!("the player is at {url}"));
     console.emit(&json!({"type": "serving", "url": url}));
     if !running.address().ip().is_loopback() {
@@ -65,7 +63,7 @@ pub(crate) fn start_for(
             "this machine has no screen. On your own computer: ssh -L {port}:localhost:{port} {}, then open \
              http://localhost:{port}/{}",
             machine(),
-            token.map_or(String::new(), |token| format!("#edit={token}"))
+            token.map_or(String::new(), |token| format!("#{right}={token}"))
         ));
     }
     Ok(running)
@@ -108,43 +106,136 @@ fn open_browser(url: &str) -> bool {
     }
 }
 
+/// Pause and stop of a run, as its page asks for them.
+///
+/// A pause blocks the trainer between two steps, so that the result stays the same to the bit.
+#[derive(Debug)]
+pub(crate) struct Control {
+    stop: Arc<AtomicBool>,
+    paused: AtomicBool,
+    began: Instant,
+    /// Time of all pauses so far.
+    waited: Mutex<Duration>,
+}
+
+impl Control {
+    /// `stop` ends the run as Ctrl-C does.
+    pub(crate) fn new(stop: Arc<AtomicBool>) -> Arc<Self> {
+        let waited = Mutex::new(Duration::ZERO);
+        Arc::new(Self { stop, paused: AtomicBool::new(false), began: Instant::now(), waited })
+    }
+
+    /// Seconds since the command began, without pauses: a paused run keeps its minutes.
+    pub(crate) fn clock(self: &Arc<Self>) -> Stopwatch {
+        let control = self.clone();
+        Stopwatch::of(move || control.began.elapsed().saturating_sub(control.waited()).as_secs_f64())
+    }
+
+    fn waited(&self) -> Duration {
+        *self.waited.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn is_paused(&self) -> bool {
+        self.paused.load(Ordering::SeqCst) && !self.stop.load(Ordering::SeqCst)
+    }
+
+    /// Waits until the run is continued or stopped.
+    fn wait(&self) {
+        let began = Instant::now();
+        while self.is_paused() {
+            std::thread::sleep(LOOK);
+        }
+        *self.waited.lock().unwrap_or_else(PoisonError::into_inner) += began.elapsed();
+    }
+
+    /// Does what a page asks for.
+    fn answer(&self, asked: &Value) -> Result<EditAnswer> {
+        let state = match asked["do"].as_str() {
+            Some("pause") => "pausing",
+            Some("continue") => "training",
+            Some("stop") => {
+                self.stop.store(true, Ordering::SeqCst);
+                "stopping"
+            }
+            _ => return Err(Error::input("unknown request of the page").remedy("Reload the page")),
+        };
+        self.paused.store(state == "pausing", Ordering::SeqCst);
+        Ok(EditAnswer { told: json!({ "state": state }), scene: None })
+    }
+}
+
 /// A run that is watched while it trains. What goes wrong with watching never costs the run.
 pub(crate) struct Watch {
     running: Option<Running>,
+    control: Arc<Control>,
+    /// The held-out score of the newest snapshot, dB.
+    held_out: Mutex<Option<f64>>,
 }
 
 impl Watch {
-    /// Nobody looks.
-    pub(crate) fn nobody() -> Self {
-        Self { running: None }
-    }
-
     /// Starts to serve a run that is about to train; a server that cannot be started is a warning.
-    pub(crate) fn start(title: &str, place: &Place, console: &Console) -> Self {
-        let config = Config { live: true, background: true, about: json!({ "title": title }), ..Config::default() };
-        match start(config, place, console) {
-            Ok(running) => Self { running: Some(running) },
+    ///
+    /// `place`: none serves nothing. `capture`: its cameras and images are shown next to the render.
+    pub(crate) fn start(
+        title: &str,
+        capture: Option<Arc<Capture>>,
+        place: Option<&Place>,
+        control: &Arc<Control>,
+        console: &Console,
+    ) -> Self {
+        let running = place.and_then(|place| match Self::serve(title, capture, place, control, console) {
+            Ok(running) => Some(running),
             Err(error) => {
                 console.warn(&format!("training continues without the page: {error}"));
-                Self::nobody()
+                None
             }
-        }
+        });
+        Self { running, control: control.clone(), held_out: Mutex::new(None) }
     }
 
-    /// Whether somebody could look.
+    fn serve(
+        title: &str,
+        capture: Option<Arc<Capture>>,
+        place: &Place,
+        control: &Arc<Control>,
+        console: &Console,
+    ) -> Result<Running> {
+        let token = token()?;
+        let (asked, mut about) = (control.clone(), json!({ "title": title }));
+        let photos = capture.map(|capture| {
+            let (cameras, photos) = capture_page::cameras(capture);
+            about["cameras"] = cameras;
+            photos
+        });
+        let control = Some(Editing::new(token.clone(), move |value| asked.answer(&value)));
+        let config = Config { live: true, background: true, about, control, photos, ..Config::default() };
+        start_for(config, place, Some(&token), console)
+    }
+
+    /// Whether the run is served.
     pub(crate) fn is_on(&self) -> bool {
         self.running.is_some()
     }
 
-    /// Passes an event on.
+    /// Passes an event on, and waits after a step while the page has paused the run.
     pub(crate) fn hear(&self, event: &Event) {
         let Some(running) = &self.running else { return };
+        let score = || self.held_out.lock().unwrap_or_else(PoisonError::into_inner);
+        let state = |state: &str| running.publish(&News::Control(json!({ "state": state })));
         match event {
-            Event::Snapshot { iteration, bytes } => {
-                running.set_scene(bytes.clone(), &json!({ "iteration": iteration }));
+            Event::Snapshot { iteration, bytes, held_out } => {
+                *score() = *held_out;
+                running.set_scene(bytes.clone(), &json!({ "iteration": iteration, "held_out": held_out }));
             }
             Event::Progress { .. } => {
-                running.publish(&News::Step(serde_json::to_value(event).expect("events are plain data")));
+                let mut step = serde_json::to_value(event).expect("events are plain data");
+                step["held_out"] = json!(*score());
+                running.publish(&News::Step(step));
+                if self.control.is_paused() {
+                    state("paused");
+                    self.control.wait();
+                    state("training");
+                }
             }
             Event::Warning { message } => running.publish(&News::Note(json!({ "message": message }))),
             Event::RolledBack { iteration, to, what } => {
@@ -158,11 +249,46 @@ impl Watch {
         }
     }
 
+    /// The run was stopped and saved; `resume` continues it. The server may end after this.
+    pub(crate) fn stopped(&self, iteration: usize, resume: &str) {
+        let Some(running) = &self.running else { return };
+        running.publish(&News::Control(json!({ "state": "stopped", "iteration": iteration, "resume": resume })));
+        std::thread::sleep(FAREWELL);
+    }
+
     /// Shows a finished run's playback file, where there is one.
     pub(crate) fn show(&self, run: &Path, iteration: usize) {
         let Some(running) = &self.running else { return };
         if let Ok(bytes) = splat4d_workflow::files::read(&playable::of_run(run)) {
             running.set_scene(bytes.into(), &json!({ "iteration": iteration }));
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_paused_run_waits_without_using_its_time_and_goes_on_or_stops() {
+        let stop = Arc::new(AtomicBool::new(false));
+        let control = Control::new(stop.clone());
+        let ask = |what: &str| control.answer(&json!({ "do": what })).map(|a| a.told["state"].clone());
+        assert!(ask("explode").is_err() && !control.is_paused());
+        for way in ["continue", "stop"] {
+            assert_eq!(ask("pause").unwrap(), "pausing");
+            let (clock, waiting) = (control.clock(), control.clone());
+            let trainer = std::thread::spawn(move || {
+                let (before, began) = (clock.seconds(), Instant::now());
+                waiting.wait();
+                (clock.seconds() - before, began.elapsed().as_secs_f64())
+            });
+            std::thread::sleep(3 * LOOK);
+            assert!(!trainer.is_finished(), "it waits");
+            ask(way).unwrap();
+            let (counted, passed) = trainer.join().unwrap();
+            assert!(counted < 0.5 * passed, "{counted} s of {passed} s are counted");
+        }
+        assert!(stop.load(Ordering::SeqCst), "stop ends the run as Ctrl-C does");
     }
 }

@@ -1,4 +1,4 @@
-//! The built binary on small synthetic captures: what users type, what they get, and what they are told.
+//! The built binary on small synthetic captures: what users type, what they get, and what is printed.
 
 #[path = "cli/channels.rs"]
 mod channels;

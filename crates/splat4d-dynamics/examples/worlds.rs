@@ -13,7 +13,7 @@ use std::time::Instant;
 
 /// Frames that are observed.
 const OBSERVED: usize = 120;
-/// Frames ahead at which errors are told.
+/// Frames ahead at which errors are reported.
 const HORIZONS: [usize; 5] = [1, 5, 10, 20, 30];
 
 fn main() -> Result<()> {

@@ -53,7 +53,7 @@ impl<'a> Filter<'a> {
         (OBSERVED * self.observed.size).powi(2)
     }
 
-    /// The time of the frame that [`update`](Self::update) compares with, whatever its own: poses are told, not asked of time.
+    /// The time of the frame that [`update`](Self::update) compares with, whatever its own: poses are given, not evaluated by time.
     pub fn time(&self) -> f64 {
         self.clock.at(1)
     }

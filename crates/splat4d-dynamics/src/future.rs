@@ -74,7 +74,7 @@ pub fn predicted(scene: &Scene<f32>, observed: &Observed, moments: &[Moment], cl
     Ok(out)
 }
 
-/// Gaussians at the last observed moment on nodes that go where they are told.
+/// Gaussians at the last observed moment on nodes whose motion is given.
 fn carried(
     frozen: Params<f32>,
     paths: &Paths,

@@ -110,7 +110,7 @@ pub fn observe(scene: &Scene<f32>, ticks: &[f64], count: usize) -> Result<Observ
 }
 
 /// Follows nodes through a scene from where they are at the first of `ticks`, which may go either way: a moment a tick. So
-/// a motion model tells what it thinks of later times, and a scene that saw them what was true.
+/// a motion model extrapolates to later times, and a scene that saw them what was true.
 pub fn follow(scene: &Scene<f32>, start: &Moment, ticks: &[f64]) -> Vec<Moment> {
     if ticks.len() < 2 {
         return vec![start.clone()];

@@ -1,4 +1,4 @@
-//! What a forecast is worth: node errors by horizon, skill over freezing, win rates, divergence, calibration.
+//! The quality of a forecast: node errors by horizon, skill over freezing, win rates, divergence, calibration.
 
 use crate::paths::Moment;
 use splat4d::math::se3::{norm, sub};

@@ -149,12 +149,12 @@ impl Camera {
         self.lens = Some(Intrinsic { fx, fy: (fx != fy).then_some(fy), cx, cy, k, p, fisheye });
     }
 
-    /// The offset that the user tells.
+    /// The offset that the user gives.
     pub fn given_offset(&self) -> Option<f64> {
         self.offset.filter(|_| self.keep_offset)
     }
 
-    /// The lens that the user tells.
+    /// The lens that the user gives.
     pub fn given_lens(&self) -> Option<(Intrinsics, Lens)> {
         self.lens.as_ref().filter(|_| self.keep_lens).map(Intrinsic::lens)
     }
@@ -259,7 +259,7 @@ impl Corrections {
         write_atomically(&folder.join(FILE), format!("{HEAD}{body}").as_bytes())
     }
 
-    /// What the user tells of all cameras' offsets.
+    /// What the user gives of all cameras' offsets.
     pub fn given_offsets(&self) -> Vec<Option<f64>> {
         self.cameras.iter().map(Camera::given_offset).collect()
     }

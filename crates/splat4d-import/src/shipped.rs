@@ -32,7 +32,7 @@ pub struct Extracted {
     pub warnings: Vec<String>,
 }
 
-/// The videos of a capture that is shipped so and whose frames nobody has extracted in another way; empty: it is no such
+/// The videos of a capture that is shipped so and whose frames are not extracted in another way; empty: it is no such
 /// capture.
 pub fn videos(root: &Path) -> Vec<PathBuf> {
     if !root.join(POSES).is_file() || root.join("capture.json").is_file() {
@@ -105,7 +105,7 @@ fn side(info: &Info) -> usize {
     own / own.div_ceil(SIDE).max(1)
 }
 
-/// Extraction takes minutes: poses of another number of cameras are told before. Returns how many there are.
+/// Extraction takes minutes: poses of another number of cameras are reported before. Returns how many there are.
 fn check_poses(path: &Path, videos: &[PathBuf]) -> Result<usize> {
     let bytes = splat4d_train::files::read(path)?;
     let rows = Npy::read(&bytes).map_err(|e| e.at(path.display()))?.shape.first().copied().unwrap_or(0);

@@ -219,6 +219,10 @@ export function datasetCamera(meta, entry) {
   return camera;
 }
 
+/** A camera's time offset against the first one, in words; null: none. */
+export const clockOf = camera => (Number.isFinite(camera.offset)
+  ? `clock ${camera.offset > 0 ? '+' : '−'}${Math.abs(1000 * camera.offset).toFixed(1)} ms` : null);
+
 // Deep links: the part of an address behind '#'.
 
 const short = x => String(+x.toPrecision(6));

@@ -12,6 +12,9 @@ const OBSERVED = ['src', 'controls', 'time', 'speed', 'loop', 'backend', 'channe
 const EVENTS = ['load', 'timeupdate', 'play', 'pause', 'ended', 'error', 'camerachange', 'channelchange', 'labelschange',
   'ratechange'];
 
+/** Hosts of pages that are being written. */
+const LOCAL = ['', 'localhost', '127.0.0.1', '[::1]'];
+
 let sheet;
 
 /** '#rrggbb' or '#rgb' as three numbers in 0..1; null for 'scene' and for what is no colour. */
@@ -126,7 +129,11 @@ export class Splat4D extends HTMLElement {
     const p = this.#player, ui = this.#ui;
     const src = this.getAttribute('src');
     const source = this.#scene ?? (src ? new URL(src, document.baseURI).href : null);
-    if (!source) return;
+    if (!source) {
+      // A page that sets the scene later must not flash a notice; one that is being written is told.
+      if (LOCAL.includes(location.hostname) && !this.hasAttribute('page')) ui.showNote('No scene: set the attribute src or the property scene.');
+      return;
+    }
     const poster = this.getAttribute('poster');
     if (poster) ui.setPoster(new URL(poster, document.baseURI).href);
     await p.load(source, { start: this.#start() });

@@ -1,6 +1,7 @@
 // A scene that is still being learned: the server's events, the curve of its quality, and the newest snapshot.
 
 import { button, h, save } from './dom.js';
+import { icon } from './icons.js';
 
 /** Milliseconds before another try to reach the server, doubled up to the second. */
 const RETRY = [500, 8000];
@@ -50,9 +51,9 @@ export class Feed {
 }
 
 /** A step as the server tells it, by either of its two sets of names. */
-function readStep({ psnr, loss, gaussians, ...s }) {
+function readStep({ psnr, loss, gaussians, held_out: held, ...s }) {
   const [step, of, left] = [s.iteration ?? s.step, s.iterations ?? s.of, s.seconds_left ?? s.left_s].map(Number);
-  return { step, of, left, psnr: +psnr, loss: +loss, gaussians };
+  return { step, of, left, psnr: +psnr, loss: +loss, gaussians, held: held == null ? NaN : +held };
 }
 
 /** Steps already taken: JSON (a list, or the server's {news}) or the CSV of a run. */
@@ -72,8 +73,8 @@ export function readMetrics(text) {
 export class Training {
   #points = [];
 
-  constructor(ui, { events, src, metrics, version, reload }) {
-    this.ui = ui;
+  constructor(ui, { events, src, metrics, version, reload, control }) {
+    Object.assign(this, { ui, control });
     // Pages of a version that was replaced fail on the way, and the next version follows at once.
     ui.quiet = true;
     this.dot = h('i', { class: 'dot' });
@@ -83,13 +84,18 @@ export class Training {
     this.canvas = h('canvas', { role: 'img', 'aria-label': 'Quality over steps' });
     const axis = name => h('small', { class: name });
     this.axes = { psnr: [axis('high psnr'), axis('low psnr')], loss: [axis('high loss'), axis('low loss')], step: [axis(), axis()] };
+    this.psnrName = h('small', { class: 'psnr' });
     this.plot = h('div', { class: 'plot', hidden: true },
-      h('div', { class: 'names' }, h('small', { class: 'psnr' }, 'PSNR, training views, dB'), h('small', { class: 'loss' }, 'Loss')),
+      h('div', { class: 'names' }, this.psnrName, h('small', { class: 'loss' }, 'Loss')),
       h('div', { class: 'area' }, this.canvas, ...this.axes.psnr, ...this.axes.loss),
       h('div', { class: 'names' }, this.axes.step[0], h('small', {}, 'steps'), this.axes.step[1]));
+    this.pause = button('Pause', () => this.#ask(this.at === 'paused' ? 'continue' : 'pause'), {}, 'pause');
+    this.stop = button('Stop', () => this.#ask('stop'), { title: 'Save a checkpoint and end the run; it can be continued' });
+    this.acts = h('div', { class: 'acts' }, ...(control ? [this.pause, this.stop] : []),
+      ui.capture?.photos ? button('Compare', () => ui.compare(), { title: 'Image of the capture next to the render (Z)' }, 'photo') : null);
     this.card = h('section', { class: 'card live', 'aria-label': 'Training' },
       h('div', { class: 'row' }, this.dot, this.state, h('span', { class: 'space' }), this.left),
-      this.plot, this.figures);
+      this.plot, this.figures, this.acts);
     ui.left.append(this.card);
     ui.root.addEventListener('themechange', () => this.#draw());
     this.resizes = new ResizeObserver(() => this.#draw());
@@ -118,15 +124,45 @@ export class Training {
         // Whoever joins late, or was away, asks for what was missed.
         if (state === 'live') past();
       },
-      other: data => { if (data.kind === 'done' || data.kind === 'finished') this.#finish(); },
+      other: data => {
+        if (data.kind === 'done' || data.kind === 'finished') this.#finish();
+        else if (data.kind === 'control') this.#controlled(data);
+      },
     });
+  }
+
+  /** Asks the program to pause, continue or stop. */
+  async #ask(what) {
+    try {
+      const answer = await fetch(this.control.address, { method: 'POST', body: JSON.stringify({ do: what }),
+        headers: { 'content-type': 'application/json', 'x-splat4d-token': this.control.token } });
+      if (!answer.ok) throw new Error(await answer.text());
+      this.#controlled(await answer.json());
+    } catch (error) { this.ui.toast(error.message, 5000); }
+  }
+
+  /** `state`: training, pausing, paused, stopping or stopped. */
+  #controlled({ state, resume }) {
+    this.at = state;
+    if (state === 'stopped') {
+      this.over = true;
+      this.feed.close();
+      this.card.append(h('small', {}, 'Saved. Continue with: ', h('code', {}, resume)));
+    }
+    this.#show(this.link);
   }
 
   #show(state) {
     this.link = state;
-    const over = this.over || this.last?.step >= this.last?.of;
-    this.dot.className = `dot ${state === 'live' && !over ? 'on' : 'off'}`;
-    this.state.textContent = over ? 'Training finished'
+    const over = this.over || this.last?.step >= this.last?.of, { at } = this;
+    const words = { pausing: 'Pausing', paused: 'Paused', stopping: 'Stopping', stopped: 'Stopped' }[at];
+    this.dot.className = `dot ${state === 'live' && !over && !words ? 'on' : 'off'}`;
+    this.acts.hidden = over && !this.ui.capture?.photos;
+    for (const b of [this.pause, this.stop]) b.hidden = over;
+    this.pause.replaceChildren(icon(at === 'paused' ? 'play' : 'pause'), at === 'paused' ? 'Continue' : 'Pause');
+    this.pause.disabled = at === 'pausing' || at === 'stopping';
+    this.stop.disabled = at === 'stopping';
+    this.state.textContent = at === 'stopped' || (!over && words) ? words : over ? 'Training finished'
       : { connecting: this.last ? 'Reconnecting' : 'Connecting', live: 'Training', away: 'Reconnecting' }[state];
   }
 
@@ -159,6 +195,7 @@ export class Training {
     const cells = [
       [count(data.step), data.of ? `of ${count(data.of)} steps` : 'steps'],
       [isFinite(data.psnr) ? data.psnr.toFixed(2) : '–', 'dB, training views'],
+      ...(isFinite(data.held) ? [[data.held.toFixed(2), 'dB, held out']] : []),
       [count(data.gaussians ?? 0), 'Gaussians'],
     ];
     this.left.textContent = data.left > 0 && !this.over ? `${left(data.left)} left` : '';
@@ -183,22 +220,26 @@ export class Training {
     const g = canvas.getContext('2d'), style = getComputedStyle(canvas);
     const [first, last] = [this.#points[0].step, this.#points.at(-1).step];
     const edge = 3 * ratio, w = canvas.width - 2 * edge, height = canvas.height - 2 * edge;
-    const curve = (key, colour, width) => {
+    const values = (...keys) => this.#points.flatMap(p => keys.map(k => p[k])).filter(isFinite);
+    const curve = (key, colour, width, range, dash = []) => {
       const points = this.#points.filter(p => isFinite(p[key]));
-      const [low, high] = [Math.min(...points.map(p => p[key])), Math.max(...points.map(p => p[key]))];
+      const [low, high] = [Math.min(...range), Math.max(...range)];
       const digits = key === 'psnr' ? 1 : 3;
-      this.axes[key].forEach((label, i) => { label.textContent = points.length ? [high, low][i].toFixed(digits) : ''; });
+      this.axes[key]?.forEach((label, i) => { label.textContent = points.length ? [high, low][i].toFixed(digits) : ''; });
       g.beginPath();
       for (const p of points) {
         g.lineTo(edge + w * (p.step - first) / (last - first || 1),
           edge + height * (1 - (p[key] - low) / (high - low || 1)));
       }
       Object.assign(g, { strokeStyle: colour, lineWidth: width * ratio, lineJoin: 'round', lineCap: 'round' });
+      g.setLineDash(dash.map(x => x * ratio));
       g.stroke();
     };
+    this.psnrName.textContent = values('held').length ? 'PSNR, dB: training, held out (dotted)' : 'PSNR, training views, dB';
     this.axes.step.forEach((label, i) => { label.textContent = [first, last][i].toLocaleString('en-GB'); });
-    curve('loss', style.getPropertyValue('--muted'), 1.5);
-    curve('psnr', style.getPropertyValue('--accent'), 2);
+    curve('loss', style.getPropertyValue('--muted'), 1.5, values('loss'));
+    curve('psnr', style.getPropertyValue('--accent'), 2, values('psnr', 'held'));
+    curve('held', style.getPropertyValue('--accent'), 2, values('psnr', 'held'), [1, 4]);
     const psnr = this.#points.map(p => p.psnr);
     canvas.setAttribute('aria-label', `Quality over steps: PSNR from ${psnr[0].toFixed(1)} to ${
       psnr.at(-1).toFixed(1)} dB`);

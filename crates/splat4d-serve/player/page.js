@@ -14,35 +14,39 @@ async function config() {
   } catch { return {}; }
 }
 
-/** The leave to edit that the program's address brings. It goes from the address bar, and stays for this tab. */
-function leave() {
+/** The token to edit or to control a run, from the address that the program printed. It leaves the address bar and stays for this tab. */
+function leave(right) {
   const kept = f => { try { return f(sessionStorage); } catch { return null; /* Storage may be shut; the address then serves once. */ } };
-  const given = new URLSearchParams(location.hash.slice(1)), found = given.get('edit');
-  if (!found) return kept(s => s.getItem('splat4d-edit'));
-  given.delete('edit');
-  kept(s => s.setItem('splat4d-edit', found));
+  const given = new URLSearchParams(location.hash.slice(1)), found = given.get(right);
+  if (!found) return kept(s => s.getItem(`splat4d-${right}`));
+  given.delete(right);
+  kept(s => s.setItem(`splat4d-${right}`, found));
   const rest = decodeURIComponent(given.toString());
   history.replaceState(null, '', location.pathname + location.search + (rest ? `#${rest}` : ''));
   return found;
 }
 
 const about = await config();
-const token = about.edit ? leave() : null;
+const token = about.edit ? leave('edit') : null, control = about.control ? leave('control') : null;
 const element = document.createElement('splat-4d');
 element.setAttribute('page', '');
 document.body.append(element);
-const { scene, src = scene, title, live, metrics, version, autoplay = true } = about;
-if (autoplay && !token && !matchMedia('(prefers-reduced-motion: reduce)').matches) element.setAttribute('autoplay', '');
+const { scene, src = scene, title, live, metrics, version, cameras, photos, frusta, autoplay = true } = about;
+if (cameras) element.face.capture = { cameras, photos: photos ? './photo' : null, overview: frusta };
+// A capture is first looked at as it stands.
+if (autoplay && !token && !frusta && !matchMedia('(prefers-reduced-motion: reduce)').matches) element.setAttribute('autoplay', '');
 if (title) {
   element.setAttribute('heading', title);
   document.title = `${title} · splat4d`;
 }
 if (live) {
   // A run that has just begun has no snapshot; the first one is announced.
-  element.follow({ events: live === true ? './events' : live, src: src ?? './scene.s4d', metrics, version });
+  element.follow({ events: live === true ? './events' : live, src: src ?? './scene.s4d', metrics, version,
+    control: control && { address: './control', token: control } });
 } else if (src instanceof Blob) element.scene = src;
 else if (src) element.setAttribute('src', src);
 else element.invite();
+if (frusta) element.addEventListener('load', () => element.face.showCameras(true), { once: true });
 if (token) {
   element.addEventListener('load', () => import('./edit.js').then(m => m.Editing.start(element.face, token))
     .catch(error => element.face.toast(error.message, 8000)), { once: true });

@@ -1,6 +1,7 @@
 // The two panels over the bar (View, Cameras), the help page and the figures.
 
 import { CHANNELS } from './player.js';
+import { clockOf } from './camera.js';
 import { Track } from './track.js';
 import { allow, button, bytes, choice, clock, field, h, pick, save, segments, tool } from './dom.js';
 
@@ -16,6 +17,7 @@ const KEYS = [
   ['Next camera', 'N'], ['Reset the view', 'R'], ['Orbit or fly', 'M'], ['Move', 'W', 'A', 'S', 'D'],
   ['Down, up', 'Q', 'E'], ['Move faster', 'Shift'], ['Turn', 'Shift + arrows'], ['Zoom', '↑', '↓'],
   ['Add a camera key', 'K'], ['Play the camera path', 'P'], ['Bullet time', 'B'], ['Full screen', 'F'], ['Statistics', 'I'],
+  ['Cameras in the scene', 'V'], ['Image next to the render', 'Z'],
   ['Save image', 'G'], ['Light or dark', 'T'], ['This help', 'H', '?'],
 ];
 const GESTURES = [
@@ -102,11 +104,14 @@ export function cameraPanel(ui) {
   const bullet = button('Bullet time', () => ui.bullet(), { title: 'Stop the time and move the camera' });
   const out = button('Export', () => save(new Blob([JSON.stringify(player.track, null, 1)],
     { type: 'application/json' }), 'path.json'), { title: 'Save the path for splat4d render --path path.json' });
+  const frusta = h('input', { type: 'checkbox', 'aria-label': 'Show cameras in the scene (V)', onchange: () => ui.showCameras(frusta.checked) });
+  const photo = h('input', { type: 'checkbox', 'aria-label': 'Image next to the render (Z)', onchange: () => ui.compare(photo.checked) });
+  const frustaField = field('Show cameras in the scene', frusta), photoField = field('Image next to the render', photo);
   const views3 = h('h3', {}, 'Cameras of the capture');
   const node = panel('Cameras', () => ui.open(null),
     field('Movement', mode),
     button('Reset the view', () => player.reset()),
-    views3, views,
+    views3, views, frustaField, photoField,
     h('h3', {}, 'Camera path'), note, keys,
     h('div', { class: 'wrap' },
       button('Add key', () => ui.addKey()), play, bullet, out,
@@ -115,10 +120,15 @@ export function cameraPanel(ui) {
   node.refresh = () => {
     mode.set(player.controls.mode);
     const cameras = player.meta?.cameras ?? [];
+    frusta.checked = !!ui.rig?.shown;
+    photo.checked = !!ui.rig?.compared;
+    frustaField.hidden = !cameras.length;
+    photoField.hidden = !cameras.length || !ui.capture?.photos;
     if (shown !== cameras) {
       shown = cameras;
       list.replaceChildren(h('option', { value: -1, disabled: true }, 'Free view'),
-        ...cameras.map((c, i) => h('option', { value: i }, `${i + 1} · ${c.name ?? 'camera'}`)));
+        ...cameras.map((c, i) => h('option', { value: i }, [i + 1, c.name ?? 'camera', clockOf(c), c.held ? 'held out' : null]
+          .filter(Boolean).join(' · '))));
       views.hidden = views3.hidden = !cameras.length;
     }
     list.value = String(player.viewed ?? -1);

@@ -650,10 +650,15 @@ export class Player extends EventTarget {
     return true;
   }
 
-  /** What a backend is told to draw now, at a size in px. */
-  drawing(width, height, camera = this.camera) {
+  /** Nearest and farthest distance of the depth view, scene units. */
+  depthRange(camera = this.camera) {
     const { center, radius } = bounds(this.meta);
     const middle = dot(add(center, camera.position, -1), camera.forward);
+    return [Math.max(middle - radius, 0.02 * radius), Math.max(middle, 0) + radius];
+  }
+
+  /** What a backend is told to draw now, at a size in px. */
+  drawing(width, height, camera = this.camera) {
     // The capture's cameras saw no haze right before them. Who comes closer to look at something wants to see it.
     const least = this.meta.near ?? NEAR;
     const near = camera.lens ? least : Math.min(least, NEAR_SHARE * camera.distance);
@@ -664,7 +669,7 @@ export class Player extends EventTarget {
       time, epoch, at: waiting ? HOLD : this.#running ? this.#ahead : null,
       view: { ...camera.view(width, height), near }, channel: this.channel,
       background: this.background ?? this.meta.background,
-      depthRange: [Math.max(middle - radius, 0.02 * radius), Math.max(middle, 0) + radius],
+      depthRange: this.depthRange(camera),
       flowScale: FLOW_SHARE * height,
     };
   }

@@ -106,6 +106,8 @@ h3{font-size:.8em;margin:.2em 0 -.4em;font-weight:600;color:var(--muted);letter-
 .title{padding:.4em .9em;max-width:100%;overflow:hidden;text-overflow:ellipsis;white-space:nowrap;font-weight:600}
 .idle .title{opacity:0}
 .title{transition:opacity .25s}
+.depth{padding:.35em .9em;display:flex;gap:.6em;align-items:center;font-size:.88em;font-variant-numeric:tabular-nums}
+.depth i{width:7em;height:.7em;border-radius:.35em;background:linear-gradient(90deg,#fff,#000);border:1px solid var(--line)}
 .stats{padding:.7em .95em;display:grid;grid-template-columns:auto auto;gap:.1em 1.1em;font-size:.88em;
  font-variant-numeric:tabular-nums;margin:0;flex:none}
 .stats dt{color:var(--muted)}
@@ -122,6 +124,14 @@ h3{font-size:.8em;margin:.2em 0 -.4em;font-weight:600;color:var(--muted);letter-
  white-space:nowrap}
 .live small{color:var(--muted);font-size:.85em}
 .live .figures small{display:block}
+.live .acts{display:flex;gap:.45em;flex-wrap:wrap}
+.frusta{position:absolute;inset:0;width:100%;height:100%;pointer-events:none}
+.photo{position:absolute;inset:0 0 0 50%;margin:0;background:var(--page);display:grid;place-items:center}
+.photo img{width:100%;height:100%;object-fit:contain;position:absolute;inset:0}
+.photo figcaption{position:absolute;top:clamp(8px,1.2em,28px);right:clamp(8px,1.2em,28px);padding:.35em .9em;font-size:.9em;
+ font-variant-numeric:tabular-nums;max-width:90%}
+.compared .stage{right:50%}
+@container (max-aspect-ratio:1/1){.compared .stage{right:0;bottom:50%}.photo{inset:50% 0 0}}
 .dot{width:.6em;height:.6em;border-radius:50%;background:var(--accent);display:inline-block;margin-right:.55em}
 .dot.off{background:var(--muted)}
 @keyframes breathe{50%{opacity:.35}}
@@ -166,6 +176,7 @@ kbd{font:inherit;font-size:.88em;background:var(--raised);border:1px solid var(-
 @container (max-width:340px){.time .of{display:none}}
 @container (max-width:1000px){.roomy{display:none!important}}
 @container (min-width:1001px){.panel .cramped{display:none}}
+@container (max-height:299px){.root:not(.page) :is(.spare,.title){display:none!important}}
 @container (max-height:300px){.panel{max-height:calc(100cqh - 5.6em)}.live .plot{display:none}}
 @media (prefers-reduced-motion:reduce){*,*::before,*::after{transition:none!important;animation:none!important}}
 @media (forced-colors:active){.rail>.done,.knob{background:Highlight}.card{border:1px solid CanvasText}}

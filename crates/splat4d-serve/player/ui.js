@@ -67,11 +67,15 @@ export class Interface {
     this.bar = h('div', { class: 'card bar', role: 'toolbar', 'aria-label': 'Playback' }, this.scrub,
       h('div', { class: 'row' }, this.play, ...steps, this.timeLabel, h('div', { class: 'space' }),
         this.embed ? null : this.loopTool, this.embed ? null : this.speed, ...spare, this.xrTool, this.arTool, this.full));
+    // Without room, an element of somebody's page keeps what plays.
+    for (const item of [this.back, this.next, this.loopTool, this.speed, ...spare]) item.classList.add('spare');
+    this.root.classList.toggle('page', this.page);
     this.panels = { cameras: cameraPanel(this), view: viewPanel(this) };
     this.dock = h('div', { class: 'dock' }, this.panels.cameras, this.panels.view, this.bar);
     this.title = h('div', { class: 'card title', hidden: true });
+    this.scale = h('div', { class: 'card depth', hidden: true, role: 'img' }, h('span'), h('i'), h('span'));
     this.figures = figuresCard(p);
-    this.left = h('div', { class: 'left' }, this.title, this.figures);
+    this.left = h('div', { class: 'left' }, this.title, this.scale, this.figures);
     this.help = helpPage(() => this.toggleHelp(false));
     this.notice = h('div', { class: 'centre' });
     this.ring = h('div', { class: 'card load', role: 'status', hidden: true },
@@ -129,6 +133,8 @@ export class Interface {
       on(name, () => this.refresh());
     }
     on('scene', () => {
+      // The server knows more of the capture's cameras than the file.
+      if (this.capture?.cameras) p.meta.cameras = this.capture.cameras;
       // What lies behind the scene, also where a poster leaves it free and before the first image.
       const back = p.background ?? p.meta.background;
       this.stage.style.background = `rgb(${back.map(x => Math.round(255 * clamp(x, 0, 1)))})`;
@@ -143,6 +149,7 @@ export class Interface {
     on('trouble', e => this.quiet || this.toast(e.detail.error.what ?? e.detail.error.message, 3 * TOAST));
     on('poster', e => this.setPoster(e.detail.blob));
     on('viewed', e => { this.toast(`Camera ${e.detail.number + 1} · ${e.detail.name ?? ''}`); this.refresh(); });
+    on('camerachange', () => this.#showScale());
     on('camerachange', () => { if (p.viewed == null) this.panels.cameras.refresh(); });
     // A finger that taps brings the controls back and sends them away; a mouse only has to move.
     let tap = null;
@@ -196,12 +203,24 @@ export class Interface {
     this.loopTool.setAttribute('aria-pressed', String(p.loop));
     this.speed.set(p.speed, `${+p.speed.toFixed(2)}×`);
     this.channel.set(p.channel);
+    this.#showScale();
     const on = !!this.root.getRootNode().fullscreenElement;
     retool(this.full, on ? 'small' : 'full', on ? 'Leave full screen' : 'Full screen');
     this.full.hidden = !document.fullscreenEnabled;
     this.dock.hidden = (this.hiddenControls ?? false) || ['empty', 'error'].includes(p.state);
     for (const panel of Object.values(this.panels)) panel.refresh();
     if (!this.#panel) this.wake();
+  }
+
+  /** Distances that the depth view's brightness stands for. */
+  #showScale() {
+    const p = this.player;
+    this.scale.hidden = p.channel !== 'depth' || !p.file;
+    if (this.scale.hidden) return;
+    const { unit } = p.meta, [near, far] = p.depthRange().map(z => `${(z * (unit ?? 1)).toPrecision(2)}${unit ? ' m' : ''}`);
+    this.scale.firstChild.textContent = near;
+    this.scale.lastChild.textContent = unit ? far : `${far} units`;
+    this.scale.setAttribute('aria-label', `Depth from ${near} (bright) to ${far} (dark)`);
   }
 
   #showTime() {
@@ -285,6 +304,12 @@ export class Interface {
       h('div', { class: 'wrap' },
         this.retry ? button('Try again', () => this.retry(), { class: 'main' }) : null,
         this.page ? button('Open another file', () => this.pickFile(), {}, 'open') : null)));
+  }
+
+  /** A line in the middle, until there is a scene. */
+  showNote(text) {
+    this.notice.replaceChildren(h('p', { class: 'note' }, text));
+    this.refresh();
   }
 
   /** The page without a scene. */
@@ -442,6 +467,24 @@ export class Interface {
     else this.toast('A path needs two keys: move the camera and press K');
   }
 
+  /** Cameras of the capture; fetched when first asked for. */
+  async #rigged() {
+    const { Rig } = await import('./rig.js');
+    return this.rig ??= new Rig(this, this.capture ?? {});
+  }
+
+  async showCameras(on = !this.rig?.shown) {
+    if (!this.player.meta?.cameras?.length) return this.toast('The scene does not name the cameras of its capture');
+    (await this.#rigged()).show(on);
+    this.refresh();
+  }
+
+  async compare(on = !this.rig?.compared) {
+    if (!this.capture?.photos) return this.toast('The images of the capture are not served here');
+    (await this.#rigged()).compare(on);
+    this.refresh();
+  }
+
   bullet() {
     const p = this.player;
     if (p.film?.frozen) p.stopFilm();
@@ -554,6 +597,7 @@ export class Interface {
       k: () => this.addKey(), p: () => this.playPath(), b: () => this.bullet(),
       f: () => this.fullscreen(), i: () => this.setFigures(!this.figuresOn), g: () => this.screenshot(),
       x: () => this.editing?.toggle(),
+      v: () => this.showCameras(), z: () => this.compare(),
       t: () => this.setTheme(this.dark ? 'light' : 'dark'), h: () => this.toggleHelp(), '?': () => this.toggleHelp(),
     };
   }

@@ -5,6 +5,7 @@ use crate::body::Body;
 use crate::edit::{self, Editing};
 use crate::events::Hub;
 use crate::guard::Guard;
+use crate::photos::{self, Photos};
 use crate::range::{self, Wanted};
 use crate::reply::{text, value, whole, with};
 use crate::scene::{Missing, Scene};
@@ -42,8 +43,11 @@ pub(crate) struct Shared {
     /// A scene elsewhere, and its origin.
     pub foreign: Option<(String, String)>,
     pub player_folder: Option<PathBuf>,
-    /// Leave to edit.
+    /// Permission to edit.
     pub editing: Option<Editing>,
+    /// Permission to pause and stop a run.
+    pub control: Option<Editing>,
+    pub photos: Option<Photos>,
     listeners: Arc<Semaphore>,
     policy: HeaderValue,
 }
@@ -60,6 +64,8 @@ impl Shared {
             foreign,
             player_folder: None,
             editing: None,
+            control: None,
+            photos: None,
             listeners: Arc::new(Semaphore::new(MAX_LISTENERS)),
             policy: policy.parse().expect("an origin was checked"),
         }
@@ -79,7 +85,11 @@ fn policy(origin: &str) -> String {
 
 /// Answers one request.
 pub(crate) async fn answer(shared: &Arc<Shared>, request: &Parts, body: Incoming) -> Response<Body> {
-    let editing = shared.editing.as_ref().filter(|_| request.uri.path() == edit::ROUTE);
+    let editing = match request.uri.path() {
+        edit::ROUTE => shared.editing.as_ref(),
+        edit::CONTROL_ROUTE => shared.control.as_ref(),
+        _ => None,
+    };
     let mut response = match (shared.guard.check(request, editing.is_some()), editing) {
         (Err(refusal), _) => text(refusal.status, refusal.why),
         (Ok(()), Some(editing)) if request.method == Method::POST => {
@@ -114,6 +124,7 @@ async fn route(shared: &Arc<Shared>, request: &Parts) -> Response<Body> {
         "config.json" => whole(config(shared).to_string().into(), "application/json"),
         "metrics.json" => whole(shared.hub.json(), "application/json"),
         "events" => events(shared, request),
+        photos::ROUTE => photo(shared, request).await,
         "" => player(shared, INDEX, &request.headers).await,
         name => player(shared, name.strip_prefix("player/").unwrap_or(name), &request.headers).await,
     }
@@ -126,6 +137,12 @@ fn config(shared: &Shared) -> Value {
     config["live"] = json!(shared.live);
     if shared.editing.is_some() {
         config["edit"] = json!(true);
+    }
+    if shared.control.is_some() {
+        config["control"] = json!(true);
+    }
+    if shared.photos.is_some() {
+        config["photos"] = json!(true);
     }
     config["version"] = json!(version);
     config["scene"] = match &shared.foreign {
@@ -231,6 +248,19 @@ fn events(shared: &Shared, request: &Parts) -> Response<Body> {
     let last = request.headers.get("last-event-id").and_then(|v| v.to_str().ok());
     let headers = [(header::CONTENT_TYPE, "text/event-stream"), (header::CACHE_CONTROL, "no-store")];
     with(shared.hub.stream(last, place), StatusCode::OK, &headers)
+}
+
+/// The image of a camera nearest to a time.
+async fn photo(shared: &Arc<Shared>, request: &Parts) -> Response<Body> {
+    let wanted = photos::PhotoQuery::parse(request.uri.query().unwrap_or_default());
+    let (Some(photos), Some(wanted)) = (shared.photos.clone(), wanted) else { return missing() };
+    let found = tokio::task::spawn_blocking(move || photos.find(&wanted)).await;
+    let Some(photo) = found.ok().flatten() else { return missing() };
+    let mut response = whole(photo.jpeg.into(), "image/jpeg");
+    response.headers_mut().insert(photos::TIME, value(&photo.time.to_string()));
+    // The images of a capture do not change while it is served.
+    response.headers_mut().insert(header::CACHE_CONTROL, HeaderValue::from_static("private, max-age=600"));
+    response
 }
 
 /// Whether a list of entity tags holds ours. Weak comparison, as `If-None-Match` has it.

@@ -38,6 +38,7 @@ const FILES: &[(&str, &str)] = player![
     "panels.js",
     "player.js",
     "ranges.js",
+    "rig.js",
     "scene-file.js",
     "schedule.js",
     "shaders.js",
@@ -117,7 +118,7 @@ pub fn asset(name: &str) -> Option<&'static Asset> {
     assets().iter().find(|a| a.name == name)
 }
 
-/// A file from a folder, for whoever writes the player; reads the disk. None where there is no such file.
+/// A file from a folder, for development of the player; reads the disk. None where there is no such file.
 pub(crate) fn from_folder(folder: &Path, name: &str) -> Option<Asset> {
     if !is_name(name) {
         return None;

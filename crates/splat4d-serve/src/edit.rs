@@ -21,8 +21,10 @@ use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::{Semaphore, oneshot};
 
-/// Name of the route.
+/// Route of edits.
 pub(crate) const ROUTE: &str = "/edit";
+/// Route that pauses and stops a live run.
+pub(crate) const CONTROL_ROUTE: &str = "/control";
 /// The header that holds the token.
 const TOKEN: &str = "x-splat4d-token";
 /// Most bytes that a page may send: ten thousand steps of a hundred bytes.
@@ -139,7 +141,7 @@ pub(crate) async fn answer(scene: &Scene, editing: &Editing, request: &Parts, bo
     }
 }
 
-/// What cannot be done is told as JSON.
+/// The error as JSON.
 fn refused(error: &Error) -> Response<Body> {
     let mut response = whole(json!({ "error": error.to_string() }).to_string().into(), "application/json");
     *response.status_mut() = StatusCode::UNPROCESSABLE_ENTITY;

@@ -37,6 +37,8 @@ pub enum News {
     Step(Value),
     /// `kind: "note"`: something to be told: `message`.
     Note(Value),
+    /// `kind: "control"`: the run was paused, continued or stopped: `state`.
+    Control(Value),
     /// `kind: "done"`: the run is over; the server goes on serving.
     Done(Value),
 }
@@ -60,6 +62,7 @@ struct Log {
     count: u64,
     notes: VecDeque<Entry>,
     snapshot: Option<Entry>,
+    control: Option<Entry>,
     done: Option<Entry>,
 }
 
@@ -82,7 +85,7 @@ impl Log {
 /// The log and who waits for it.
 #[derive(Debug)]
 pub(crate) struct Hub {
-    /// Tells this server's numbers from those of one before it at the same address.
+    /// Distinguishes this server's numbers from those of an earlier one at the same address.
     epoch: u64,
     log: Mutex<Log>,
     newest: watch::Sender<u64>,
@@ -103,6 +106,7 @@ impl Hub {
                 }
                 log.notes.push_back(entry);
             }),
+            News::Control(value) => self.push("control", value, |log, entry| log.control = Some(entry)),
             News::Done(value) => self.push("done", value, |log, entry| log.done = Some(entry)),
         }
     }
@@ -142,7 +146,7 @@ impl Hub {
     /// Everything kept that is newer than `after`, oldest first.
     fn since(&self, after: u64) -> Vec<Entry> {
         let log = self.lock();
-        let single = log.snapshot.iter().chain(&log.done);
+        let single = log.snapshot.iter().chain(&log.control).chain(&log.done);
         let mut entries: Vec<Entry> = single.filter(|e| e.id > after).cloned().collect();
         for list in [&log.steps, &log.notes] {
             let from = list.partition_point(|e| e.id <= after);

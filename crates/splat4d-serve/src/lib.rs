@@ -13,6 +13,8 @@
 //! | `/config.json` | what the page shows: `{title, scene, live, …}` of [`Config::about`] |
 //! | `/events` | events of a live run as server-sent events; see [`News`] |
 //! | `/metrics.json` | the same events so far, in one piece |
+//! | `/photo` | an image of the capture, by camera and time, only with [`Config::photos`] |
+//! | `POST /control` | only with [`Config::control`]: pauses and stops a live run, by the rules of `/edit` |
 //! | `POST /edit` | only with [`Config::editing`]: requests of a page with the token for a list of edits |
 //!
 //! ```no_run
@@ -38,6 +40,7 @@
 //! | `edit.rs` | the one guarded request that accepts input: edits, with a token |
 //! | `assets.rs`, `page.rs` | the player's files; player and scene as one static page |
 //! | `events.rs` | events of a live run: one bounded log |
+//! | `photos.rs` | images of the capture's cameras |
 //! | `answer.rs`, `server.rs` | routes and headers; start, stop, accept: one thread, bounded memory |
 //! | `../player/` | the browser player: plain ES modules. A frame is rendered at the time of its order and active set: `schedule.js` requests them from `sort.worker.js` ahead of the clock by the measured latency and drops those of a clock that jumped; WebGPU culls and sorts within the frame. `stream.js` states which times are complete; the others hold the last frame |
 
@@ -48,6 +51,7 @@ mod edit;
 mod events;
 mod guard;
 mod page;
+mod photos;
 mod range;
 mod reply;
 mod scene;
@@ -58,6 +62,7 @@ pub use assets::{Asset, asset, assets};
 pub use edit::{EditAnswer, Editing};
 pub use events::News;
 pub use page::{Page, SceneIn};
+pub use photos::{Photo, PhotoQuery, Photos};
 pub use scene::Content;
 pub use server::{Config, DEFAULT_PORT, Running, Server};
 

@@ -4,6 +4,7 @@ use crate::answer::{Shared, answer};
 use crate::edit::Editing;
 use crate::events::News;
 use crate::guard::Guard;
+use crate::photos::Photos;
 use crate::scene::{Content, Scene};
 use crate::write_timeout::{Either, WriteTimeout, either};
 use hyper::server::conn::http1;
@@ -25,7 +26,7 @@ use tokio::net::{TcpListener, TcpSocket, TcpStream};
 use tokio::runtime::Runtime;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 
-/// The port where nobody says another one.
+/// The default port.
 pub const DEFAULT_PORT: u16 = 4440;
 /// Ports tried behind the default one where it is taken.
 const NEXT_PORTS: u16 = 20;
@@ -65,11 +66,15 @@ pub struct Config {
     pub about: Value,
     /// Whether news will be published: the page then listens.
     pub live: bool,
-    /// Leave for pages to edit; none: nothing can be sent.
+    /// Permission for pages to edit; none: nothing can be sent.
     pub editing: Option<Editing>,
+    /// Permission for pages to pause and stop a live run, by the same rules.
+    pub control: Option<Editing>,
+    /// Images of the capture's cameras.
+    pub photos: Option<Photos>,
     /// Whether to step back for other work of this machine (Linux only).
     pub background: bool,
-    /// Reads the player from this folder, at every request, instead of the embedded one. For whoever writes the player.
+    /// Reads the player from this folder, at every request, instead of the embedded one, for its development.
     pub player_folder: Option<PathBuf>,
 }
 
@@ -83,6 +88,8 @@ impl Default for Config {
             about: Value::Null,
             live: false,
             editing: None,
+            control: None,
+            photos: None,
             background: false,
             player_folder: None,
         }
@@ -120,7 +127,8 @@ impl Server {
         let guard = Guard::new(&config.host, !address.ip().is_loopback());
         let mut shared = Shared::new(scene, guard, config.about, config.live, foreign);
         shared.player_folder = config.player_folder;
-        shared.editing = config.editing;
+        (shared.editing, shared.control) = (config.editing, config.control);
+        shared.photos = config.photos;
         let shared = Arc::new(shared);
         let (stop, stopped) = watch::channel(false);
         let at_work = shared.clone();
@@ -148,12 +156,12 @@ impl Running {
         self.address
     }
 
-    /// Tells all pages. Never waits, never fails: pages that are not there get it when they come.
+    /// Sends news to all pages. Never waits, never fails: pages that connect later receive it then.
     pub fn publish(&self, news: &News) {
         self.shared.hub.publish(news);
     }
 
-    /// Replaces the scene and tells all pages, with the fields of `about` (such as `{"iteration": 500}`). Returns the
+    /// Replaces the scene and notifies all pages, with the fields of `about` (such as `{"iteration": 500}`). Returns the
     /// version's number. Pages that still read the version before it can finish.
     pub fn set_scene(&self, bytes: Arc<[u8]>, about: &Value) -> u64 {
         let version = self.shared.scene.set(bytes);

@@ -1,6 +1,6 @@
 //! The whole server on loopback: what clients ask, well and badly, and what they get.
 
-use crate::{Config, Content, EditAnswer, Editing, News, Running, Server};
+use crate::{Config, Content, EditAnswer, Editing, News, Photo, Photos, Running, Server};
 use serde_json::{Value, json};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{Shutdown, TcpStream};
@@ -596,4 +596,41 @@ fn without_leave_nothing_can_be_sent() {
     assert_eq!(post(&server, "/edit", &[], br#"{"do": "x"}"#).status, 405);
     let config: Value = serde_json::from_slice(&get(&server, "/config.json").body).unwrap();
     assert_eq!(config["edit"], Value::Null);
+}
+
+#[test]
+fn a_run_is_controlled_by_the_rules_of_edits() {
+    let asked: Arc<std::sync::Mutex<Vec<Value>>> = Arc::default();
+    let heard = asked.clone();
+    let control = Editing::new(TOKEN.into(), move |value| {
+        heard.lock().unwrap().push(value);
+        Ok(EditAnswer { told: json!({"state": "paused"}), scene: None })
+    });
+    let server = start(Config { live: true, control: Some(control), ..Config::default() });
+    let pause = br#"{"do": "pause"}"#;
+    for headers in [[("x-splat4d-token", "")], [("origin", "http://evil.example")], [("sec-fetch-site", "cross-site")]]
+    {
+        assert_eq!(post(&server, "/control", &headers, pause).status, 403, "{headers:?}");
+    }
+    assert_eq!(post(&server, "/edit", &[], pause).status, 405, "permission to control is none to edit");
+    assert!(asked.lock().unwrap().is_empty(), "none of it reached the program");
+    assert_eq!(post(&server, "/control", &[], pause).body, br#"{"state":"paused"}"#);
+    assert_eq!(*asked.lock().unwrap(), [json!({"do": "pause"})]);
+    let config: Value = serde_json::from_slice(&get(&server, "/config.json").body).unwrap();
+    assert_eq!((&config["control"], &config["edit"]), (&json!(true), &Value::Null));
+}
+
+#[test]
+fn photos_are_found_by_camera_and_time_and_nothing_else_is_read() {
+    let photos = Photos::new(|wanted| {
+        (wanted.view < 2).then(|| Photo { jpeg: vec![wanted.view as u8, wanted.side as u8], time: wanted.time + 0.25 })
+    });
+    let server = start(Config { photos: Some(photos), ..Config::default() });
+    let reply = get(&server, "/photo?view=1&t=0.5&side=64");
+    assert_eq!((reply.status, &reply.body[..]), (200, &[1, 64][..]));
+    assert_eq!((reply.header("content-type"), reply.header("x-splat4d-time")), (Some("image/jpeg"), Some("0.75")));
+    for bad in ["/photo?view=2", "/photo?view=../x", "/photo?file=/etc/passwd", "/photo/1"] {
+        assert_eq!(get(&server, bad).status, 404, "{bad}");
+    }
+    assert_eq!(get(&of_bytes(&bytes(10)), "/photo?view=0").status, 404, "only where there are photos");
 }

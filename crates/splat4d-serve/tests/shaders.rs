@@ -13,7 +13,7 @@ const SHADERS: [(&str, &str); 6] = [
     ("DRAW", "player/draw.wgsl"),
 ];
 
-/// The module's text: every shader without comments and indentation, which nobody reads over the wire.
+/// The module's text: every shader without comments and indentation, which need not be transferred.
 fn module(folder: &Path) -> String {
     let mut out = String::from(
         "// Made from the .wgsl files, whose comments say what they do, by\n\

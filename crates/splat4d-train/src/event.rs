@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-/// Where something long tells how far it is, and what the user should know.
+/// Reports the progress of long work, and what the user should know.
 pub struct Progress<'a>(pub &'a mut dyn FnMut(&Event));
 
 impl Progress<'_> {
@@ -139,6 +139,8 @@ pub enum Event {
         /// The file's bytes.
         #[serde(skip)]
         bytes: Arc<[u8]>,
+        /// Mean PSNR of some held-out views, dB; none: no view is held out.
+        held_out: Option<f64>,
     },
     /// Training is over.
     Finished {

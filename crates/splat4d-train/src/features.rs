@@ -258,7 +258,7 @@ mod tests {
         [x as f32, if y > 0.0 { 0.8 } else { -0.3 }, 0.5]
     }
 
-    /// Two cameras look at a wall at z = 0 from z = 4, one a little to the side; nobody knows the first row of pixels.
+    /// Two cameras look at a wall at z = 0 from z = 4, one a little to the side; the first row of pixels is unknown.
     fn capture(folder: &Path) -> Capture {
         let mut cameras = Vec::new();
         for (c, shift) in [0.0, 0.4].into_iter().enumerate() {

@@ -2,7 +2,7 @@
 //!
 //! A step changes numbers. Everything else that happens to a learner (rows come, go and change places, a hook replaces the
 //! scene, opacities are lowered) goes through the methods here, so that scene, moments and statistics cannot come apart,
-//! and whoever remembers something of rows hears of it: the learner notes how far it was `Touched`.
+//! and all that keep data of rows are notified: the learner notes how far it was `Touched`.
 
 mod corrections;
 mod exposure;

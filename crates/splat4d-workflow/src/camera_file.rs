@@ -26,7 +26,7 @@ const LARGEST: f64 = 1e12;
 /// Shortest focal length that is accepted, pixels.
 const SHORTEST: f64 = 1e-3;
 
-/// Reads the camera and its background, if it tells one.
+/// Reads the camera and its background, if it has one.
 pub fn read(path: &Path) -> Result<(Camera, Option<[f32; 3]>)> {
     let text = read_text(path)?;
     parse(&text).map_err(|e| e.at(path.display()))

@@ -63,7 +63,8 @@ impl Entry {
         let results = run.results.as_ref()?;
         let bytes = run.number("playback_bytes").map(|b| b as u64);
         Some(Self {
-            name: run.name(),
+            // Runs of one capture differ in their folders.
+            name: folder_name(&run.path).unwrap_or_else(|| run.name()),
             scores: scores(results),
             motion: run.recipe_text("run.motion"),
             steps: run.iteration(),
@@ -95,7 +96,7 @@ impl Entry {
         }
         let folder = file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
         let name = match file.file_name().is_some_and(|n| n == "results.json") {
-            true => folder.canonicalize().ok().and_then(|f| f.file_name().map(|n| n.to_string_lossy().into_owned())),
+            true => folder_name(folder),
             false => file.file_stem().map(|n| n.to_string_lossy().into_owned()),
         };
         let per_view = crate::files::read(&folder.join("per_view.json")).ok();
@@ -118,6 +119,11 @@ fn scores(entry: &Value) -> Vec<Option<f64>> {
         found.1.as_f64().filter(|x| x.is_finite())
     };
     SCORES.iter().map(|(key, ..)| of(key)).collect()
+}
+
+/// The name of a folder, also of `.`.
+fn folder_name(folder: &Path) -> Option<String> {
+    folder.canonicalize().ok()?.file_name().map(|n| n.to_string_lossy().into_owned())
 }
 
 /// Reads all, and gives two of one name a number.

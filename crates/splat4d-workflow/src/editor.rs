@@ -6,6 +6,7 @@ use crate::draw::color_rgb;
 use crate::editing::{self, Bring};
 use crate::events::{Listener, ignore};
 use crate::files;
+use crate::picking::{Drawn, Shape, draw, number, there};
 use crate::source::Source;
 use image::codecs::jpeg::JpegEncoder;
 use serde::Deserialize;
@@ -14,9 +15,7 @@ use splat4d::device;
 use splat4d::edit::{Done, DragHandle, Dragging, Edits, Expr, Selected, Step, has_nodes, replay_after, seen, select};
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::{Se3, quat, se3};
-use splat4d::play::Player;
 use splat4d::render::{Backend, Image, RenderConfig, Shot};
-use splat4d::scene::splats::SPLAT_OPACITY;
 use splat4d::scene::{Camera, Intrinsics, Lens, Time};
 use splat4d::{Error, Result};
 use splat4d_serve::EditAnswer;
@@ -32,22 +31,10 @@ const MOST_SIDE: usize = 1280;
 const PICK_SIDE: usize = 240;
 /// Quality of the JPEG that stands in until the scene is baked.
 const QUALITY: u8 = 80;
-/// Most selected Gaussians of which a page is told the places: more dots cannot be told apart.
+/// Most selected Gaussians whose places a page gets: more dots cannot be distinguished.
 const POINTS: usize = 3000;
-/// Fainter ones are not told of, and carry no depth.
-const FAINT: f32 = 0.1;
-/// Below this a pixel shows nothing.
-const SEEN: f32 = 0.5;
-/// Moments for which the page is told how many of a selection can be seen.
+/// Times for which the page gets how many of a selection are visible.
 const MOMENTS: usize = 5;
-/// Share of what is seen by which a selection reaches beyond it.
-const MARGIN: f64 = 0.05;
-/// Distance of colours that look alike, 0 to 1.
-const ALIKE: f64 = 0.12;
-/// Farther than this nothing is looked for, scene units.
-const ENDLESS: f64 = 1e6;
-/// Most corners that a page may draw.
-const CORNERS: usize = 256;
 
 /// The view of a page: a pinhole camera.
 #[derive(Clone, Debug, Deserialize)]
@@ -92,16 +79,6 @@ impl Eye {
         let camera = self.camera()?;
         Ok(camera.downscaled(self.width.max(self.height).div_ceil(PICK_SIDE).max(1)))
     }
-}
-
-/// What was drawn on the image.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-enum Shape {
-    Box,
-    Sphere,
-    Lasso,
-    Color,
 }
 
 /// Where a handle is pulled.
@@ -261,7 +238,9 @@ impl Editor {
         let state = self.lock();
         let stale = kept.as_ref().unwrap_or(&state.listed) != &state.shown;
         let scene = &self.source.scene;
-        let mut layers: Vec<&str> = scene.layers.iter().map(|l| l.name.as_str()).collect();
+        // A playback file's layers are its pages: parts of the file, not of the scene.
+        let named = scene.layers.iter().filter(|_| self.source.playback.is_none());
+        let mut layers: Vec<&str> = named.map(|l| l.name.as_str()).collect();
         layers.dedup();
         let name = self.file.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
         json!({
@@ -390,13 +369,6 @@ impl Editor {
     }
 }
 
-fn draw(scene: &Scene<f32>, camera: &Camera, t: f64, depth: bool, image: &mut Image<f32>) -> Result<()> {
-    let mut player = Player::of_scene(scene);
-    let splats = player.at(Time(t.clamp(scene.clip[0], scene.clip[1])))?;
-    let shot = Shot { depth, ..Shot::new(&splats, camera, scene.background) };
-    device::cpu(RenderConfig::default()).render(&shot, image)
-}
-
 /// An image as a data URI.
 fn jpeg(image: &Image<f32>) -> Result<String> {
     let rgb = color_rgb(&image.color);
@@ -411,31 +383,7 @@ fn rounded(of: &[[f64; 3]]) -> Vec<[f32; 3]> {
     of.iter().map(|x| x.map(|x| x as f32)).collect()
 }
 
-/// A number as people write it: five digits that count.
-fn number(x: f64) -> String {
-    format!("{x:.4e}").parse::<f64>().map_or_else(|_| x.to_string(), |x| (x + 0.0).to_string())
-}
-
-fn numbers(of: &[f64]) -> String {
-    of.iter().map(|x| number(*x)).collect::<Vec<_>>().join(",")
-}
-
-/// Opaque enough Gaussians at t for which `which` holds, and where they are.
-fn there(scene: &Scene<f32>, t: f64, which: impl Fn(usize, usize) -> bool) -> Vec<[f64; 3]> {
-    let mut seen = Evaluation::default();
-    scene.at(Time(t.clamp(scene.clip[0], scene.clip[1])), &mut seen);
-    let mut out = Vec::new();
-    for (layer, tape) in seen.tapes().enumerate() {
-        for j in 0..tape.out().rows() {
-            if tape.out().get(j, SPLAT_OPACITY) >= FAINT && which(layer, tape.rows().id(j)) {
-                out.push(tape.out().read::<3>(j, 0).map(f64::from));
-            }
-        }
-    }
-    out
-}
-
-/// What a page is told of a selection.
+/// What a page gets of a selection.
 fn held(select: &str, scene: &Scene<f32>, selected: &Selected, t: f64) -> Value {
     let [start, end] = scene.clip;
     let mut times: Vec<f64> = (0..MOMENTS).map(|i| start + (end - start) * i as f64 / (MOMENTS - 1) as f64).collect();
@@ -454,124 +402,7 @@ fn held(select: &str, scene: &Scene<f32>, selected: &Selected, t: f64) -> Value 
     })
 }
 
-/// What was drawn on the image.
-struct Drawn<'a> {
-    shape: Shape,
-    corners: &'a [[f64; 2]],
-    /// Whether all that lies behind is meant as well.
-    through: bool,
-}
-
-impl Drawn<'_> {
-    /// The selection in words. Errors: too few corners, nothing is seen there.
-    fn words(&self, scene: &Scene<f32>, camera: &Camera, t: f64) -> Result<String> {
-        let least = match self.shape {
-            Shape::Color => 1,
-            Shape::Lasso => 3,
-            Shape::Box | Shape::Sphere => 2,
-        };
-        let sound = self.corners.iter().flatten().all(|x| x.is_finite());
-        if !(least..=CORNERS).contains(&self.corners.len()) || !sound {
-            return Err(Error::input("the outline has too few or too many corners").remedy("Draw it again"));
-        }
-        let mut image = Image::default();
-        draw(scene, camera, t, true, &mut image)?;
-        let k = &camera.intrinsics;
-        let world = camera.cam_from_world.inverse();
-        let depth = |i: usize| f64::from(image.depth.data[i] / image.alpha.data[i]);
-        let shows = |i: usize| image.alpha.data[i] >= SEEN;
-        let nothing = || Error::input("nothing is visible there").remedy("Draw over something visible");
-        // The pixel of a corner, within the image.
-        let pixel = |[u, v]: [f64; 2]| {
-            let column = (k.fx * u + k.cx).clamp(0.0, (camera.width - 1) as f64) as usize;
-            let row = (k.fy * v + k.cy).clamp(0.0, (camera.height - 1) as f64) as usize;
-            row * camera.width + column
-        };
-        let [first, last] = [self.corners[0], self.corners[self.corners.len() - 1]];
-        match self.shape {
-            Shape::Color => {
-                let i = pixel(first);
-                let alpha = image.alpha.data[i];
-                if !shows(i) {
-                    return Err(nothing());
-                }
-                let behind = scene.background;
-                let own = |c: usize| (image.color.plane(c)[i] - (1.0 - alpha) * behind[c]) / alpha;
-                let rgb = [0, 1, 2].map(|c| (1e3 * f64::from(own(c).clamp(0.0, 1.0))).round() / 1e3);
-                Ok(format!("color({}, {ALIKE})", numbers(&rgb)))
-            }
-            Shape::Sphere => {
-                let i = pixel(first);
-                if !shows(i) {
-                    return Err(nothing());
-                }
-                let z = depth(i);
-                let center = world.apply([first[0] * z, first[1] * z, z]);
-                let radius = z * (last[0] - first[0]).hypot(last[1] - first[1]);
-                Ok(format!("sphere({}, {})", numbers(&center), number(radius)))
-            }
-            Shape::Box | Shape::Lasso => {
-                let polygon = match self.shape {
-                    Shape::Box => vec![first, [last[0], first[1]], last, [first[0], last[1]]],
-                    _ => self.corners.to_vec(),
-                };
-                let center = |i: usize| {
-                    let (row, column) = (i / camera.width, i % camera.width);
-                    [(column as f64 + 0.5 - k.cx) / k.fx, (row as f64 + 0.5 - k.cy) / k.fy]
-                };
-                let mut depths: Vec<f64> = (0..camera.width * camera.height)
-                    .filter(|&i| shows(i) && splat4d::edit::within(&polygon, center(i)))
-                    .map(depth)
-                    .collect();
-                if depths.is_empty() {
-                    return Err(nothing());
-                }
-                depths.sort_by(f64::total_cmp);
-                let (near, far) = (depths[depths.len() / 50], depths[depths.len() - 1 - depths.len() / 50]);
-                let side = |k: usize| {
-                    let of = |pick: fn(f64, f64) -> f64| polygon.iter().map(|c| c[k]).reduce(pick).unwrap_or(0.0);
-                    of(f64::max) - of(f64::min)
-                };
-                // What is seen is the front of something about as deep as it is wide.
-                let wide = near * side(0).min(side(1));
-                let range = if self.through {
-                    [0.0, ENDLESS]
-                } else {
-                    [near - MARGIN * wide - MARGIN * near, far + wide.min(far - near + wide)]
-                };
-                let range = [range[0].max(0.0), range[1]];
-                if self.shape == Shape::Lasso {
-                    let eye = world.translation;
-                    let turn = quat::from_rotation(&world.rotation);
-                    let corners: Vec<f64> = polygon.iter().flatten().copied().collect();
-                    return Ok(format!(
-                        "lasso({}, {}, {}, {})",
-                        numbers(&eye),
-                        numbers(&turn),
-                        numbers(&range),
-                        numbers(&corners)
-                    ));
-                }
-                let inside = |x: &[f64; 3]| {
-                    let p = camera.cam_from_world.apply(*x);
-                    p[2] > range[0] && p[2] <= range[1] && splat4d::edit::within(&polygon, [p[0] / p[2], p[1] / p[2]])
-                };
-                let all: Vec<[f64; 3]> = there(scene, t, |_, _| true).into_iter().filter(inside).collect();
-                if all.is_empty() {
-                    return Err(nothing());
-                }
-                let edge = |k: usize, pick: fn(f64, f64) -> f64| all.iter().map(|x| x[k]).reduce(pick).unwrap_or(0.0);
-                let low: [f64; 3] = std::array::from_fn(|k| edge(k, f64::min));
-                let high: [f64; 3] = std::array::from_fn(|k| edge(k, f64::max));
-                let room: [f64; 3] = std::array::from_fn(|k| 0.01 * (high[k] - low[k]) + 1e-6);
-                let (low, high) = (se3::sub(low, room), se3::add(high, room));
-                Ok(format!("box({}, {})", numbers(&low), numbers(&high)))
-            }
-        }
-    }
-}
-
-/// A token that nobody can guess, from the system's randomness.
+/// A token that cannot be guessed, from the system's randomness.
 pub fn token() -> Result<String> {
     let mut bytes = [0; 16];
     getrandom::fill(&mut bytes).map_err(|e| {
@@ -594,11 +425,16 @@ mod tests {
 
     /// A red ball left of a green one, both a unit away from the origin, seen from below z.
     fn source() -> Source {
+        balls([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    }
+
+    /// A red and a green ball at two places: even and odd rows.
+    fn balls(places: [[f64; 3]; 2]) -> Source {
         let mut p = Params::new(ROWS, 1, LifeKind::Infinite.columns());
         for row in 0..ROWS {
             let r = Rng::new(4, "balls", 0).fork(row as u64);
             let side = if row % 2 == 0 { -1.0 } else { 1.0 };
-            let x = [side + 0.2 * r.normal(0), 0.2 * r.normal(1), 0.2 * r.normal(2)];
+            let x: [f64; 3] = std::array::from_fn(|k| places[row % 2][k] + 0.2 * r.normal(k as u64));
             p[GEOMETRY].write(row, 0, x.map(|x| x as f32));
             p[GEOMETRY].write(row, QUAT, [1.0, 0.0, 0.0, 0.0]);
             p[GEOMETRY].write(row, LOG_SCALE, [-2.2; 3]);
@@ -676,6 +512,28 @@ mod tests {
             .refused(json!({"do": "pick", "steps": [], "shape": "box", "corners": [[0.4, 0.3], [0.45, 0.35]],
             "view": view(), "t": 0.0, "through": false, "now": false}));
         assert!(nothing.contains("nothing is visible there"), "{nothing}");
+    }
+
+    #[test]
+    fn shapes_take_what_is_hidden_behind_a_surface_only_with_through() {
+        let folder = tempfile::tempdir().unwrap();
+        let hidden = balls([[0.0; 3], [0.0, 0.0, 3.0]]);
+        let editor = Editor::new(hidden, "balls".into(), &folder.path().join("edits.toml")).unwrap();
+        for (shape, corners) in [
+            ("box", json!([[-0.2, -0.2], [0.2, 0.2]])),
+            ("lasso", json!([[-0.2, -0.2], [0.2, -0.2], [0.2, 0.2], [-0.2, 0.2]])),
+        ] {
+            let [front, both] = [false, true].map(|through| {
+                let ask = json!({"do": "pick", "steps": [], "shape": shape, "corners": corners, "view": view(), "t": 0.0,
+                    "through": through, "now": false});
+                editor.answer(ask).unwrap().told
+            });
+            let held = front["gaussians"].as_u64().unwrap();
+            assert!((170..=200).contains(&held), "{shape} {held}");
+            let z = front["center"][2].as_f64().unwrap();
+            assert!(z.abs() < 0.1, "{shape}: none of the ball behind, {z}");
+            assert!(both["gaussians"].as_u64().unwrap() > 380, "{shape} {both}");
+        }
     }
 
     #[test]
@@ -779,11 +637,5 @@ mod tests {
         let y = |told: &Value| told["nodes"][0][1].as_f64().unwrap();
         assert!((y(&moved) - y(&rest) - 0.5).abs() < 1e-5);
         assert_ne!(moved["picture"], rest["picture"]);
-    }
-
-    #[test]
-    fn tokens_differ() {
-        let tokens = [token().unwrap(), token().unwrap()];
-        assert!(tokens[0] != tokens[1] && tokens.iter().all(|t| t.len() == 32));
     }
 }

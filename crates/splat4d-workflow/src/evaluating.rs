@@ -136,7 +136,7 @@ pub fn rest_of(run: &Run, clock: Stopwatch) -> Deadline {
     }
 }
 
-/// Seconds that parts of what follows training take, by a render that is timed; zero where nobody asks.
+/// Seconds that parts of what follows training take, by a render that is timed; zero where it is not needed.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 struct Times {
     scores: f64,

@@ -1,4 +1,4 @@
-//! Writing files so that nobody ever finds half of one.
+//! Writing files so that no reader ever finds half of one.
 
 use splat4d::format::playback::{EXTENSION, OLD_EXTENSION};
 use splat4d::{Error, Result};
@@ -54,7 +54,7 @@ pub fn base64(bytes: &[u8]) -> String {
     out
 }
 
-/// Tells two contents apart, in 16 hexadecimal digits: FNV-1a, against mistakes and not against malice.
+/// Distinguishes two contents, in 16 hexadecimal digits: FNV-1a, against mistakes and not against malice.
 pub fn fingerprint(bytes: impl AsRef<[u8]>) -> String {
     const OFFSET: u64 = 0xcbf2_9ce4_8422_2325;
     const PRIME: u64 = 0x0000_0100_0000_01b3;

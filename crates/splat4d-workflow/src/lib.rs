@@ -29,6 +29,7 @@
 //! | `run_folder.rs`, `status.rs`, `sequence.rs` | run folders; how far a run is; numbered files |
 //! | `source.rs`, `source/` | scenes of runs and files, of other programs' folders and archives |
 //! | `device.rs`, `draw.rs`, `video.rs`, `raw_values.rs`, `rendering.rs` | renders a scene's channels as images, films, arrays |
+//! | `capture_page.rs` | cameras, images and points of a capture, for the player's page |
 //! | `point_queries.rs` | points followed through a scene |
 //! | `measure.rs`, `measure/` | how scenes and files play: frames per second, bytes, Gaussians alive |
 //! | `baking.rs`, `baking/` | a scene as a playback file, within bytes and likeness |
@@ -38,13 +39,14 @@
 //! | `evaluating.rs`, `foreign.rs`, `still_baseline.rs` | what follows training: scores, playback file, film, report; scores of any scene; of a static one |
 //! | `labelling.rs`, `chunked.rs`, `compressing.rs` | labels, long captures in chunks, compression with a guard |
 //! | `predicting.rs`, `predicting/` | forecasts, compared with what came |
-//! | `editing.rs`, `editor.rs` | lists of edits; edits from a page of the player |
+//! | `editing.rs`, `picking.rs`, `editor.rs` | lists of edits; edits from a page of the player |
 //! | `texts.rs` | texts that users write, for the fuzz targets |
 
 #![allow(missing_docs)] // its interface is not stable yet
 
 pub mod baking;
 pub mod camera_file;
+pub mod capture_page;
 pub mod chunked;
 pub mod comparing;
 pub mod comparison;
@@ -64,6 +66,7 @@ pub mod growing;
 pub mod labelling;
 pub mod measure;
 pub mod paths;
+mod picking;
 pub mod playable;
 pub mod point_queries;
 pub mod predicting;

@@ -13,7 +13,7 @@ const MOST_POINTS: usize = 1_000_000;
 #[derive(Clone, Debug, PartialEq)]
 pub struct Asked {
     query: Query,
-    /// Whose sight of it is told.
+    /// The camera whose view of it is returned.
     camera: Option<String>,
 }
 

@@ -194,7 +194,7 @@ impl Run {
         Recipe::from_toml(text).map_err(|e| e.at(path.display()))
     }
 
-    /// Steps taken, where something tells.
+    /// Steps taken, where recorded.
     pub fn iteration(&self) -> Option<usize> {
         let told = self.number("iteration").map(|n| n as usize);
         told.or(self.iteration).or_else(|| self.metrics.last().map(|m| m.iteration as usize))

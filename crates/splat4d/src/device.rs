@@ -68,7 +68,7 @@ fn or_cpu(config: RenderConfig, gpu: Result<(Box<dyn Backend>, String)>) -> Open
 
 /// The device that was asked for, with the CPU next to it: what the GPU cannot draw is drawn by the CPU, image by
 /// image,
-/// and a GPU that fails is left for good. Each is told once ([`Backend::notice`]), and neither is an error.
+/// and a GPU that fails is left for good. Each is reported once ([`Backend::notice`]), and neither is an error.
 pub fn open_to_train(device: Device, config: RenderConfig) -> Opened {
     let opened = open(device, config, &Wanted { backward: true, ..Wanted::default() }, Tables::Changing);
     let why = opened.why.replacen("drawing", "training", 1);
@@ -307,7 +307,7 @@ fn gpu(device: Device, config: RenderConfig, wanted: &Wanted, tables: Tables) ->
 type SelfTest<'a> = &'a mut dyn FnMut(&mut dyn Backend) -> Result<()>;
 
 /// A renderer that has passed a test, and its name: with subgroups, or else without. Errors: it has passed neither; that of the
-/// first is told.
+/// first is reported.
 #[cfg(feature = "gpu")]
 fn to_train(
     open: &dyn Fn() -> Result<Gpu>,

@@ -22,7 +22,7 @@ const BLOCK: usize = crate::format::playback::BLOCK_GAUSSIANS;
 /// Memory for unpacked pages unless told, bytes.
 pub const DEFAULT_BUDGET: usize = 1 << 30;
 
-/// An image of a scene at a time, on the CPU, over the scene's own background. Whoever draws many keeps a [`Player`], a
+/// An image of a scene at a time, on the CPU, over the scene's own background. To render many, keep a [`Player`], a
 /// [`Backend`](crate::render::Backend) and an [`Image`].
 ///
 /// Errors: a driver's; the CPU has none.
@@ -54,7 +54,7 @@ impl ReadAt for &[u8] {
 /// When the rows of one layer are alive.
 #[derive(Debug, Default)]
 struct Alive {
-    /// Nobody is ever born or dies: every row is meant.
+    /// No Gaussian is born or dies: all rows are used.
     all: bool,
     /// [from, to] of every row, seconds; from > to: never.
     spans: Vec<[f64; 2]>,

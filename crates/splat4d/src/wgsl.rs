@@ -1,6 +1,6 @@
 //! The shaders as text, shared by the native renderer (feature `gpu`) and the browser's player.
 //!
-//! No feature and no dependency: whoever needs a shader puts the files it names one after the other. Each file's header
+//! No feature and no dependency: a shader is the concatenation of the files it names. Each file's header
 //! names its twin in Rust, its buffers and what a thread owns.
 
 /// `struct View`, `Cov`, `Ellipse`; `covariance`, `project`: twin of `render::project`. No bindings.
@@ -41,7 +41,7 @@ pub const RASTERIZE_BACK_VECTOR: &str = include_str!("gpu/rasterize_back_vector.
 pub const RASTERIZE_BACK: &str = include_str!("gpu/rasterize_back.wgsl");
 /// An image compared with its truth: L1, D-SSIM and their gradient: `moments`, `gradient`.
 pub const LOSS: &str = include_str!("gpu/loss.wgsl");
-/// Learnable rows at time t, and their lives. Reads `params`, which whoever includes it binds.
+/// Learnable rows at time t, and their lives. Reads `params`, which the including shader binds.
 pub const LEARNT: &str = include_str!("gpu/learnt.wgsl");
 /// Writes a row's gradients. After [`LEARNT`].
 pub const PUT: &str = include_str!("gpu/put.wgsl");

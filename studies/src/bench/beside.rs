@@ -45,7 +45,7 @@ const RATES: [RateOf; 6] = [
 const SCENE: &str = "scene.json";
 const OURS: &str = "splat4d.json";
 
-/// What a program tells of its run.
+/// What a program reports of its run.
 #[derive(Debug, Serialize, Deserialize)]
 struct Ran {
     program: String,
@@ -190,7 +190,7 @@ fn verdicts(ours: &Ran, folder: &Path) -> Result<Vec<String>> {
     paths.iter().filter(other).map(verdict).collect()
 }
 
-/// Writes a scene into a folder of its name, trains it with `backend`, and tells how other programs compare that were there before.
+/// Writes a scene into a folder of its name, trains it with `backend`, and prints how it compares with programs that were measured before.
 pub(super) fn measure(
     pinned: &Pinned,
     folder: &Path,

@@ -19,7 +19,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Bytes of a splat's geometry, of what is made of it, of its place in a list, and of what goes back to the CPU.
+/// Bytes of a splat's geometry, of what is made of it, of its place in a list, and of what returns to the CPU.
 const GEOMETRY: usize = 40;
 const SHAPE: usize = 48;
 const NUMBER: usize = 4;

@@ -53,7 +53,7 @@ const DEGREE: usize = 3;
 /// Side of the images with more Gaussians and in the memory figure; and with more frames.
 const SIDE: usize = 800;
 const SMALL_SIDE: usize = 400;
-/// Steps before times count, and steps of which the median is told, with more frames.
+/// Steps before times count, and steps of which the median is reported, with more frames.
 const WARM_UP: usize = 10;
 const STEPS: usize = 60;
 /// As the bundled capture's images.

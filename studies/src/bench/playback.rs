@@ -74,7 +74,7 @@ pub(super) fn json(rows: &[Played]) -> String {
     format!("[\n{}\n]", lines.join(",\n"))
 }
 
-/// A quantity's name, and how a side tells it.
+/// A quantity's name, and how a side prints it.
 type Quantity<'a> = (&'a str, &'a dyn Fn(&Side) -> String);
 
 /// A line for each quantity, a column for each file; the head first.

@@ -8,7 +8,7 @@ use splat4d_import::board::Board;
 use splat4d_import::corrections;
 use splat4d_import::doctor::{Grade, Report as Looked};
 use splat4d_import::take::{self, CameraReport, Report, Request, Rig};
-use splat4d_import::video::Selection;
+use splat4d_import::video::{Crop, Cropping, Selection};
 use splat4d_import::write::Format;
 use splat4d_train::event::Progress;
 use splat4d_train::output::{Input, OutputFolder, check_apart, written};
@@ -74,6 +74,10 @@ pub(crate) struct Args {
     /// Largest number of pixels of the images' shorter side
     #[arg(long, value_name = "PIXELS", default_value_t = SIZE)]
     size: usize,
+    /// Cut off black bars (auto), or keep this part of every image, in pixels of the videos; given poses and masks are for
+    /// whole images
+    #[arg(long, value_name = "auto|W:H:X:Y", value_parser = crop, conflicts_with_all = ["calibration", "masks"])]
+    crop: Option<Cropping>,
     /// Frames per second of folders of images
     #[arg(long, value_name = "N", default_value_t = FPS)]
     fps: f64,
@@ -118,6 +122,18 @@ fn apart(text: &str) -> Result<([String; 2], f64), String> {
     Ok(([a, b].map(|n| n.trim().to_owned()), metres))
 }
 
+fn crop(text: &str) -> Result<Cropping, String> {
+    if text == "auto" {
+        return Ok(Cropping::Auto);
+    }
+    let wrong = || format!("invalid part of an image \"{text}\": write auto, or W:H:X:Y such as 1920:800:0:140");
+    let numbers: Option<Vec<usize>> = text.split(':').map(|n| n.trim().parse().ok()).collect();
+    match numbers.as_deref() {
+        Some(&[width, height, x, y]) if width > 0 && height > 0 => Ok(Cropping::At(Crop { width, height, x, y })),
+        _ => Err(wrong()),
+    }
+}
+
 fn height(text: &str) -> Result<(String, f64), String> {
     let wrong = || format!("invalid height of a camera \"{text}\": write left=1.6");
     let (name, metres) = text.rsplit_once('=').ok_or_else(wrong)?;
@@ -128,7 +144,7 @@ fn height(text: &str) -> Result<(String, f64), String> {
     Ok((name.trim().to_owned(), metres))
 }
 
-/// Refuses a folder that holds what an import writes, but no import: nobody's images, masks or points are replaced.
+/// Refuses a folder that holds what an import writes, but no import: images, masks or points of other origin are never replaced.
 fn check_ours(folder: &Path) -> splat4d::Result<()> {
     if folder.join(corrections::FILE).is_file() {
         return Ok(());
@@ -160,7 +176,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             to: args.to,
             size: Some(args.size),
             deinterlace: args.deinterlace,
+            crop: None,
         },
+        crop: args.crop,
         fps: args.fps,
         rig: match args.rig.as_str() {
             "fixed" => Rig::Fixed,
@@ -240,6 +258,10 @@ fn told(report: &Report, looked: Option<&(Looked, PathBuf)>, console: &Console) 
     for camera in &report.cameras {
         let off = camera.calibration.map_or_else(|| "-".to_owned(), |v| format!("{v:.2}"));
         let _ = writeln!(text, "{}{}", row(camera), if given { format!("{off:>16}") } else { String::new() });
+    }
+    if !report.gaps.is_empty() {
+        let each = report.gaps.iter().map(|g| format!("{}-{} {:.0}", g.cameras[0], g.cameras[1], g.degrees));
+        let _ = writeln!(text, "degrees between neighbours: {}", each.collect::<Vec<_>>().join(", "));
     }
     for guess in &report.guesses {
         let _ = writeln!(text, "{guess}");

@@ -40,7 +40,7 @@ const HUGE: f64 = 1.0;
 const MANY_HUGE: f64 = 0.02;
 /// Below this many Gaussians shares say nothing.
 const FEW: usize = 100;
-/// Layers that are listed; playback files have one a page, and their sections are told already.
+/// Layers that are listed; playback files have one a page, and their sections are printed already.
 const MANY_LAYERS: usize = 8;
 /// Longest bar of a histogram, characters.
 const BAR: usize = 32;
@@ -48,6 +48,7 @@ const BAR: usize = 32;
 const EXAMPLES: &str = "\
 Examples:
   splat4d info my-take            cameras, frames, split, findings, memory estimate
+  splat4d info my-take --check    exit code 2 if it does not look healthy, for scripts
   splat4d info my-take --doctor   problems per camera and remedies (writes ./doctor/doctor.html)
   splat4d info runs/knight        recipe, progress, scores
   splat4d info scene.ply --json   Gaussians, SH degree, bounds, opacity and scales, damage";
@@ -77,15 +78,18 @@ pub(crate) struct Args {
     /// Check a capture's images and poses, and write doctor.html and doctor.json
     #[arg(long)]
     doctor: bool,
+    /// Fail with exit code 2 if it does not look healthy
+    #[arg(long)]
+    check: bool,
     /// Folder of --doctor's output
     #[arg(short, long, value_name = "FOLDER", default_value = "doctor", requires = "doctor")]
     output: PathBuf,
 }
 
-/// Output of the verb: a JSON object, and the same for people.
 /// What readers say of values that cannot be right as they were read; all else that they say is a note.
 const DOUBTS: [&str; 2] = ["--linear", "where single precision has steps"];
 
+/// Output of the verb: a JSON object, and the same for people.
 struct Told {
     json: Value,
     text: String,
@@ -127,14 +131,25 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         told.json["healthy"] = json!(healthy);
         told.json["troubles"] = json!(told.troubles);
         console.emit(&told.json);
-        return Ok(());
+        return args.verdict(healthy);
     }
     for trouble in &told.troubles {
         let _ = writeln!(told.text, "! {}", in_line(trouble));
     }
     let verdict = if healthy { "looks healthy" } else { "does not look healthy, see above" };
     console.report(&format!("{}{verdict}", told.text), healthy);
-    Ok(())
+    args.verdict(healthy)
+}
+
+impl Args {
+    /// Errors: with --check, what does not look healthy.
+    fn verdict(&self, healthy: bool) -> anyhow::Result<()> {
+        if healthy || !self.check {
+            return Ok(());
+        }
+        let remedy = "The findings are listed above; without --check they do not change the exit code.";
+        Err(Error::input("does not look healthy").at(self.path.display()).remedy(remedy).into())
+    }
 }
 
 fn line(out: &mut String, name: &str, value: &str) {

@@ -4,7 +4,7 @@ use crate::console::Console;
 use crate::device::Device;
 use crate::interrupt;
 use crate::measuring::MeasureArgs;
-use crate::serving::{self, Place, Watch};
+use crate::serving::{self, Control, Place, Watch};
 use serde_json::json;
 use splat4d::{Error, ErrorKind};
 use splat4d_import::shipped;
@@ -57,7 +57,7 @@ A capture is a folder with one of these: capture.json (write it for your own rig
 Blender), transforms.json (Nerfstudio), sparse/ (COLMAP), train_meta.json (PanopticSports), dataset.json (HyperNeRF) or \
 poses_bounds.npy (N3DV). `splat4d info CAPTURE` checks one. `--help-knobs` lists all settings.";
 
-/// The settings that most runs are told by, for `--help`.
+/// The settings that most runs change, for `--help`.
 const IMPORTANT: [&str; 12] = [
     "run.iterations",
     "run.half_size_until",
@@ -187,23 +187,27 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         console.result(knob_list(topic)?.trim_end());
         return Ok(());
     }
-    let clock = Stopwatch::start();
+    let stop = interrupt::flag(SAVING);
+    let control = Control::new(stop.clone());
+    let clock = control.clock();
     args.measure.check()?;
     if !args.view && args.place.is_told() {
         return Err(Error::input("--port, --host and --no-open need --view").remedy("Add --view.").into());
     }
-    let stop = interrupt::flag(SAVING);
     interrupt::ends("training had not begun, and the same command begins it");
-    let watch = |title: &str| {
-        if args.view { Watch::start(title, &args.place, console) } else { Watch::nobody() }
+    let watch = |title: &str, capture: Option<&Arc<Capture>>| {
+        Watch::start(title, capture.cloned(), args.view.then_some(&args.place), &control, console)
     };
+    // The images of a run that is continued; without its capture the resume itself reports the reason.
+    let images = |run: &Run| args.view.then(|| run.open_capture().ok()).flatten().map(|(capture, _)| Arc::new(capture));
     let snapshots = |watch: &Watch| watch.is_on().then_some(SNAPSHOT_INTERVAL);
     let listen = |event: &Event, watch: &Watch| {
         watch.hear(event);
         console.event(event);
     };
     if let Some(run) = args.resume.as_ref().filter(|run| Chunked::is(run)) {
-        let watch = watch(&Run::open(run)?.name());
+        let opened = Run::open(run)?;
+        let watch = watch(&opened.name(), images(&opened).as_ref());
         let _folder = OutputFolder::shared(run)?;
         let chunked = Chunked::open(run)?;
         return in_chunks(args, run, &chunked, clock, &stop, &watch, console);
@@ -211,7 +215,8 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     // A run that ended before its first checkpoint begins again, as it was asked for.
     let again = args.resume.as_ref().and_then(|run| Some((run.clone(), Asked::unbegun(run)?)));
     let (folder, run, watch, trained) = if let Some(run) = args.resume.as_ref().filter(|_| again.is_none()) {
-        let watch = watch(&Run::open(run)?.name());
+        let opened = Run::open(run)?;
+        let watch = watch(&opened.name(), images(&opened).as_ref());
         let folder = OutputFolder::amend(run, "train --resume")?;
         let device = chosen(args.device.into(), "training", console);
         let clock = clock.clone();
@@ -274,7 +279,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             let run = folder.as_ref().unwrap_or_else(|shared| shared).path().to_owned();
             describe(&capture, outlook.memory, console);
             console.say(&chunked::in_words(&outlook));
-            let watch = watch(&capture.name);
+            let watch = watch(&capture.name, Some(&capture));
             let begun = Chunked::begin(&capture, &outlook.recipe, &run, &mut |event| listen(event, &watch))?;
             let chunked = begun.expect("a take that has a plan is learnt by it").paced(outlook.pacing);
             let _folder = match folder {
@@ -299,7 +304,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         let (folder, found) = place()?;
         let run = folder.path().to_owned();
         describe(&whole, memory_estimate(&whole, &recipe), console);
-        let watch = watch(&whole.name);
+        let watch = watch(&whole.name, Some(&whole));
         let options = TrainOptions {
             device: chosen(args.device.into(), "training", console),
             minutes,
@@ -335,11 +340,13 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let outcome: Outcome = trained?;
     evaluating::amend(&run, [("notes".into(), json!(console.warnings()))])?;
     if outcome.interrupted {
+        let resume = format!("splat4d train --resume {}", in_command(&run));
+        watch.stopped(outcome.iteration, &resume);
         return Err(Error::new(
             ErrorKind::Interrupted,
             format!("training was stopped after step {} and saved", outcome.iteration),
         )
-        .remedy(format!("Continue with: splat4d train --resume {}", in_command(&run)))
+        .remedy(format!("Continue with: {resume}"))
         .into());
     }
     let name = in_command(&run);
@@ -397,8 +404,10 @@ fn in_chunks(
     });
     console.clear();
     if outcome?.is_some_and(|o| o.interrupted) {
+        let resume = format!("splat4d train --resume {}", in_command(run));
+        watch.stopped(0, &resume);
         return Err(Error::new(ErrorKind::Interrupted, "training was stopped and saved")
-            .remedy(format!("Continue with: splat4d train --resume {}", in_command(run)))
+            .remedy(format!("Continue with: {resume}"))
             .into());
     }
     match args.chunk {
@@ -555,7 +564,7 @@ fn minutes(text: &str) -> Result<f64, String> {
     if value > 0.0 && value <= MOST { Ok(value) } else { Err(format!("expected minutes above 0, at most {MOST}")) }
 }
 
-/// The examples, and the settings that most runs are told by.
+/// The examples, and the settings that most runs change.
 fn long_help() -> String {
     let knobs = Recipe::knobs();
     let lines: String = IMPORTANT

@@ -51,7 +51,7 @@ pub struct Board {
     pub family: Family,
     /// Metres along a tag's dark square.
     pub side: f64,
-    /// Tells what is up.
+    /// Defines what is up.
     pub lies: Option<Lies>,
 }
 

@@ -51,7 +51,7 @@ fn depth(text: &str) -> usize {
 }
 
 impl Tree {
-    /// Reads a text; its beginning tells the syntax.
+    /// Reads a text; its beginning determines the syntax.
     pub(super) fn parse(text: &str) -> Result<Self> {
         let text = text.trim_start_matches('\u{feff}');
         let start = text.trim_start();

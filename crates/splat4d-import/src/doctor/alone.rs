@@ -7,14 +7,14 @@ use crate::sync::median;
 use splat4d_train::capture::Capture;
 
 /// What stands still went so far, pixels of 1920, and at least so many own ones.
-const MOVED: [f64; 2] = [0.5, 2.0];
-const MOVED_PIXELS: [f64; 2] = [0.35, 1.0];
+pub(super) const MOVED: [f64; 2] = [0.5, 2.0];
+pub(super) const MOVED_PIXELS: [f64; 2] = [0.35, 1.0];
 /// Brightness that jumps from image to image, stops.
 const FLICKER: [f64; 2] = [0.05, 0.15];
 /// Missing and doubled frames, of all.
 const FRAMES: [f64; 2] = [0.01, 0.05];
 /// Part of the pixels that is clipped black or white: backgrounds of data sets are, so that only most of an image
-/// tells.
+/// reports it.
 const CLIPPED: f64 = 0.6;
 /// Mean below which an image is too dark, of 255.
 const DARK: f64 = 20.0;

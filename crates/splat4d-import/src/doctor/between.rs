@@ -18,11 +18,11 @@ use splat4d_train::vision::features::{Limits, find};
 use splat4d_train::vision::raster::grey;
 
 /// Distance of matches from their epipolar lines, pixels of an image 1920 wide.
-const EPIPOLAR: [f64; 2] = [1.0, 2.0];
+pub(super) const EPIPOLAR: [f64; 2] = [1.0, 2.0];
 /// And at least so many of the image's own: of the bundled capture, whose poses are exact, up to 0.8 were measured.
-const OWN_PIXELS: [f64; 2] = [1.0, 2.0];
+pub(super) const OWN_PIXELS: [f64; 2] = [1.0, 2.0];
 /// Exposure, and one channel against green, stops.
-const EXPOSURE: [f64; 2] = [0.15, 0.5];
+pub(super) const EXPOSURE: [f64; 2] = [0.15, 0.5];
 /// And of poses: of pairs with fewer many are chance (measured on a hall and on the bundled capture), of cameras whose axes
 /// are farther apart most, degrees.
 const SURE: usize = 20;

@@ -18,11 +18,11 @@ const OFFSET: [f64; 2] = [0.5, 1.5];
 const OFFSET_SIGMAS: f64 = 4.0;
 const OFFSET_FRAMES: f64 = 0.75;
 /// Seconds from the first to the last row of an image, and standard deviations from which on they are believed.
-const SHUTTER: [f64; 2] = [0.004, 0.010];
+pub(super) const SHUTTER: [f64; 2] = [0.004, 0.010];
 const SHUTTER_SIGMAS: f64 = 4.0;
 /// Neighbours with which a camera's clock is compared.
 const NEIGHBOURS: usize = 3;
-/// Frames that a clock is looked for within, and the part of those that were looked at: right lags are told by standing out of
+/// Frames that a clock is looked for within, and the part of those that were looked at: right lags are recognized by standing out of
 /// many.
 const WITHIN: f64 = 10.0;
 const WITHIN_PART: f64 = 1.0 / 3.0;

@@ -16,6 +16,7 @@ mod volume;
 
 use crate::{Error, Result};
 use serde::Serialize;
+use splat4d::scene::Camera;
 use splat4d_train::capture::{Capture, ImageStore, Rgb8, Severity};
 use splat4d_train::event::Progress;
 use splat4d_train::run::forecast;
@@ -82,6 +83,23 @@ pub struct CameraReport {
     pub picture: Rgb8,
 }
 
+impl CameraReport {
+    /// Limits of one of its numbers, by the name of its field, for images of this camera: beyond the first is a warning,
+    /// beyond the second bad. Of sharpness and focus, below.
+    pub fn limits(field: &str, view: &Camera) -> Option<[f64; 2]> {
+        // Small images resolve less: their own pixels count.
+        let or_pixels = |limits, pixels: [f64; 2]| finding::worse(limits, pixels.map(|p| p * finding::unit(view)));
+        Some(match field {
+            "epipolar" => or_pixels(between::EPIPOLAR, between::OWN_PIXELS),
+            "exposure" => between::EXPOSURE,
+            "sharpness" | "focus" => finding::SHARPNESS,
+            "moved" => or_pixels(alone::MOVED, alone::MOVED_PIXELS),
+            "shutter" => clocks::SHUTTER,
+            _ => return None,
+        })
+    }
+}
+
 /// What two cameras say of each other.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct PairReport {
@@ -136,7 +154,7 @@ pub struct Options {
     pub features: usize,
     /// Corners of a camera that are followed.
     pub tracks: usize,
-    /// Bytes of memory that training may take; none: all that the machine has, where it tells.
+    /// Bytes of memory that training may take; none: all that the machine has, where it reports that.
     pub memory: Option<u64>,
 }
 

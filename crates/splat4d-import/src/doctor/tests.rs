@@ -380,7 +380,7 @@ fn tracks(c: usize, late: f64, shutter: f64) -> Vec<Track> {
     (0..30).map(|k| Track { samples: (0..60).map(|n| sample(k, n)).collect() }).collect()
 }
 
-/// What is told of the clocks where the ill camera is late by so many seconds, and reads its rows over so many.
+/// The findings on time offsets where the faulty camera is late by so many seconds, and reads its rows over so many.
 fn timed(late: f64, shutter: f64) -> Report {
     let folder = tempfile::tempdir().unwrap();
     let moment: Clip = clean().iter().map(|c| c[..2].to_vec()).collect();
@@ -455,7 +455,7 @@ fn training_that_does_not_fit_into_memory_is_reported() {
     assert_eq!(told(needed / 2), [Grade::Bad]);
 }
 
-/// The clean take with faults that are smaller than what is told, each of them as large as the names of the checks say.
+/// The clean take with faults that are smaller than what is reported, each of them as large as the names of the checks say.
 #[test]
 fn invisible_faults_are_not_reported() {
     let mut pushed = clean().clone();

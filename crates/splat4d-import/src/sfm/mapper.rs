@@ -178,7 +178,7 @@ impl<'a> Ground<'a> {
         link.matches.iter().map(|&([i, j], _)| [ray(a, focal[0], i), ray(b, focal[1], j)]).collect()
     }
 
-    /// The map of no camera, with focal lengths (of the larger side) as they are told or guessed.
+    /// The map of no camera, with focal lengths (of the larger side) as they are given or guessed.
     fn empty(&self, focal: f64) -> Map<'_> {
         let mut lenses: Vec<Option<Lens>> = vec![None; self.lens_count];
         let mut told = vec![false; self.lens_count];

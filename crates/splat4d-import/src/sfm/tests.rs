@@ -106,7 +106,7 @@ fn a_rig_is_found_among_noise_and_outliers_with_focal_lengths_and_clocks() {
     assert!(splat4d::math::se3::dot(there, up) > 0.9, "{there:?}");
 }
 
-/// Tells the lenses of a rig, and its poses if they are `placed`; those of `wrong` cameras are turned by 1.5 degrees.
+/// Gives the lenses of a rig, and its poses if they are `placed`; those of `wrong` cameras are turned by 1.5 degrees.
 fn tell(rig: &mut Rig, placed: bool, wrong: &[usize]) -> Vec<f64> {
     let turn = super::algebra::rotation([0.0, 1.5f64.to_radians(), 0.0]);
     let mut focals = Vec::new();

@@ -24,7 +24,7 @@ const MATCHES: usize = 8;
 /// Times that a match must have in common.
 const COMMON: usize = 3;
 /// By how much the best lag's log-likelihood must exceed the median over lags, in median absolute deviations of lags. All of
-/// 22 pairs of a real hall with 2.5 to 12 were right; of tracks without anything in common it is the other bound that tells.
+/// 22 pairs of a real hall with 2.5 to 12 were right; of tracks without anything in common the other bound decides.
 const STANDS_OUT: f64 = 2.5;
 /// And by how much for every track: tracks without anything in common reach 0.02 by chance, pairs of the hall
 /// 0.23 to 1.05.
@@ -315,9 +315,9 @@ impl Problem<'_> {
         matched.iter().map(of).sum::<f64>() / matched.len() as f64
     }
 
-    /// How much a match pulls at the lag (px²/s), and what it tells of it (px²/s²): the mean square of how fast it leaves the
+    /// How much a match pulls at the lag (px²/s), and its information on it (px²/s²): the mean square of how fast it leaves the
     /// line. Its times count as one, for what is wrong with a track is wrong at all of them. The variance of the lag is the sum
-    /// of the squared pulls over the squared sum of what is told (White 1980).
+    /// of the squared pulls over the squared sum of the information (White 1980).
     fn information(&self, m: &Sightings, lag: f64, step: f64, scale: f64) -> (f64, f64) {
         let (mut pull, mut sum, mut count) = (0.0, 0.0, 0.0f64);
         for &(t, x) in &m.places {

@@ -89,7 +89,7 @@ pub struct Refused {
 /// The clock of all.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Solution {
-    /// Per camera; None: nothing connects it with camera 0 or one whose offset is told.
+    /// Per camera; None: nothing connects it with camera 0 or one whose offset is given.
     pub offsets: Vec<Option<Offset>>,
     /// What was left out.
     pub refused: Vec<Refused>,

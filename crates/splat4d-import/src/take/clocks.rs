@@ -78,7 +78,7 @@ fn heard(
 pub(super) struct Guessed {
     /// Lags that are guessed.
     pub evidence: Vec<Evidence>,
-    /// Whether anything moves in two cameras, one of them open, as far as a short take tells: then clocks matter.
+    /// Whether anything moves in two cameras, one of them open, as far as a short take shows: then clocks matter.
     pub moves: bool,
 }
 
@@ -111,7 +111,7 @@ pub(super) fn by_motion(
     Ok(Guessed { evidence: out, moves })
 }
 
-/// Refuses a take in which something moves and too few clocks are told: it would be seen at other moments by every camera, and
+/// Refuses a take in which something moves and too few clocks are known: it would be seen at other moments by every camera, and
 /// nothing later could tell. How much moves is a guess that other evidence has to confirm, and counts for nothing here.
 pub(super) fn check(names: &[&str], solved: &Solved, told: &[Option<f64>], motion: &[String]) -> Result<()> {
     let known = |c: usize| {

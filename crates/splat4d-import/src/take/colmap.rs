@@ -21,7 +21,7 @@ const LOOK: Duration = Duration::from_millis(100);
 /// Characters of the program's last words that are repeated.
 const LAST_WORDS: usize = 400;
 
-/// A step of the program, and what it is told; options of several names have a help text decide.
+/// A step of the program, and its arguments; options of several names have a help text decide.
 struct Step {
     name: &'static str,
     /// The text that begins an option in old and in new versions; 3.13 took names of the matcher for those of its kind.

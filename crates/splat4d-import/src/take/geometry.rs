@@ -13,7 +13,7 @@ use splat4d_train::event::Progress;
 
 /// Frames in a row in which corners are followed.
 const WINDOW: usize = 90;
-/// Part of them that a clock is looked for within: right lags are told by standing out of many.
+/// Part of them that a clock is looked for within: right lags are recognized by standing out of many.
 const WITHIN: f64 = 1.0 / 3.0;
 /// Corners of a camera that are followed, as the doctor has them.
 const TRACKS: usize = 60;

@@ -12,6 +12,7 @@ mod given;
 mod inputs;
 mod poses;
 mod report;
+mod spacing;
 mod stored;
 mod tags;
 mod way;
@@ -19,13 +20,14 @@ mod world;
 
 pub use inputs::{Input, find};
 pub use report::{CameraReport, Report};
+pub use spacing::Gap;
 
 use crate::board::Board;
 use crate::calibration::Video;
 use crate::corrections::{self, Corrections};
 use crate::sfm::known::pixel_unit;
 use crate::sync::graph::Evidence;
-use crate::video::{self, Selection, Source};
+use crate::video::{self, Cropping, Selection, Source};
 use crate::write::{self, Clip, Format, Pictures, Take};
 use crate::{Error, ErrorKind, Result};
 use splat4d_train::event::Progress;
@@ -52,6 +54,8 @@ pub struct Request {
     pub folder: PathBuf,
     /// Which frames, on the clock of the first camera, and how large.
     pub selection: Selection,
+    /// Which parts of images are kept.
+    pub crop: Option<Cropping>,
     /// Frames per second of folders of images.
     pub fps: f64,
     /// Whether cameras stand still.
@@ -79,7 +83,7 @@ pub struct Request {
 /// Frames of a moving camera that are placed at most: every one is a camera of its own to the solver.
 const MOST_WALKING: usize = 150;
 
-/// Share of the cameras that must be placed, and below which that is told: what people who reconstruct by
+/// Share of the cameras that must be placed, and below which that is reported: what people who reconstruct by
 /// structure from motion go by.
 const PLACED_LEAST: f64 = 0.7;
 const PLACED_WARN: f64 = 0.9;
@@ -165,7 +169,8 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
         Vec::new()
     };
     let clock = clocks::solve(&cameras, &heard, &told);
-    let selections = clocks::shared(&cameras, &clock, &request.selection, &mut report)?;
+    let mut selections = clocks::shared(&cameras, &clock, &request.selection, &mut report)?;
+    crop(request, &cameras, &mut selections, &mut report, progress, stop)?;
     let clips: Vec<Clip<'_>> = cameras
         .iter()
         .zip(selections)
@@ -265,8 +270,10 @@ fn check(solved: &poses::Solved, pictures: &[Pictures], report: &mut Report) -> 
             .collect();
         let reasons = if reasons.is_empty() { String::new() } else { format!(" ({})", reasons.join("; ")) };
         return Err(Error::input(format!("only {placed} of {asked} {what} could be placed{reasons}")).remedy(format!(
-            "Place neighbouring cameras at most 20 degrees apart, in focus and well lit (docs/filming.md); or leave \
+            "{}Place neighbouring cameras at most {} degrees apart, in focus and well lit (docs/filming.md); or leave \
              these out (use = false in {}) and run the same command again.",
+            angles(&report.gaps),
+            spacing::FAR,
             corrections::FILE
         )));
     }
@@ -283,6 +290,17 @@ fn check(solved: &poses::Solved, pictures: &[Pictures], report: &mut Report) -> 
         report.guesses.push(format!("Only {} points {what}", solved.points.len()));
     }
     Ok(())
+}
+
+/// The angles of the placed cameras and what is missing between them, in sentences.
+fn angles(gaps: &[Gap]) -> String {
+    if gaps.is_empty() {
+        return String::new();
+    }
+    let each: Vec<String> =
+        gaps.iter().map(|g| format!("{} and {} {:.0}", g.cameras[0], g.cameras[1], g.degrees)).collect();
+    let advice: String = gaps.iter().filter_map(Gap::advice).map(|a| a + " ").collect();
+    format!("Degrees between placed neighbours: {}. {advice}", each.join(", "))
 }
 
 /// Compares what was given with what images show, and refuses what they contradict.
@@ -324,7 +342,7 @@ fn agrees(solved: &poses::Solved, pictures: &[Pictures], report: &mut Report) ->
     Ok(())
 }
 
-/// Takes the way of sound out of clocks that sound alone tells, or says why not.
+/// Takes the way of sound out of clocks that sound alone determines, or reports why not.
 fn sound_goes(
     solved: &mut poses::Solved,
     evidence: &[Evidence],
@@ -350,6 +368,39 @@ fn sound_goes(
             "Clocks by sound alone are late by 2.9 ms a metre of its way, which is not taken out, for the unit is no metre.".into(),
         );
     }
+}
+
+/// Gives every selection the part of images that is kept.
+fn crop(
+    request: &Request,
+    cameras: &[Camera],
+    selections: &mut [Selection],
+    report: &mut Report,
+    progress: &mut Progress<'_>,
+    stop: &dyn Fn() -> bool,
+) -> Result<()> {
+    let Some(cropping) = request.crop else { return Ok(()) };
+    for (k, (camera, selection)) in cameras.iter().zip(selections).enumerate() {
+        if stop() {
+            return Err(Error::new(ErrorKind::Interrupted, "stopped").remedy("The same command goes on from there."));
+        }
+        selection.crop = match cropping {
+            Cropping::At(crop) => Some(crop),
+            Cropping::Auto => {
+                progress.phase("looking for black bars", k, cameras.len());
+                let found = video::without_bars(&*camera.source, selection);
+                found.map_err(|e| e.at(format!("camera {}", camera.name)))?
+            }
+        };
+        if let Some(c) = selection.crop {
+            let [w, h] = camera.source.info().size;
+            report.guesses.push(format!(
+                "Camera {}: {}x{} pixels of {w}x{h} are kept, from column {} and row {} on.",
+                camera.name, c.width, c.height, c.x, c.y
+            ));
+        }
+    }
+    Ok(())
 }
 
 /// Opens all inputs; no file twice.
@@ -427,6 +478,10 @@ fn finish(
                 own.found_lens(&last.intrinsics, &last.lens);
             }
         }
+    }
+    if !solved.moving {
+        report.gaps = spacing::gaps(&solved, &names_of(pictures));
+        report.guesses.extend(report.gaps.iter().filter_map(Gap::advice));
     }
     corrections.write(folder)?;
     let contradicted = posed.then(|| agrees(&solved, pictures, &mut report)).transpose();

@@ -22,7 +22,7 @@ const RESTED: f64 = 0.05;
 const MOVING_POINTS: usize = 20;
 /// The standard deviation of a clock that they agree on, frames: half of a hall's 31 clocks were 0.04 off.
 const BY_GEOMETRY: f64 = 0.06;
-/// Where sound tells a clock, geometry contradicts it from so many frames on.
+/// Where sound determines a clock, geometry contradicts it from so many frames on.
 const CONTRADICTS: f64 = 1.0;
 /// Of points that stand still training starts; where there are fewer, of all.
 const ENOUGH_STILL: usize = 200;

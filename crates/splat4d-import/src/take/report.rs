@@ -1,6 +1,7 @@
 //! What was found, and how sure it is.
 
 use super::poses::Stand;
+use super::spacing::Gap;
 use crate::Result;
 use crate::sync::graph::Offset;
 use crate::write::Pictures;
@@ -19,15 +20,17 @@ pub struct Report {
     pub capture: PathBuf,
     /// A row for each camera.
     pub cameras: Vec<CameraReport>,
+    /// Neighbouring cameras and the angles between them; empty for cameras that move.
+    pub gaps: Vec<Gap>,
     /// Points that cameras agree on.
     pub points: usize,
     /// What had to be assumed, a sentence each.
     pub guesses: Vec<String>,
     /// Pairs of cameras whose lag was measured and contradicts the rest.
     pub refused: Vec<String>,
-    /// Pairs of cameras that motion tells no lag of, and why.
+    /// Pairs of cameras for which motion determines no lag, and why.
     pub motion: Vec<String>,
-    /// Nothing moves in cameras whose clocks nothing tells: they do not matter.
+    /// Nothing moves in cameras whose clocks are unknown: they do not matter.
     pub still: bool,
 }
 

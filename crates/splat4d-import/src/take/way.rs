@@ -1,4 +1,4 @@
-//! The way of sound: once cameras have places in metres, what each heard too late is taken out of the clocks that only sound tells.
+//! The way of sound: once cameras have places in metres, what each heard too late is taken out of the clocks that only sound determines.
 
 use super::clocks::WAY;
 use super::poses::Solved;
@@ -25,7 +25,7 @@ pub(super) struct Corrected {
     pub most: f64,
 }
 
-/// Takes the way of sound out of clocks that sound alone tells. The solution's unit is the metre.
+/// Takes the way of sound out of clocks that sound alone determines. The solution's unit is the metre.
 ///
 /// Where sounds come from, cameras say whose clocks geometry found or people told: what these heard is late by nothing but its
 /// way. Of fewer cameras, or none, it is the middle of what all look at.
@@ -93,7 +93,7 @@ fn by_sound_alone(offset: &Offset, told: Option<f64>) -> bool {
     told.is_none() && offset.kinds.contains(&Kind::Sound) && !offset.kinds.contains(&Kind::Geometry)
 }
 
-/// Whether sound alone tells a clock.
+/// Whether sound alone determines a clock.
 pub(super) fn hangs_on_sound(solved: &Solved, told: &[Option<f64>]) -> bool {
     solved.offsets.iter().zip(told).any(|(o, t)| o.as_ref().is_some_and(|o| by_sound_alone(o, *t)))
 }

@@ -12,7 +12,7 @@ use splat4d_train::event::Progress;
 
 /// Upwards is an axis of a calibrated world where that is so near (cosine of 15 degrees): people calibrate on floors.
 const ALONG_AXIS: f64 = 0.966;
-/// Degrees between what floor and walls say and what cameras hold upwards that are told.
+/// Degrees between what floor and walls say and what cameras hold upwards that are reported.
 const TOLD: f64 = 1.0;
 
 /// Where the world is from.
@@ -20,7 +20,7 @@ const TOLD: f64 = 1.0;
 pub(super) enum Origin {
     /// A calibration, whose axes and lengths stay; whether these are metres.
     Calibrated { metres: bool },
-    /// Nobody's: axes and unit are as it happened.
+    /// None: axes and unit are arbitrary.
     Free,
 }
 

@@ -167,7 +167,7 @@ impl Source for Avi {
     }
 
     fn frames(&self, selection: &Selection) -> Result<Box<dyn Reader + '_>> {
-        selection.check()?;
+        selection.check_for(self.info())?;
         let times = (0..self.frames.len()).map(|i| i as f64 * self.interval).collect();
         Ok(Box::new(Pictures { avi: self, selection: selection.clone(), next: 0, counted: 0, times }))
     }

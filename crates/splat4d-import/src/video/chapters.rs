@@ -131,7 +131,7 @@ impl Source for Joined {
     }
 
     fn frames(&self, selection: &Selection) -> Result<Box<dyn Reader + '_>> {
-        selection.check()?;
+        selection.check_for(self.info())?;
         let selection = selection.clone();
         let (times, warnings) = (Vec::new(), self.info.warnings.clone());
         Ok(Box::new(Pages { of: self, selection, next: 0, open: None, times, counted: 0, warnings }))

@@ -13,7 +13,7 @@ const SAME_PICTURE: f64 = 0.3;
 /// images
 /// that follow each other may differ as little.
 const SAME_PART: f64 = 0.2;
-/// Differences by which most images are told (three quarters of them differ by less): of frames doubled one by one,
+/// Differences that most images have (three quarters of them differ by less): of frames doubled one by one,
 /// half
 /// differ by nothing.
 const MOST: f64 = 0.75;

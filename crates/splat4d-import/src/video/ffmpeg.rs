@@ -54,7 +54,7 @@ impl Source for Video {
     }
 
     fn frames(&self, selection: &Selection) -> Result<Box<dyn Reader + '_>> {
-        selection.check()?;
+        selection.check_for(self.info())?;
         let info = &self.probe.info;
         if info.interlaced && !selection.deinterlace {
             let what = "it is interlaced: each frame contains two fields of different times";

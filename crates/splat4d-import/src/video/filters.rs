@@ -18,7 +18,7 @@ pub(super) struct Chain {
     pub warnings: Vec<String>,
 }
 
-/// The chain for a video. `showinfo@all` tells the times of all frames, `showinfo@kept` those of the chosen ones.
+/// The chain for a video. `showinfo@all` prints the times of all frames, `showinfo@kept` those of the chosen ones.
 pub(super) fn chain(info: &Info, selection: &Selection, tone_mapping: bool) -> Chain {
     let size = selection.scaled(info.size);
     let mut parts: Vec<String> = Vec::new();
@@ -53,6 +53,13 @@ pub(super) fn chain(info: &Info, selection: &Selection, tone_mapping: bool) -> C
         && let Some(matrix) = color.matrix
     {
         warnings.push(format!("Its file does not say what its colours mean; taken for {} by its size.", said(matrix)));
+    }
+    if let Some(crop) = selection.crop {
+        if info.upright_stored() != info.size {
+            // Crops are told in square pixels.
+            parts.push(format!("scale={}:{}:flags={SCALING}", info.size[0], info.size[1]));
+        }
+        parts.push(format!("crop={}:{}:{}:{}:exact=1", crop.width, crop.height, crop.x, crop.y));
     }
     let range = if color.range == Range::Full { "full" } else { "limited" };
     let matrix = color.matrix.map(|m| format!(":in_color_matrix={m}:in_range={range}")).unwrap_or_default();
@@ -119,6 +126,15 @@ mod tests {
         assert!(at("showinfo@all") < at("select=not(mod(n\\,3))") && at("select") < at("showinfo@kept"));
         assert!(chain.text.contains("scale=960:540") && chain.text.contains("in_color_matrix=bt709:in_range=limited"));
         assert!(chain.warnings.is_empty());
+    }
+
+    #[test]
+    fn images_are_cropped_before_they_are_scaled() {
+        let crop = Some(crate::video::Crop { width: 1920, height: 800, x: 0, y: 140 });
+        let chain = chain(&info(), &Selection { crop, size: Some(400), ..Selection::default() }, true);
+        assert_eq!(chain.size, [960, 400]);
+        let at = |word: &str| chain.text.find(word).unwrap_or_else(|| panic!("{word}: {}", chain.text));
+        assert!(at("crop=1920:800:0:140") < at("scale=960:400"));
     }
 
     #[test]

@@ -84,7 +84,7 @@ impl Source for Folder {
     }
 
     fn frames(&self, selection: &Selection) -> Result<Box<dyn Reader + '_>> {
-        selection.check()?;
+        selection.check_for(self.info())?;
         let times = self.files.iter().map(|f| f.1).collect();
         Ok(Box::new(Pictures { folder: self, selection: selection.clone(), next: 0, counted: 0, times }))
     }
@@ -156,6 +156,13 @@ impl Reader for Pictures<'_> {
 /// An image in the size that was asked for.
 pub(super) fn scaled(picture: Rgb8, selection: &Selection) -> Rgb8 {
     let [width, height] = selection.scaled([picture.width, picture.height]);
+    let picture = match selection.crop {
+        Some(crop) => {
+            let data = crop.of(&picture.data, picture.width, 3);
+            Rgb8 { width: crop.width, height: crop.height, data }
+        }
+        None => picture,
+    };
     if [width, height] == [picture.width, picture.height] {
         return picture;
     }
@@ -169,6 +176,10 @@ pub(super) fn scaled(picture: Rgb8, selection: &Selection) -> Rgb8 {
 /// An alpha channel in the size that was asked for.
 fn scaled_plane(alpha: Vec<u8>, size: [usize; 2], selection: &Selection) -> Vec<u8> {
     let [width, height] = selection.scaled(size);
+    let (alpha, size) = match selection.crop {
+        Some(crop) => (crop.of(&alpha, size[0], 1), [crop.width, crop.height]),
+        None => (alpha, size),
+    };
     if [width, height] == size {
         return alpha;
     }

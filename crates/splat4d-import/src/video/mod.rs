@@ -7,6 +7,7 @@
 mod avi;
 mod chapters;
 mod clock;
+mod crop;
 mod ffmpeg;
 mod filters;
 mod folder;
@@ -15,6 +16,7 @@ mod program;
 
 pub use chapters::{Chapter, open_all};
 pub use clock::{Clock, Gap, mean_difference};
+pub use crop::{Crop, Cropping, without_bars};
 pub(crate) use folder::ENDINGS as PICTURE_ENDINGS;
 pub use folder::Folder;
 pub use probe::{Color, Info, Range, Transfer};
@@ -41,11 +43,13 @@ pub struct Selection {
     pub size: Option<usize>,
     /// Whether interlaced videos are taken, and their lines filled in.
     pub deinterlace: bool,
+    /// The part of images that is kept, before they are scaled.
+    pub crop: Option<Crop>,
 }
 
 impl Default for Selection {
     fn default() -> Self {
-        Self { every: 1, from: None, to: None, size: None, deinterlace: false }
+        Self { every: 1, from: None, to: None, size: None, deinterlace: false, crop: None }
     }
 }
 
@@ -75,8 +79,15 @@ impl Selection {
         Ok(())
     }
 
-    /// The size that images of `size` get: of the same shape, their shorter side as asked for.
-    pub(crate) fn scaled(&self, [width, height]: [usize; 2]) -> [usize; 2] {
+    /// The same for a source.
+    pub(crate) fn check_for(&self, info: &Info) -> Result<()> {
+        self.check()?;
+        self.crop.map_or(Ok(()), |crop| crop.check(info.size))
+    }
+
+    /// The size that images of `size` get: cropped, their shorter side as asked for.
+    pub(crate) fn scaled(&self, size: [usize; 2]) -> [usize; 2] {
+        let [width, height] = self.crop.map_or(size, |c| [c.width, c.height]);
         match self.size {
             Some(side) if side < width.min(height) => {
                 let scale = side as f64 / width.min(height) as f64;
@@ -175,7 +186,7 @@ fn stem(path: &Path) -> String {
     name.map_or_else(|| "camera".into(), |n| n.to_string_lossy().into_owned())
 }
 
-/// Tells two files apart: FNV-1a of length, beginning, middle and end, against mistakes and not against malice.
+/// Distinguishes two files: FNV-1a of length, beginning, middle and end, against mistakes and not against malice.
 fn fingerprint_of_file(path: &Path) -> Result<u64> {
     use std::io::{Read, Seek, SeekFrom};
     /// Bytes of each of the three places: a video's tables and some of its images.

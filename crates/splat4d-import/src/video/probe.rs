@@ -1,4 +1,4 @@
-//! What a video is, as ffprobe tells it.
+//! What a video is, as ffprobe reports it.
 
 use super::program::ratio;
 use serde_json::Value;
@@ -35,12 +35,20 @@ pub enum Transfer {
 pub struct Color {
     /// The matrix from luma and chroma to RGB, as ffmpeg names it; None: the file holds RGB or grey.
     pub matrix: Option<&'static str>,
-    /// Whether the matrix is told, and not guessed from the size.
+    /// Whether the matrix is stated, and not guessed from the size.
     pub tagged: bool,
     /// Full or limited.
     pub range: Range,
     /// Ordinary or high dynamic range.
     pub transfer: Transfer,
+}
+
+impl Info {
+    /// Pixels across and down of stored images after they were turned upright.
+    pub(super) fn upright_stored(&self) -> [usize; 2] {
+        let [w, h] = self.stored;
+        if self.rotation.rem_euclid(180) == 90 { [h, w] } else { [w, h] }
+    }
 }
 
 /// What a source is.
@@ -62,7 +70,7 @@ pub struct Info {
     pub time_base: Option<f64>,
     /// Seconds.
     pub duration: Option<f64>,
-    /// Frames, where the file tells.
+    /// Frames, where the file states them.
     pub frames: Option<usize>,
     /// The codec, as ffmpeg names it.
     pub codec: String,

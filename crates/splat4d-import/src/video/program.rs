@@ -18,7 +18,7 @@ const FPS_MODE_SINCE: (u32, u32) = (5, 1);
 const OLDEST: (u32, u32) = (4, 3);
 /// Complaints of a program that are remembered: the first ones.
 const COMPLAINTS: usize = 8;
-/// Words of a complaint that concerns nobody.
+/// Words of a complaint that can be ignored.
 const MUXER: &str = "dts to muxer";
 /// Characters of a complaint that are repeated.
 const COMPLAINT_LENGTH: usize = 300;
@@ -76,7 +76,7 @@ impl Tools {
         out.is_ok_and(|out| String::from_utf8_lossy(&out.stdout).lines().any(named))
     }
 
-    /// What ffprobe tells of a file, as JSON. Errors: nothing that it knows, damage.
+    /// What ffprobe reports of a file, as JSON. Errors: nothing that it knows, damage.
     pub(super) fn probe(&self, path: &Path) -> Result<String> {
         let mut command = Command::new(&self.ffprobe);
         command.args([
@@ -188,7 +188,7 @@ impl Said {
     }
 }
 
-/// Which of the two places in the chain of filters tells a time: all frames, or those that are kept.
+/// Which of the two places in the chain of filters printed a time: all frames, or those that are kept.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Stamp {
     All,
@@ -275,7 +275,7 @@ pub(super) fn ratio(text: &str) -> Option<f64> {
     (value.is_finite() && value > 0.0).then_some(value)
 }
 
-/// A complaint for people: without addresses, marks and the file's name, which is told anyway.
+/// A complaint for people: without addresses, marks and the file's name, which is printed anyway.
 fn plain(line: &str, path: &Path) -> String {
     let mut text = line.trim();
     // "[mov,mp4 @ 0x55d5] [error] moov atom not found"

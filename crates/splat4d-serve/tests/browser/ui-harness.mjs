@@ -10,12 +10,18 @@ const HERE = dirname(fileURLToPath(import.meta.url));
 const PLAYER = join(HERE, '../../player');
 const TYPES = { js: 'text/javascript', html: 'text/html', json: 'application/json' };
 
+/** One pixel. */
+const PNG = Buffer.from('iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg==', 'base64');
+
 /** Serves `/` and the player; `pages` are further routes {path: html}; `config` is /config.json. */
 export class Site {
   config = { title: 'Two knights', scene: 'scene.s4d', live: false };
   pages = {};
   listeners = new Set();
   joined = 0;
+  /** Requests for images, and for control of a run. */
+  photos = [];
+  controlled = [];
   mocks = true;
 
   async start(port = 0) {
@@ -33,6 +39,8 @@ export class Site {
     // What every browser asks for unasked.
     if (path === '/favicon.ico') return response.writeHead(204).end();
     if (path === '/events') return this.#listen(response);
+    if (path === '/photo') return this.#photo(new URL(request.url, this.url).searchParams, response);
+    if (path === '/control') return this.#control(request, response);
     const name = path === '/' ? 'index.html' : path.replace(/^\/(player\/)?/, '');
     for (const folder of this.mocks ? [join(HERE, 'mock'), PLAYER] : [PLAYER]) {
       const text = /^[\w.-]+$/.test(name) && await readFile(join(folder, name)).catch(() => null);
@@ -43,6 +51,20 @@ export class Site {
 
   #send(response, body, type) {
     response.writeHead(200, { 'content-type': TYPES[type] ?? 'text/plain', 'cache-control': 'no-store' }).end(body);
+  }
+
+  /** An image per camera; its time is that of the nearest tenth of a second. */
+  #photo(asked, response) {
+    this.photos.push(Object.fromEntries(asked));
+    const time = Math.round(10 * asked.get('t')) / 10;
+    response.writeHead(200, { 'content-type': 'image/png', 'x-splat4d-time': time }).end(PNG);
+  }
+
+  async #control(request, response) {
+    let body = '';
+    for await (const part of request) body += part;
+    this.controlled.push({ ...JSON.parse(body), token: request.headers['x-splat4d-token'] });
+    this.#send(response, JSON.stringify({ state: { pause: 'pausing', continue: 'training', stop: 'stopping' }[JSON.parse(body).do] }), 'json');
   }
 
   #listen(response) {

@@ -255,7 +255,7 @@ fn check_errors(points: &[Point], warnings: &mut Vec<String>) {
 }
 
 /// The points of a COLMAP model that lies next to `marker`, whose frames are `frames`: in their world, if the cameras
-/// agree. What came of it is told.
+/// agree. The result is reported.
 pub(super) fn points_beside(
     root: &Path,
     marker: &Path,

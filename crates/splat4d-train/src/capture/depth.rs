@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 /// Lengths from here on are no depth: renderers write 10¹⁰ or infinity where nothing is hit.
 const NOWHERE: f32 = 1e9;
 /// Pixels of a box of which one is made belong to one surface if their values are within this share of the largest: the
-/// mean over an edge is nobody's depth (docs of scene flow: bilinear samples within 5 %).
+/// mean over an edge is the depth of neither side (docs of scene flow: bilinear samples within 5 %).
 const ONE_SURFACE: f32 = 0.05;
 
 /// What the numbers of a depth map are.
@@ -43,7 +43,7 @@ pub struct DepthFile {
     pub path: PathBuf,
     /// Scene units a stored number; no matter but for metric ones.
     pub scale: f64,
-    /// What it tells.
+    /// Its kind.
     pub kind: DepthKind,
 }
 
@@ -182,7 +182,7 @@ fn check(map: &Map, file: &DepthFile) -> Result<()> {
 }
 
 /// At the size of the image's pinhole view, each pixel as the nearest one of the map: means across an edge are
-/// nobody's.
+/// of neither side.
 /// Undistortion keeps rays, and so z.
 fn straighten(map: &Map, camera: &Camera) -> Vec<f32> {
     let (lens, k) = (Distortion::new(camera.lens), &camera.intrinsics);

@@ -1,7 +1,7 @@
-//! Images of features on disk: `.npy` [height, width, channels], numbers that a network (or anything else) tells of a
+//! Images of features on disk: `.npy` [height, width, channels], numbers that a network (or anything else) assigns to a
 //! image's pixels, at the image's size or coarser.
 //!
-//! A pixel whose channels are all 0 is one that nobody knows.
+//! A pixel whose channels are all 0 is unknown.
 
 use super::json;
 use super::lens::Distortion;

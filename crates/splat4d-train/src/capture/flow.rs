@@ -177,7 +177,7 @@ fn decode_picture(path: &Path, camera: &Camera) -> Result<Vec<Code>> {
 }
 
 /// From the distorted images of both frames to their pinhole views. The vector is that of the nearest pixel: means of
-/// vectors across an edge are nobody's.
+/// vectors across an edge belong to neither side.
 fn straighten(codes: Vec<Code>, from: &Camera, to: &Camera) -> Vec<Code> {
     let lenses = [from, to].map(|c| Distortion::new(c.lens));
     if lenses.iter().all(Distortion::is_pinhole) {

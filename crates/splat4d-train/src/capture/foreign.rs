@@ -29,7 +29,7 @@ struct Export {
     read: fn(&Path, &Path, &CaptureOptions) -> Result<Take>,
 }
 
-/// In the order in which they are looked for: those that are told by their content come last.
+/// In the order in which they are looked for: those that are recognized by their content come last.
 const EXPORTS: [Export; 4] = [polycam::EXPORT, record3d::EXPORT, metashape::EXPORT, realityscan::EXPORT];
 
 /// Reads the export in a folder, or that a file is. `None`: it is none.

@@ -1,6 +1,6 @@
 //! Label masks on disk: grey images of 8 or 16 bits whose values number the capture's labels.
 //!
-//! The largest value of the depth (255 or 65535) stands for what nobody labelled.
+//! The largest value of the depth (255 or 65535) stands for what is not labelled.
 
 use super::lens::Distortion;
 use super::picture::{self, Samples};

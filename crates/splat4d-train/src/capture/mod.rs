@@ -85,7 +85,7 @@ use std::sync::Arc;
 pub enum CaptureKind {
     /// Our own `capture.json`.
     Own,
-    /// `transforms_{train,val,test}.json`: D-NeRF, Blender and whoever writes like them.
+    /// `transforms_{train,val,test}.json`: D-NeRF, Blender and programs that write like them.
     DNerf,
     /// PanopticSports `train_meta.json` and `test_meta.json`.
     Panoptic,

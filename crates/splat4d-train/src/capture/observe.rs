@@ -11,7 +11,7 @@ impl Capture {
     /// [`future`](Self::future), whatever its purpose was. `near`: as [`CaptureOptions::near`](super::CaptureOptions).
     ///
     /// A frame is observed where its time is at most first + share · (last − first) of the training and held-out frames.
-    /// With later images go what tells of them: initial points with later times, and optical flow into the future. A
+    /// With later images go what belongs to them: initial points with later times, and optical flow into the future. A
     /// capture's own points without times are taken at their word. Errors: one moment, a share that leaves nothing.
     pub fn observe(&mut self, share: f64, near: f64) -> Result<()> {
         let place = |e: Error| e.at(format!("{} (capture.observe = {share})", self.root.display()));

@@ -1,4 +1,4 @@
-//! Cameras of a reconstruction without its images: for whoever has other images of the same rig.
+//! Cameras of a reconstruction without its images: for other images of the same rig.
 
 use super::json::{self, Node};
 use super::transforms::posed_frames;

@@ -37,7 +37,7 @@ const REACH_DEGREES: [f64; 2] = [5.0, 15.0];
 /// Of the nearest and of the farthest training camera's distance: nearer than half of it a pixel shows what no image
 /// did.
 const REACH_DISTANCE: [f64; 2] = [0.5, 2.0];
-/// Training views that the reach is told by, at most, evenly chosen.
+/// Training views that determine the reach, at most, evenly chosen.
 const REACH_VIEWS: usize = 200;
 
 /// How far from the training cameras new views will hold: a rule, not a measurement.

@@ -42,7 +42,7 @@ const CAMERA_WORDS: [&str; 2] = ["cam", "camera"];
 /// been registered.
 const EVEN: f64 = 0.5;
 
-/// Finds cameras and frame numbers of images without times. What was assumed and how to say otherwise is told.
+/// Finds cameras and frame numbers of images without times. Assumptions, and how to override them, are reported.
 pub(super) fn order(
     names: &[&str],
     poses: &[Se3],

@@ -145,7 +145,7 @@ impl<S: Copy + Into<f32>> Pass for Convert<'_, S> {
 }
 
 impl std::fmt::Debug for StoredPicture {
-    /// Size and kind; millions of samples help nobody.
+    /// Size and kind; not the millions of samples.
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let (mask, valid) = (self.mask.is_some(), self.valid.is_some());
         let (depth, flow) = (self.depth.is_some(), self.flow.is_some());

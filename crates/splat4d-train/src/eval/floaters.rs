@@ -1,4 +1,4 @@
-//! Floaters: Gaussians that hang before few cameras. They are told by what their removal does to every image.
+//! Floaters: Gaussians that hang before few cameras. They are recognized by what their removal does to every image.
 //!
 //! With L = Σ over pixels and channels of (I − T)² between render I and truth T, and r_i the part of the render that is lost
 //! without Gaussian i, removing it alone changes L by

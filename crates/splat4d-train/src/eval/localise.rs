@@ -56,7 +56,7 @@ pub struct Question {
     pub lens: bool,
 }
 
-/// Where an image was taken, as far as the scene tells.
+/// Where an image was taken, as far as the scene determines it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Located {
     /// From where, with the image's size.

@@ -19,7 +19,7 @@ const TAPS: usize = 11;
 const SIGMA: f64 = 1.5;
 const C1: f64 = 1e-4;
 const C2: f64 = 9e-4;
-/// 8-bit steps in `[0,1]`: flicker is told in these.
+/// 8-bit steps in `[0,1]`: the unit of flicker.
 const LEVELS: f64 = 255.0;
 
 fn assert_same(render: &Planes<f32>, truth: &Planes<f32>) {

@@ -416,7 +416,7 @@ struct Drawn {
     sums: ColourSums,
 }
 
-/// Fits a camera's colours over all its views (`sums`, one a place), and tells `PSNR-cc` of each of them.
+/// Fits a camera's colours over all its views (`sums`, one a place), and sets `PSNR-cc` of each of them.
 fn correct_colours(name: &str, places: &[usize], sums: &[ColourSums], views: &mut [Option<View>]) -> CameraScores {
     let mut all = ColourSums::default();
     sums.iter().for_each(|view| all.add(view));

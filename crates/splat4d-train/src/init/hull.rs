@@ -159,7 +159,7 @@ struct Silhouette<'a> {
     color: &'a (dyn Fn(usize) -> [f32; 3] + Sync),
 }
 
-/// Tells every camera's silhouette, one after the other.
+/// Adds every camera's silhouette, one after the other.
 type Shown<'a> = dyn Fn(&mut dyn FnMut(Silhouette<'_>)) -> Result<()> + 'a;
 
 /// Those of all cameras.

@@ -31,7 +31,7 @@ pub struct Seeds {
     pub colors: Vec<[f32; 3]>,
     /// When the point was seen, seconds; `None`: during the whole clip.
     pub times: Vec<Option<f64>>,
-    /// How fast it moves, scene units a second; zero where nobody knows.
+    /// How fast it moves, scene units a second; zero where unknown.
     pub velocities: Vec<[f64; 3]>,
     /// Width of the lives of points with a time, seconds; `None`: the recipe's.
     pub life: Option<f64>,

@@ -16,7 +16,7 @@ const ONE_SURFACE: f64 = 0.05;
 const NEAREST: usize = 9;
 
 /// Velocities of pixels of an image, scene units a second, axes of the world; zero where no neighbour of the image
-/// tells any. A pixel that flow does not know takes those of the nearest that it does.
+/// has any. A pixel without flow takes those of the nearest that it does.
 pub(super) fn velocities(frames: &dyn Frames, map: &Map, pixels: &[usize]) -> Result<Vec<[f64; 3]>> {
     let mut picture = Picture::default();
     Map::load(frames, map.frame, &mut picture)?;

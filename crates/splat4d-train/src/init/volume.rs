@@ -53,7 +53,7 @@ pub(crate) fn common(frames: &dyn Frames) -> Volume {
 /// Cameras that are asked whether they see a candidate.
 const ASKED: usize = 100;
 /// A random point must be seen by this share of the cameras that see the best seen one: what only few see is hardly
-/// learnt, and hangs as haze before the views that nobody trained on.
+/// learnt, and hangs as haze in front of views that were not trained on.
 const SEEN_SHARE: f64 = 0.25;
 /// Candidates a wanted point, at most.
 const CANDIDATES: usize = 32;

@@ -111,7 +111,7 @@ pub(crate) struct StepGrads<'a> {
     pub d_times: &'a [f64],
 }
 
-/// Gradients to what is learnt: the number of a row and what is told of it.
+/// Gradients to what is learnt: the number of a row and its gradient.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Gradients {
     /// To twists, by row.
@@ -362,7 +362,7 @@ impl Corrections {
         }
     }
 
-    /// What was learnt, a row for every camera (or image of a moving one), as plain data. `name` tells of a frame: its
+    /// What was learnt, a row for every camera (or image of a moving one), as plain data. `name` returns of a frame: its
     /// camera's name, and its number where that camera moves.
     pub(crate) fn report(&self, name: &dyn Fn(usize) -> (String, Option<usize>)) -> Value {
         let row = |(row, (_, frame)): (usize, &(Se3, usize))| {

@@ -56,7 +56,7 @@ pub trait ProbeLoss<F: Real>: Send + Sync {
 pub enum KeptLoss {
     /// Means over the rows that are active.
     Rows(RowWeights),
-    /// Ties of poses, which [`ParamLoss::ties`] tells.
+    /// Ties of poses, from [`ParamLoss::ties`].
     Ties,
 }
 

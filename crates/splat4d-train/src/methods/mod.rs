@@ -268,7 +268,7 @@ impl Stage {
         (self.sh_from + step).checked_div(self.sh_interval).map_or(most, |unlocked| unlocked.min(most))
     }
 
-    /// Tells every loss that rows were edited.
+    /// Notifies every loss that rows were edited.
     pub(crate) fn on_edit(&self) {
         self.params.iter().for_each(|l| l.on_edit());
         self.probes.iter().for_each(|l| l.on_edit());

@@ -61,7 +61,7 @@ impl Noise {
     }
 }
 
-/// The logit of the opacity from which on the gate is below the least one: most Gaussians are told by one number.
+/// The logit of the opacity from which on the gate is below the least one: one comparison decides for most Gaussians.
 fn limit(min_opacity: f64) -> f32 {
     let opaque = min_opacity + (1.0 / LEAST_GATE - 1.0).ln() / NOISE_SLOPE;
     if opaque < 1.0 { (opaque / (1.0 - opaque)).ln() as f32 } else { f32::INFINITY }

@@ -42,7 +42,7 @@ pub struct Standing {
     pub host: String,
     /// UTC.
     pub since: String,
-    /// What tells the machine, as long as it has been running, from all others; empty where the system does not say.
+    /// An identifier of the machine as long as it runs; empty where the system does not say.
     machine: String,
     /// Heartbeats so far, always as many digits, so that the record never changes its length.
     beat: String,
@@ -167,7 +167,7 @@ impl Owner {
         }
     }
 
-    /// Gives the folder back and removes all that says that it was ever owned: while the lock is held, so that nobody else has it.
+    /// Gives the folder back and removes all that says that it was ever owned: while the lock is held, so that no other process has it.
     pub(super) fn remove(mut self, folder: &Path) {
         self.rest();
         discard(&folder.join(STATE));
@@ -278,7 +278,7 @@ fn lives(state: &Path, record: &Path, before: &Standing, patience: Patience) -> 
     false
 }
 
-/// How long ago, or how far in the future, a file was last written; `None`: nobody can say.
+/// How long ago, or how far in the future, a file was last written; `None`: unknown.
 fn age(path: &Path, now: SystemTime) -> Option<Duration> {
     let written = std::fs::metadata(path).and_then(|m| m.modified()).ok()?;
     Some(now.duration_since(written).unwrap_or_else(|future| future.duration()))
@@ -298,7 +298,7 @@ fn host() -> String {
     name.map_or_else(|| "this machine".into(), |n| n.trim().to_owned())
 }
 
-/// What tells this machine, as long as it runs, from others: Linux' boot id, which containers share with their host as they
+/// An identifier of this machine, as long as it runs: Linux' boot id, which containers share with their host as they
 /// share its locks.
 fn machine() -> String {
     let id = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();

@@ -32,7 +32,7 @@ pub(super) fn temporary_name(name: &OsStr) -> OsString {
     out
 }
 
-/// Whether this is the temporary name of a file that nobody writes any more.
+/// Whether this is the temporary name of a file that is no longer being written.
 fn is_left_over(path: &Path) -> bool {
     let Some(name) = path.file_name().map(OsStr::to_string_lossy) else { return false };
     let Some(name) = name.strip_prefix('.').and_then(|n| n.strip_suffix(ENDING)) else { return false };
@@ -71,7 +71,7 @@ pub(super) fn is_temporary(name: &OsStr) -> bool {
     name.as_encoded_bytes().ends_with(ENDING.as_bytes())
 }
 
-/// Tells processes of this machine, as long as it runs, from those of others: Linux' boot id and space of process numbers.
+/// Distinguishes processes of this machine, as long as it runs, from those of others: Linux' boot id and space of process numbers.
 pub(super) fn machine() -> String {
     const OFFSET: u64 = 0xcbf2_9ce4_8422_2325;
     const PRIME: u64 = 0x0000_0100_0000_01b3;

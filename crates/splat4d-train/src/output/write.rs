@@ -1,4 +1,4 @@
-//! Writes files so that nobody ever finds half of one: under a temporary name in the same folder, then renamed.
+//! Writes files so that no reader ever finds half of one: under a temporary name in the same folder, then renamed.
 
 use super::owner::check_free;
 use super::temporary::{remove_leftovers_once, temporary_name};

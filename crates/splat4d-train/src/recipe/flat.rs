@@ -1,4 +1,4 @@
-//! Names of settings without a table: those of before recipes had tables, which old files, documents and
+//! Names of settings without a table: those from before recipes had tables, which old files, documents and
 //! fingerprints have.
 
 /// Each with the key that it has now, in the order of then.

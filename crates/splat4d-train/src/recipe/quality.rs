@@ -10,7 +10,7 @@ pub enum Quality {
     Draft,
     /// The default recipe.
     Standard,
-    /// What a long run is worth: many steps and Gaussians.
+    /// For long runs: many steps and Gaussians.
     Best,
 }
 

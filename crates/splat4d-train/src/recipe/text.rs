@@ -152,7 +152,7 @@ impl Recipe {
         Ok(())
     }
 
-    /// The recipe in the names and the order of before it had tables, byte for byte: what checkpoints know it by, so that
+    /// The recipe in the names and the order that it had before it had tables, byte for byte: what checkpoints know it by, so that
     /// runs of then go on. Settings that came later count where they are not at their default.
     pub fn flat_toml(&self) -> String {
         let mut text: String =

@@ -1,4 +1,4 @@
-//! `refined.json`: what a run has learnt of its capture's cameras, so that whoever measures the scene looks at it from there.
+//! `refined.json`: what a run has learnt of its capture's cameras, so that measurements of the scene use them.
 
 use super::checkpoint::write_atomically;
 use crate::capture::Capture;

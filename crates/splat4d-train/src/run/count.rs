@@ -140,7 +140,7 @@ fn fewest(scale: f64) -> usize {
     ((scale * LEAST as f64) as usize).max(1)
 }
 
-/// To thousands where it is large: nobody needs to read the digits behind them.
+/// To thousands where it is large: smaller digits do not matter.
 fn rounded(count: f64) -> usize {
     if count >= 10_000.0 { 1000 * (count / 1000.0) as usize } else { count as usize }
 }

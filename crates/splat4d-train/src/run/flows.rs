@@ -69,7 +69,7 @@ pub(crate) fn with_found(mut capture: Capture, recipe: &Recipe, run: &Path) -> C
     capture
 }
 
-/// Training frames without flow, each with where its own is kept; none where nobody asks for it.
+/// Training frames without flow, each with where its own is kept; none where it is not needed.
 fn wanted(capture: &Capture, recipe: &Recipe, run: &Path) -> Vec<(usize, FlowFile)> {
     if recipe.loss.flow == 0.0 || recipe.capture.flow != FlowSource::Own {
         return Vec::new();

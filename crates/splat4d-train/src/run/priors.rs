@@ -14,11 +14,11 @@ use std::sync::Arc;
 
 /// Frames that are looked at, evenly chosen.
 const LOOKED_AT: usize = 8;
-/// Flow shorter than this tells nothing of its direction, pixels.
+/// Flow shorter than this has no reliable direction, pixels.
 const SHORT: f32 = 1.0;
-/// Points from which on a map tells something.
+/// Fewest points with which a map is evaluated.
 const FEW: usize = 20;
-/// Pixels from which on an image tells something.
+/// Fewest pixels with which an image is evaluated.
 const ENOUGH: usize = 200;
 /// Another reading of flow is the right one if it leaves less than this share of the difference between images.
 const CLEARLY: f64 = 0.7;
@@ -31,7 +31,7 @@ const VISIBLE: f64 = 0.3;
 /// Depths whose closest ratios to the points are spread by more than this either way (logarithm) are not theirs, at whatever
 /// scale: noise of a quarter of the depth does as much, and single-image networks have less.
 const FOREIGN: f64 = 0.1;
-/// Share of the points that stand before what a metric map shows, by more than [`METRIC_OFF`], from which on it is told: what is before
+/// Share of the points that stand before what a metric map shows, by more than [`METRIC_OFF`], from which on it is reported: what is before
 /// a point hides it, and what it is itself nothing can be before.
 const BEFORE: f64 = 0.1;
 /// A metric map is believed while the scene is within this share of it (median); others while they correlate by this.
@@ -148,7 +148,7 @@ fn flow_reads(capture: &Capture, store: &ImageStore, frame: usize) -> Result<Opt
 /// How metric depth lies to the capture's points.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Depths {
-    /// They agree, or nobody can tell.
+    /// They agree, or cannot be compared.
     Fit,
     /// The points are so many times as far away, everywhere.
     Scaled(f64),

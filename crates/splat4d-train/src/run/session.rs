@@ -21,6 +21,7 @@ use crate::step::trainer::{Fault, Measured, Trainer};
 use crate::{Error, ErrorKind, Result};
 use serde_json::json;
 use splat4d::device::Device;
+use splat4d::render::Antialias;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -253,7 +254,8 @@ impl Session<'_> {
             listen(&Event::Warning { message: format!("training cannot be watched: {e}") });
         }
         let interval = self.snapshots.filter(|_| shown.is_ok());
-        let mut snapshots = interval.map(|interval| Snapshots::new(interval, &self.opened.capture));
+        let antialias = if self.recipe.appearance.antialias { Antialias::On } else { Antialias::Off };
+        let mut snapshots = interval.map(|interval| Snapshots::new(interval, &self.opened.capture, antialias));
         let (mut clock, mut told) = (self.clock.seconds(), Clock::now());
         // A run that was continued has a clock that began later than its first command.
         let lead = self.budget.filter(|_| first > 0).map_or(0.0, |b| b.before + state.seconds - clock);

@@ -1,15 +1,19 @@
-//! The scene while it learns, as a playback file: for whoever watches. It only reads, so that the result stays the same
+//! The scene while it learns, as a playback file: for the live view. It only reads, so that the result stays the same
 //! to the bit.
 
+use super::metrics::psnr;
 use crate::Result;
-use crate::capture::Capture;
+use crate::capture::{Capture, ImageStore};
 use crate::event::Event;
 use crate::step::trainer::Trainer;
 use splat4d::bake::{Options, bake};
+use splat4d::device;
 use splat4d::format::playback::{Draft, Meta, NamedCamera, Viewpoint, WriteConfig, write};
-use splat4d::layers::Scene;
+use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::se3::{dot, sub};
+use splat4d::render::{Antialias, Backend, Image, RenderConfig, Shot};
 use splat4d::scene::{Camera, time::DEFAULT_FPS};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// Training goes on for so many times as long as the last snapshot took: at most 2.5 % of the time.
@@ -20,6 +24,10 @@ const ROUNDS: usize = 1;
 const EFFORT: u32 = 1;
 /// Most cameras that a snapshot names and is measured by.
 const CAMERAS: usize = 64;
+/// Held-out views that are rendered for a snapshot's score: an even choice of all.
+const HELD_VIEWS: usize = 4;
+/// Memory for their decoded images, bytes.
+const HELD_MEMORY: usize = 64 << 20;
 /// Rows whose means tell where the middle of the scene is.
 const ROWS: usize = 1000;
 
@@ -30,11 +38,49 @@ pub(super) struct Snapshots {
     title: String,
     cameras: Vec<NamedCamera>,
     poses: Vec<Camera>,
+    held: Option<HeldOut>,
+}
+
+/// Held-out views that score a snapshot.
+struct HeldOut {
+    store: ImageStore,
+    frames: Vec<usize>,
+    backend: Box<dyn Backend>,
+}
+
+impl HeldOut {
+    /// `None`: no view is held out.
+    fn new(capture: &Arc<Capture>, antialias: Antialias) -> Option<Self> {
+        let n = capture.held.len();
+        let count = n.min(HELD_VIEWS);
+        let frames: Vec<usize> = (0..count).map(|i| capture.held[(2 * i + 1) * n / (2 * count)]).collect();
+        let backend = device::cpu(RenderConfig { antialias, ..RenderConfig::default() });
+        (count > 0).then(|| Self { store: ImageStore::new(capture.clone(), HELD_MEMORY), frames, backend })
+    }
+
+    /// Mean PSNR, dB, of the views whose images can be read.
+    fn score(&mut self, scene: &Scene<f32>) -> Option<f64> {
+        let (mut instant, mut image) = (Evaluation::default(), Image::default());
+        let mut scores = Vec::new();
+        for &frame in &self.frames {
+            let Ok(truth) = self.store.load(frame) else { continue };
+            let (truth, frame) = (truth.to_picture(), &self.store.capture().frames[frame]);
+            scene.at(frame.time, &mut instant);
+            let splats = scene.splats(&instant);
+            device::draw(&mut self.backend, &Shot::new(&splats, &frame.view, scene.background), &mut image);
+            scores.push(psnr(mean_square(
+                &image.color.data,
+                &truth.color.data,
+                truth.valid.as_ref().map(|v| &v.data[..]),
+            )));
+        }
+        (!scores.is_empty()).then(|| scores.iter().sum::<f64>() / scores.len() as f64)
+    }
 }
 
 impl Snapshots {
     /// The first one is due at once.
-    pub(super) fn new(interval: Duration, capture: &Capture) -> Self {
+    pub(super) fn new(interval: Duration, capture: &Arc<Capture>, antialias: Antialias) -> Self {
         let mut poses: Vec<(usize, Camera)> = Vec::new();
         for frame in capture.train.iter().map(|&i| &capture.frames[i]) {
             if poses.len() < CAMERAS && poses.iter().all(|(c, _)| *c != frame.camera) {
@@ -48,6 +94,7 @@ impl Snapshots {
             title: capture.name.clone(),
             cameras: poses.iter().map(named).collect(),
             poses: poses.into_iter().map(|p| p.1).collect(),
+            held: HeldOut::new(capture, antialias),
         }
     }
 
@@ -64,8 +111,12 @@ impl Snapshots {
     /// The snapshot, due or not.
     pub(super) fn now(&mut self, trainer: &Trainer<'_>) -> Event {
         let (started, iteration) = (Instant::now(), trainer.progress.iteration);
-        let event = match self.bytes(&trainer.shown()) {
-            Ok(bytes) => Event::Snapshot { iteration, bytes: bytes.into() },
+        let scene = trainer.shown();
+        let event = match self.bytes(&scene) {
+            Ok(bytes) => {
+                let held_out = self.held.as_mut().and_then(|held| held.score(&scene));
+                Event::Snapshot { iteration, bytes: bytes.into(), held_out }
+            }
             Err(e) => Event::Warning { message: format!("step {iteration} cannot be shown: {e}") },
         };
         self.due = Instant::now() + self.interval.max(started.elapsed() * REST);
@@ -101,6 +152,15 @@ impl Snapshots {
         write(&Draft { meta, nodes: baked.nodes, poster: None }, &config, &mut bytes)?;
         Ok(bytes)
     }
+}
+
+/// The mean squared difference of two images [3, height, width], of the pixels that the lens recorded in full.
+fn mean_square(a: &[f32], b: &[f32], valid: Option<&[f32]>) -> f64 {
+    let pixels = a.len() / 3;
+    let counts = |i: usize| valid.is_none_or(|v| v[i % pixels] >= 1.0);
+    let squares = (0..a.len()).filter(|&i| counts(i)).map(|i| f64::from(a[i] - b[i]).powi(2));
+    let (sum, n) = squares.fold((0.0, 0usize), |(sum, n), s| (sum + s, n + 1));
+    sum / n.max(1) as f64
 }
 
 /// The camera's viewpoint, with the depth of the scene's middle as the distance of its target.

@@ -589,19 +589,22 @@ fn exposure_is_learned_for_rigs_and_for_one_camera_only_if_set() {
 #[test]
 fn who_watches_changes_nothing() {
     let place = Place::new();
-    let base = recipe(&[]);
+    let base = recipe(&["hold_out=camera=0"]);
     place.train("alone", &base).unwrap();
     let run = place.run("watched");
     let options = TrainOptions { snapshots: Some(Duration::ZERO), ..TrainOptions::default() };
-    let mut seen = Vec::new();
+    let (mut seen, mut scores) = (Vec::new(), Vec::new());
     let mut listen = |event: &Event| {
-        if let Event::Snapshot { iteration, bytes } = event {
+        if let Event::Snapshot { iteration, bytes, held_out } = event {
             seen.push((*iteration, bytes.clone()));
+            scores.extend(*held_out);
         }
     };
     train(place.open(&base), base.clone(), &run, &options, &AtomicBool::new(false), &mut listen).unwrap();
     assert!(place.scene("alone") == place.scene("watched"), "snapshots must not change a bit of the result");
     assert!(seen.len() >= 2 && seen[0].0 == 1 && seen.last().unwrap().0 == STEPS, "the first and the last are shown");
+    assert_eq!(scores.len(), seen.len(), "every snapshot has a held-out score");
+    assert!(scores.iter().all(|db| db.is_finite()) && scores.last() > scores.first(), "{scores:?}");
     let last = splat4d::format::playback::read(&seen.last().unwrap().1).unwrap();
     let learnt = splat4d::format::scene::read(&place.scene("watched")).unwrap();
     assert!(last.len() * 10 > learnt.len() * 9 && last.len() <= learnt.len(), "{} of {}", last.len(), learnt.len());

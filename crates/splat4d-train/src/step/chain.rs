@@ -106,7 +106,7 @@ impl<F: Real> Work<'_, F> {
 }
 
 impl<F: Real> Chain<F> {
-    /// One step: adds all gradients to `d` (one a layer, cleared by the caller). `observe` is told of every view.
+    /// One step: adds all gradients to `d` (one a layer, cleared by the caller). `observe` is called with every view.
     ///
     /// Errors: those of the backend.
     pub(crate) fn step(
@@ -303,7 +303,7 @@ impl<F: Real> Compared<F> {
         }
     }
 
-    /// Tells the observer what the view saw of every layer.
+    /// Passes to the observer what the view saw of every layer.
     fn tell(&self, evaluation: &Evaluation<F>, asked: &[usize], work: &mut Work<'_, F>) {
         let mut first = 0;
         for (layer, &i) in asked.iter().enumerate() {

@@ -25,7 +25,7 @@ const SIDE: usize = 160;
 /// A search looks no farther than this share of the clip: beyond its ends there is no scene to compare with.
 const FARTHEST: f64 = 0.25;
 
-/// The images that clocks are told from, and what is known of their cameras.
+/// The images from which time offsets are found, and what is known of their cameras.
 #[derive(Clone, Copy)]
 pub(crate) struct Look<'a> {
     pub frames: &'a dyn Frames,

@@ -107,7 +107,7 @@ pub trait Engine: Send {
         Ok(Vec::new())
     }
 
-    /// Milliseconds of the stages of the last view that is done, where a device that takes whole steps tells them.
+    /// Milliseconds of the stages of the last view that is done, where a device that takes whole steps reports them.
     fn stages(&mut self) -> Vec<(&'static str, f64)> {
         Vec::new()
     }

@@ -74,7 +74,7 @@ impl<'a> DeviceEngine<'a> {
         }
     }
 
-    /// Tells once why the CPU keeps the tables of a device that could.
+    /// Reports once why the CPU keeps the tables of a device that could.
     fn tell(&mut self, why: &str, notices: &mut Vec<String>) {
         if !std::mem::replace(&mut self.told, true) {
             notices.push(format!("the CPU keeps the tables and steps: {why}"));

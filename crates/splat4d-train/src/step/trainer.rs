@@ -203,7 +203,7 @@ impl<'a> Trainer<'a> {
         self.spread();
     }
 
-    /// Tells those that remember something of the learner what was done to it, steps apart: the one place where that is
+    /// Notifies those that keep data of the learner of what was done to it, steps apart: the one place where that is
     /// known.
     fn spread(&mut self) {
         let touched = self.learner.take_touched();
@@ -227,7 +227,7 @@ impl<'a> Trainer<'a> {
     }
 
     /// Does what is due before the next step, through stages without steps. [`step`](Self::step) does so by itself, but
-    /// tells nobody.
+    /// notifies nothing.
     pub(crate) fn enter(&mut self, progress: &mut Progress<'_>) -> Result<()> {
         while !self.entered && !self.is_done() {
             if self.progress.stage_step == 0 {
@@ -345,7 +345,7 @@ impl<'a> Trainer<'a> {
         self.engine.changed(&self.learner);
     }
 
-    /// Milliseconds of the stages of the last view that is done, where a device that takes whole steps tells them.
+    /// Milliseconds of the stages of the last view that is done, where a device that takes whole steps reports them.
     pub fn stages(&mut self) -> Vec<(&'static str, f64)> {
         self.engine.stages()
     }
@@ -438,7 +438,7 @@ impl<'a> Trainer<'a> {
     }
 
     /// Runs the operations of `which` that are due after any of these steps of the stage's schedule, once each and where
-    /// they are due last, and tells losses what they did.
+    /// they are due last, and notifies losses of what they did.
     fn keep_up(&mut self, passed: RangeInclusive<usize>, which: impl Fn(&dyn Upkeep) -> bool) -> Result<Change> {
         let Stage { upkeep, groups, iterations, .. } = &mut self.stages[self.progress.stage];
         let at = |step| At { step, steps: *iterations };

@@ -156,7 +156,7 @@ pub enum Order {
     Grow,
     /// Rows are put in order.
     Sort,
-    /// Removal of what is worth little.
+    /// Removal of what has little importance.
     Remove,
     /// Merging of what stands in one place.
     Merge,

@@ -27,7 +27,7 @@ const WINDOW: usize = SIDE * SIDE;
 const NEIGHBOURS: usize = 4;
 /// A window whose grey values spread less than this (standard deviation, in [0, 1]) looks the same everywhere.
 const TEXTURE: f32 = 0.012;
-/// Least correlation of a window after tilting, and of one that is worth tilting.
+/// Least correlation of a window after tilting, and of one that is tilted.
 const ALIKE: f32 = 0.8;
 const HOPEFUL: f32 = 0.6;
 /// 1 - correlation at the best depth must be this much less than anywhere else.
@@ -373,7 +373,7 @@ fn correlation(window: &Window, other: &Other<'_>, patch: Patch) -> Option<f32> 
     Some(window.values.iter().zip(&values).map(|(a, b)| a * b).sum())
 }
 
-/// What a neighbour at this angle is worth for measuring depth.
+/// The weight of a neighbour at this angle for measuring depth.
 fn angle_worth(degrees: f64) -> f64 {
     if !ANGLES.contains(&degrees) {
         return 0.0;

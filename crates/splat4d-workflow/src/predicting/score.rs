@@ -47,7 +47,7 @@ pub(super) struct Case {
     moving: Option<f64>,
 }
 
-/// What a model is worth, by its comparisons and those of freeze and constant velocity.
+/// The quality of a model, by its comparisons and those of freeze and constant velocity.
 pub(super) fn scores(name: &str, own: &[Case], baselines: [&Vec<Case>; 2], horizon: usize) -> ModelScores {
     let mean = |of: &dyn Fn(&Case) -> Option<f64>, at: Option<usize>| {
         let all: Vec<f64> = own.iter().filter(|c| at.is_none_or(|h| c.horizon == h)).filter_map(of).collect();

@@ -3,10 +3,13 @@
 use super::chart::{Series, escape, lines};
 use super::{document, pictures};
 use crate::comparing::{self, Entry, score_of};
+use crate::run_folder::ViewScore;
 use std::fmt::Write;
 
 /// Views that are shown: those in which the rows are worst.
 const VIEWS: usize = 6;
+/// Points of a curve.
+const CURVE_POINTS: usize = 80;
 
 /// The page.
 pub fn page(entries: &[Entry]) -> String {
@@ -41,8 +44,10 @@ fn table(out: &mut String, entries: &[Entry]) {
 
 fn curves(out: &mut String, entries: &[Entry]) {
     let of = |x: fn(&crate::run_folder::Metrics) -> f64| -> Vec<Series> {
-        let series =
-            |e: &Entry| Series { name: e.name.clone(), points: e.metrics.iter().map(|m| (x(m), m.psnr)).collect() };
+        let series = |e: &Entry| Series {
+            name: e.name.clone(),
+            points: smooth(&e.metrics.iter().map(|m| (x(m), m.psnr)).collect::<Vec<_>>()),
+        };
         entries.iter().map(series).filter(|s| !s.points.is_empty()).collect()
     };
     let by_step = lines(&of(|m| m.iteration), "step", "dB");
@@ -57,26 +62,31 @@ fn curves(out: &mut String, entries: &[Entry]) {
     out.push_str("</div>\n");
 }
 
-/// Files of the views that all rows have, the worst first.
-fn worst(entries: &[Entry]) -> Vec<String> {
+/// Views that all rows have, the worst of each camera first, by their mean PSNR.
+fn worst(entries: &[Entry]) -> Vec<ViewScore> {
     let Some(first) = entries.first() else { return Vec::new() };
     let score = |e: &Entry, file: &str| e.views.iter().find(|v| v.file == file).and_then(|v| v.psnr);
-    let mut all: Vec<(f64, String)> = first
-        .views
-        .iter()
-        .filter_map(|v| {
-            let scores: Option<Vec<f64>> = entries.iter().map(|e| score(e, &v.file)).collect();
-            Some((scores?.iter().sum::<f64>(), v.file.clone()))
-        })
-        .collect();
-    all.sort_by(|a, b| a.0.total_cmp(&b.0).then_with(|| a.1.cmp(&b.1)));
-    all.into_iter().take(VIEWS).map(|(_, file)| file).collect()
+    let shared = first.views.iter().filter_map(|v| {
+        let scores: Option<Vec<f64>> = entries.iter().map(|e| score(e, &v.file)).collect();
+        let mean = scores?.iter().sum::<f64>() / entries.len() as f64;
+        Some(ViewScore { psnr: Some(mean), ..v.clone() })
+    });
+    let shared: Vec<ViewScore> = shared.collect();
+    super::worst(&shared, VIEWS).into_iter().map(|i| shared[i].clone()).collect()
+}
+
+/// Means of as many points as a chart can tell apart: single steps jump from camera to camera.
+fn smooth(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
+    let stride = points.len().div_ceil(CURVE_POINTS).max(1);
+    let mean = |part: &[(f64, f64)], of: fn(&(f64, f64)) -> f64| part.iter().map(of).sum::<f64>() / part.len() as f64;
+    points.chunks(stride).map(|part| (mean(part, |p| p.0), mean(part, |p| p.1))).collect()
 }
 
 fn views(out: &mut String, entries: &[Entry]) {
     let mut shown = String::new();
-    for file in worst(entries) {
-        let place = |e: &Entry, kind: &str| pictures::inline(&e.pictures.as_ref()?.join(kind).join(&file));
+    for view in worst(entries) {
+        let file = &view.file;
+        let place = |e: &Entry, kind: &str| pictures::inline(&e.pictures.as_ref()?.join(kind).join(file));
         let truth = entries.iter().find_map(|e| place(e, "gt"));
         let renders: Vec<Option<String>> = entries.iter().map(|e| place(e, "renders")).collect();
         if renders.iter().all(Option::is_none) {
@@ -88,9 +98,9 @@ fn views(out: &mut String, entries: &[Entry]) {
             let image = picture.as_ref().map(|p| format!("<img alt=\"{caption}\" src=\"{p}\">"));
             let _ = write!(shown, "<figure>{}<figcaption>{caption}</figcaption></figure>", image.unwrap_or_default());
         };
-        figure(&truth, &format!("truth, {file}"));
+        figure(&truth, &format!("truth, {}", super::place(&view)));
         for (entry, render) in entries.iter().zip(&renders) {
-            let score = entry.views.iter().find(|v| v.file == file).and_then(|v| v.psnr);
+            let score = entry.views.iter().find(|v| v.file == *file).and_then(|v| v.psnr);
             let score = score.map(|p| format!(", {p:.2} dB")).unwrap_or_default();
             figure(render, &format!("{}{score}", entry.name));
         }

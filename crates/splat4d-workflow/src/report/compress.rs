@@ -130,7 +130,7 @@ fn guard(out: &mut String, told: &Compressed) {
     }
 }
 
-/// A line of the table: its name, how a side tells it, and how the change is told.
+/// A line of the table: its name, how a side prints it, and how the change is printed.
 type Line<'a> = (&'a str, &'a dyn Fn(&Side) -> Option<String>, Option<String>);
 
 fn sides(out: &mut String, told: &Compressed) {

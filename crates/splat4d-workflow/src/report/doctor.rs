@@ -1,12 +1,13 @@
 //! `doctor.html`: what is wrong with a capture, worst first, and every camera's image and figures.
 
 use super::chart::escape;
-use super::{STYLE, pictures};
+use super::{STYLE, pictures, rig_map};
 use crate::events::Listener;
 use crate::files;
 use image::RgbImage;
 use splat4d::Result;
-use splat4d_import::doctor::{Finding, Grade, Options, Report, examine};
+use splat4d::scene::Camera;
+use splat4d_import::doctor::{CameraReport, Finding, Grade, Options, Report, examine};
 use splat4d_train::capture::Capture;
 use splat4d_train::event::{Event, Progress};
 use std::fmt::Write;
@@ -19,7 +20,7 @@ pub fn made(capture: &Capture, folder: &Path, console: &dyn Listener) -> Result<
     console.clear();
     files::make_folder(folder)?;
     let html = folder.join("doctor.html");
-    files::write(&html, page(&report).as_bytes())?;
+    files::write(&html, page(&report, capture).as_bytes())?;
     files::write(&folder.join("doctor.json"), &serde_json::to_vec_pretty(&report).expect("a report is plain data"))?;
     Ok((report, html))
 }
@@ -29,14 +30,37 @@ pub fn sentence(f: &Finding) -> String {
     format!("{}: {} {} {}", word(f.grade), f.what, f.looks, f.remedy)
 }
 
+/// The worst grade of a camera's findings.
+fn worst(report: &Report, camera: &str) -> Option<Grade> {
+    let all = report.findings.iter().flat_map(|f| std::iter::once(f).chain(&f.alike));
+    all.filter(|f| f.camera.as_deref() == Some(camera)).map(|f| f.grade).max()
+}
+
+/// A number's limits, in words behind it.
+fn limits(field: &str, scale: f64, view: Option<&Camera>) -> String {
+    let Some(found) = view.and_then(|view| CameraReport::limits(field, view)) else { return String::new() };
+    // Two digits that count.
+    let [warning, bad] = found.map(|v| format!("{:.1e}", v * scale).parse::<f64>().unwrap_or(v));
+    let way = if bad < warning { "below" } else { "above" };
+    format!("warning {way} {warning}, bad {way} {bad}")
+}
+
 /// The page.
-fn page(report: &Report) -> String {
+fn page(report: &Report, capture: &Capture) -> String {
+    let map = rig_map::svg(capture, &|name| worst(report, name));
+    let view_of = |name: &str| {
+        let camera = capture.cameras.iter().position(|c| c.name == name)?;
+        capture.frames.iter().find(|f| f.camera == camera).map(|f| &f.view)
+    };
     let mut body = String::new();
     let _ = writeln!(body, "<header><h1>{}</h1><p>{}</p></header>", escape(&report.capture), escape(&summary(report)));
     for line in about(report) {
         let _ = writeln!(body, "<p>{}</p>", escape(&line));
     }
     body.push_str("<h2>Findings, worst first</h2>\n");
+    if report.findings.is_empty() {
+        body.push_str("<p>None.</p>\n");
+    }
     for f in &report.findings {
         let class = if f.grade == Grade::Note { "note" } else { "warn" };
         let _ = write!(body, "<div class=\"{class}\"><b>{}</b> {}", word(f.grade), escape(&f.what));
@@ -46,6 +70,13 @@ fn page(report: &Report) -> String {
             let _ = write!(body, "<br><b>{label}:</b> {}", escape(text));
         }
         body.push_str("</div>\n");
+    }
+    if !map.is_empty() {
+        let _ = writeln!(
+            body,
+            "<h2>Map of the cameras</h2>\n<p class=\"note\">From above; grey dots are points of the capture. Lines show where \
+             cameras look. Orange: a warning, red: bad.</p>\n<div class=\"panel\">{map}</div>"
+        );
     }
     if !report.leave_out.is_empty() {
         let _ = writeln!(body, "<h2>Leave out</h2>\n<p>{}</p>", escape(&report.leave_out.join(", ")));
@@ -61,7 +92,7 @@ fn page(report: &Report) -> String {
          those of an image of 1920 pixels.</p>\n<div class=\"grid3\">",
     );
     for camera in &report.cameras {
-        let p = &camera.picture;
+        let (p, view) = (&camera.picture, view_of(&camera.name));
         let picture = RgbImage::from_raw(p.width as u32, p.height as u32, p.data.clone()).filter(|p| p.width() > 0);
         let image = picture.and_then(pictures::reduced).map(|uri| {
             format!(
@@ -71,18 +102,31 @@ fn page(report: &Report) -> String {
         });
         let _ =
             write!(body, "<div class=\"panel\"><h3>{}</h3>{}<table>", escape(&camera.name), image.unwrap_or_default());
-        let mut row = |name: &str, value: Option<String>| {
+        let mut row = |name: &str, value: Option<String>, limits: String| {
             if let Some(value) = value {
-                let _ = write!(body, "<tr><th>{name}</th><td>{}</td></tr>", escape(&value));
+                let _ = write!(
+                    body,
+                    "<tr><th>{name}</th><td>{}<br><span class=\"note\">{}</span></td></tr>",
+                    escape(&value),
+                    escape(&limits)
+                );
             }
         };
-        row("pose error", camera.epipolar.map(|v| format!("{v:.2} px of 1920")));
-        row("time offset", camera.offset.map(|[v, s]| format!("{:+.1} ± {:.1} ms", 1e3 * v, 1e3 * s)));
-        row("exposure", camera.exposure.map(|e| e.map(|v| format!("{v:+.2}")).join(" ") + " stops"));
-        row("sharpness", camera.sharpness.map(|v| format!("{v:.2} times the others'")));
-        row("moved", camera.moved.map(|v| format!("{v:.2} px of 1920")));
-        row("focus, last to first", camera.focus.map(|v| format!("{v:.2}")));
-        row("first to last row", camera.shutter.map(|[v, s]| format!("{:+.1} ± {:.1} ms", 1e3 * v, 1e3 * s)));
+        row("pose error", camera.epipolar.map(|v| format!("{v:.2} px of 1920")), limits("epipolar", 1.0, view));
+        row("time offset", camera.offset.map(|[v, s]| format!("{:+.1} ± {:.1} ms", 1e3 * v, 1e3 * s)), String::new());
+        row(
+            "exposure",
+            camera.exposure.map(|e| e.map(|v| format!("{v:+.2}")).join(" ") + " stops"),
+            limits("exposure", 1.0, view),
+        );
+        row("sharpness", camera.sharpness.map(|v| format!("{v:.2} times the others'")), limits("sharpness", 1.0, view));
+        row("moved", camera.moved.map(|v| format!("{v:.2} px of 1920")), limits("moved", 1.0, view));
+        row("focus, last to first", camera.focus.map(|v| format!("{v:.2}")), limits("focus", 1.0, view));
+        row(
+            "first to last row",
+            camera.shutter.map(|[v, s]| format!("{:+.1} ± {:.1} ms", 1e3 * v, 1e3 * s)),
+            limits("shutter", 1e3, view),
+        );
         body.push_str("</table></div>\n");
     }
     body.push_str("</div>\n");
@@ -131,7 +175,7 @@ pub fn word(grade: Grade) -> &'static str {
     }
 }
 
-/// What else is worth knowing of the take, in sentences.
+/// Further facts of the capture, in sentences.
 pub fn about(report: &Report) -> Vec<String> {
     let mut out = Vec::new();
     if let Some(share) = report.seen_by_three {

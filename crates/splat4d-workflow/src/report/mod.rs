@@ -9,6 +9,7 @@ pub mod doctor;
 mod pictures;
 pub mod predict;
 mod refined;
+mod rig_map;
 
 use crate::files::{self, grouped, human_bytes, human_seconds};
 use crate::run_folder::{Beside, Metrics, Run, ViewScore, beside};
@@ -172,6 +173,15 @@ fn film(out: &mut String, run: &Run) {
     }
 }
 
+/// Camera and time of a view, or its file.
+fn place(view: &ViewScore) -> String {
+    match (&view.camera, view.time) {
+        (Some(camera), Some(time)) => format!("camera {camera}, {time:.2} s"),
+        (Some(camera), None) => format!("camera {camera}"),
+        _ => view.file.clone(),
+    }
+}
+
 fn views(out: &mut String, run: &Run) {
     let Some(folder) = run.pictures() else { return };
     let mut shown = String::new();
@@ -186,11 +196,7 @@ fn views(out: &mut String, run: &Run) {
             continue;
         }
         shown.push_str("<div class=\"view\">");
-        let place = match (&view.camera, view.time) {
-            (Some(camera), Some(time)) => format!("camera {camera}, {time:.2} s"),
-            (Some(camera), None) => format!("camera {camera}"),
-            _ => view.file.clone(),
-        };
+        let place = place(view);
         let score = view.psnr.map(|p| format!("render, {p:.2} dB")).unwrap_or_else(|| "render".into());
         let captions = [("gt", format!("truth, {place}")), ("renders", score), ("errors", "error".into())];
         for (picture, (kind, caption)) in pictures.iter().zip(captions) {

@@ -15,7 +15,7 @@ use crate::math::sym3;
 
 /// Prices of the ladder.
 pub(super) const PRICES: usize = 32;
-/// The lowest price, mean squared error of an image over the clip, and the factor from price to price: from what nobody
+/// The lowest price, mean squared error of an image over the clip, and the factor from price to price: from what is not
 /// could see of a million segments to more than one Gaussian can be worth.
 const LOWEST: f64 = 1e-14;
 const FACTOR: f64 = 2.5;

@@ -454,7 +454,7 @@ fn renders_that_weigh_errors_are_bounded() {
     }
 }
 
-/// The curve tells of what is baked.
+/// The curve predicts what is baked.
 #[test]
 fn the_curve_says_how_many_segments_which_error_costs() {
     let scene = scene(vec![layer(&spacetime(3, true), LifeKind::GaussHalf, 120, 0.4, 1.9)], 1.9);

@@ -35,7 +35,7 @@ const PIXELS: f64 = 1920.0 * 1080.0;
 const CHANNELS: f64 = 3.0;
 /// Places of the mean's block in the upper triangle of a 6x6 matrix, as (xx, xy, xz, yy, yz, zz).
 const MEAN_BLOCK: [usize; 6] = [0, 1, 2, 6, 7, 11];
-/// A Gaussian fainter than this tells nothing of how strongly images react to it.
+/// Gaussians fainter than this are left out when the reaction of images is measured.
 const FAINT: f64 = 0.02;
 
 /// Sums over renders for one Gaussian, each divided by its squared opacity there.

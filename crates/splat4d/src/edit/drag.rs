@@ -264,7 +264,7 @@ impl Dragging {
         Ok(out)
     }
 
-    /// Where the nodes are meant: what handles and pins take is told by these.
+    /// Where the nodes are meant: they define what handles and pins take.
     pub fn places(&self) -> &[[f64; 3]] {
         &self.places
     }

@@ -86,7 +86,7 @@ impl Looks {
         Self(scene.layers.iter().map(of).collect())
     }
 
-    /// One look at everybody who is alive at t.
+    /// One sample of all Gaussians alive at t.
     fn at(scene: &Scene<f32>, expr: &Expr, t: f64) -> Self {
         let of = |layer: &Layer<f32>| {
             let mut ids = Vec::new();
@@ -226,6 +226,10 @@ fn evaluate(expr: &Expr, scene: &Scene<f32>, looks: &Looks, context: &dyn Contex
         Expr::Lasso(lasso) => {
             let turn = lasso.cam_from_world();
             places(&|x| lasso.holds(&turn, x))
+        }
+        Expr::Visible(surface) => {
+            let turn = surface.cam_from_world();
+            places(&|x| surface.holds(&turn, x))
         }
         Expr::Frustum(name, [near, far]) => {
             let camera = context.camera(name)?;

@@ -16,7 +16,7 @@ mod tests;
 
 pub use drag::{DragHandle, DragKey, Dragging};
 pub use look::{Selected, mask_fits, select};
-pub use select::{Expr, Lasso, within};
+pub use select::{Expr, Lasso, Surface, within};
 
 use crate::layers::Scene;
 use crate::motion::edited::FadeKey;
@@ -200,7 +200,7 @@ pub enum Step {
     },
     /// Another scene next to this one.
     Merge {
-        /// File, as whoever reads the edits finds it.
+        /// File, relative to the list of edits.
         scene: String,
         /// Its layers' names begin with this and a slash.
         name: String,
@@ -303,7 +303,7 @@ pub trait Context {
         Err(missing(&format!("scene `{name}`"), "Give a file that can be read"))
     }
 
-    /// Bytes of memory that are available; `None`: nobody knows.
+    /// Bytes of memory that are available; `None`: unknown.
     fn memory(&self) -> Option<u64> {
         None
     }

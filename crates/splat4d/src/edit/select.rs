@@ -12,6 +12,8 @@ use std::fmt;
 const DEEPEST: usize = 64;
 /// Most corners of a lasso: a bound for files.
 const MOST_CORNERS: usize = 1024;
+/// Most cells of a depth map: a bound for files.
+const MOST_CELLS: usize = 4096;
 
 /// A selection.
 #[derive(Clone, Debug, PartialEq)]
@@ -39,6 +41,8 @@ pub enum Expr {
     Layer(String),
     /// Within what was drawn on an image.
     Lasso(Box<Lasso>),
+    /// Not behind the surface that was visible in an image.
+    Visible(Box<Surface>),
     /// Name of a label.
     Label(String),
     /// Features like those of the Gaussian nearest to a place, scene units: the least cosine between them.
@@ -82,6 +86,45 @@ impl Lasso {
         let p = mat_vec(cam_from_world, sub(x, self.eye));
         let deep = p[2] > 0.0 && (self.range[0]..=self.range[1]).contains(&p[2]);
         deep && within(&self.corners, [p[0] / p[2], p[1] / p[2]])
+    }
+
+    /// Rows of the rotation from the world to the camera.
+    pub(super) fn cam_from_world(&self) -> [[f64; 3]; 3] {
+        transpose(&quat::to_rotation(quat::normalize(self.turn).0))
+    }
+}
+
+/// A coarse depth map of a rectangle of an image: the largest depth that is selected in each cell.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Surface {
+    /// Camera centre, scene units.
+    pub eye: [f64; 3],
+    /// World from camera, wxyz of any length but zero; camera axes are OpenCV's.
+    pub turn: [f64; 4],
+    /// Two opposite corners as x/z and y/z in the camera's axes: the smaller values, then the larger ones.
+    pub corners: [[f64; 2]; 2],
+    /// Cells in a row.
+    pub columns: usize,
+    /// [rows · columns], scene units; 0: nothing is selected in the cell.
+    pub depths: Vec<f64>,
+}
+
+impl Surface {
+    /// The number of the cell of an image point (x/z, y/z).
+    pub fn cell(&self, point: [f64; 2]) -> Option<usize> {
+        let rows = self.depths.len() / self.columns;
+        let along = |k: usize, cells: usize| {
+            let [from, to] = [self.corners[0][k], self.corners[1][k]];
+            let share = (point[k] - from) / (to - from);
+            (0.0..=1.0).contains(&share).then(|| ((share * cells as f64) as usize).min(cells - 1))
+        };
+        Some(along(1, rows)? * self.columns + along(0, self.columns)?)
+    }
+
+    /// Whether a point lies in the rectangle and not behind the surface.
+    pub(super) fn holds(&self, cam_from_world: &[[f64; 3]; 3], x: [f64; 3]) -> bool {
+        let p = mat_vec(cam_from_world, sub(x, self.eye));
+        p[2] > 0.0 && self.cell([p[0] / p[2], p[1] / p[2]]).is_some_and(|cell| p[2] <= self.depths[cell])
     }
 
     /// Rows of the rotation from the world to the camera.
@@ -160,7 +203,7 @@ fn unreadable(text: &str, what: &str) -> Error {
     Error::input(format!("the selection `{text}` cannot be read: {what}")).remedy(
         "It is made of box(x0,y0,z0, x1,y1,z1), sphere(x,y,z, r), frustum(camera), color(r,g,b, near), opacity(from,to), \
          size(from,to), life(from,to), speed(from,to), layer(name), label(name), like(x,y,z, cosine), mask(file, camera), subject, \
-         lasso(...), all, at(t, ...), \
+         lasso(...), visible(...), all, at(t, ...), \
          ever(...), always(...), grow(..., distance), and, or, not and parentheses",
     )
 }
@@ -323,6 +366,7 @@ impl Parser<'_> {
                 Expr::Mask(file, self.name()?)
             }
             "lasso" => Expr::Lasso(Box::new(self.lasso()?)),
+            "visible" => Expr::Visible(Box::new(self.surface()?)),
             "at" => {
                 let [t] = self.numbers()?;
                 self.expect(Token::Comma)?;
@@ -386,6 +430,27 @@ impl Parser<'_> {
         Ok(Lasso { eye: [ex, ey, ez], turn: [w, x, y, z], range: [near, far], corners })
     }
 
+    /// Eye, turn, two corners, columns and the depths of the cells.
+    fn surface(&mut self) -> Result<Surface> {
+        let head: [f64; 12] = self.numbers()?;
+        let mut depths = Vec::new();
+        while self.peek() == Some(&Token::Comma) && depths.len() < MOST_CELLS {
+            self.at += 1;
+            let [depth] = self.numbers()?;
+            depths.push(depth);
+        }
+        let [ex, ey, ez, w, x, y, z, u0, v0, u1, v1, columns] = head;
+        let turned = [w, x, y, z].iter().map(|q| q * q).sum::<f64>() > 0.0;
+        let whole = columns >= 1.0 && columns <= MOST_CELLS as f64 && columns.fract() == 0.0;
+        if !turned || !whole || u1 <= u0 || v1 <= v0 || depths.is_empty() || depths.len() % columns as usize != 0 {
+            return Err(self.wrong(
+                "visible has an eye, a turn, the smaller and the larger corner, a number of columns, and depths of whole rows",
+            ));
+        }
+        let (columns, corners) = (columns as usize, [[u0, v0], [u1, v1]]);
+        Ok(Surface { eye: [ex, ey, ez], turn: [w, x, y, z], corners, columns, depths })
+    }
+
     /// A name, with or without quotation marks.
     fn name(&mut self) -> Result<String> {
         match self.peek().cloned() {
@@ -446,6 +511,9 @@ mod tests {
             ("grow(all, 0)", "above 0"),
             ("lasso(0,0,0, 1,0,0,0, 1,9, 0,0, 1,0)", "three corners"),
             ("lasso(0,0,0, 0,0,0,0, 1,9, 0,0, 1,0, 0,1)", "a turn"),
+            ("visible(0,0,0, 1,0,0,0, 0,0, 1,1, 2, 1,2,3)", "whole rows"),
+            ("visible(0,0,0, 1,0,0,0, 0,0, 1,1, 0, 1)", "columns"),
+            ("visible(0,0,0, 1,0,0,0, 1,0, 0,1, 1, 1)", "corner"),
             ("lasso(0,0,0, 1,0,0,0, 1,9, 0,0, 1,0, 0)", "2 numbers"),
             ("and", "and"),
         ] {

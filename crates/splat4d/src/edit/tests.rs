@@ -419,7 +419,7 @@ fn copies_and_parts_are_layers() {
     }
 }
 
-/// An upright rod, and a second one next to it that nobody touches.
+/// An upright rod, and a second one next to it that stays untouched.
 fn rods() -> Scene<f32> {
     let mut params = Params::new(1200, 1, &[]);
     for i in 0..1200 {
@@ -589,6 +589,23 @@ fn a_lasso_selects_behind_its_outline() {
         assert_eq!(near[row], p[0] > 0.0 && p[2] <= 5.0, "row {row}");
     }
     assert!(near.contains(&true) && near != all);
+}
+
+#[test]
+fn visible_selects_up_to_the_depth_of_each_cell() {
+    let scene = &scenes()[3];
+    let camera = front();
+    let world = camera.cam_from_world.inverse();
+    let turn = quat::from_rotation(&world.rotation).map(|x| x.to_string()).join(",");
+    let eye = world.translation.map(|x| x.to_string()).join(",");
+    // Left of the middle nothing, right of it up to a depth of 5.
+    let text = format!("visible({eye}, {turn}, -1,-1, 1,1, 2, 0,5)");
+    let found = select(&Expr::parse(&text).unwrap(), scene, &Bench::empty()).unwrap().remove(0);
+    for (row, x) in scene.layers[0].means().enumerate() {
+        let p = camera.cam_from_world.apply(x);
+        assert_eq!(found[row], p[0] >= 0.0 && p[2] <= 5.0, "row {row}");
+    }
+    assert!(found.contains(&true) && found.contains(&false));
 }
 
 #[test]

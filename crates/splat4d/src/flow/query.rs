@@ -241,7 +241,7 @@ struct Point {
 }
 
 impl Point {
-    /// Goes along with its carriers; false: nobody carries it.
+    /// Moves with its carriers; false: it has none.
     fn step(&mut self, now: &Seen, next: &Seen) -> bool {
         let mut moved = self.moved(now, next);
         if moved.is_none() {

@@ -1,4 +1,4 @@
-//! A dialect: its name, its customs, how a file of it is told, read and written. Each declares itself in its own
+//! A dialect: its name, its customs, how a file of it is recognized, read and written. Each declares itself in its own
 //! file, and [`DIALECTS`] lists them.
 
 use super::DIALECTS;
@@ -21,7 +21,7 @@ pub(crate) const Y_UP: [f64; 3] = [0.0, 1.0, 0.0];
 /// Version of .spz that is written by default: the one that most programs open.
 pub const SPZ_VERSION: u32 = 3;
 
-/// Files of Gaussians that other programs share. docs/formats.md tells what each holds and assumes.
+/// Files of Gaussians that other programs share. docs/formats.md lists what each holds and assumes.
 #[derive(Clone, Copy)]
 #[non_exhaustive]
 pub struct Dialect {
@@ -33,7 +33,7 @@ pub struct Dialect {
     pub up: [f64; 3],
     /// Whether it holds a moving scene.
     pub moves: bool,
-    /// Whether bytes are such a file; `None`: they have no mark, and only the ending tells.
+    /// Whether bytes are such a file; `None`: they have no mark, and only the ending decides.
     pub mark: Option<fn(&[u8]) -> bool>,
     /// Reads a file; [`Dialect::open`] says which way is up.
     pub read: fn(&[u8]) -> Result<Opened>,

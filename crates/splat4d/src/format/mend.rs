@@ -166,7 +166,7 @@ pub fn from_linear(layer: &mut Layer<f32>, what: Linear) -> Warnings {
     warnings
 }
 
-/// Share of the median Gaussian's size above which an error of positions is worth a warning: a tenth of σ is invisible.
+/// Share of the median Gaussian's size above which an error of positions causes a warning: a tenth of σ is invisible.
 pub(super) const VISIBLE: f64 = 0.1;
 
 /// The size (largest σ) of the median Gaussian; none where there is none that is finite.

@@ -67,7 +67,7 @@ pub const DIALECTS: &[Dialect] = &[
 /// The scene in a file of any kind that says by its first bytes what it is: `.s4d`, .ply (3DGS, compressed, Spacetime
 /// Gaussians), .spz, .splatv, zipped SOG, `scene.safetensors` and checkpoints. A .splat has no mark: [`splat::read`] it.
 ///
-/// What had to be assumed is not told; [`Dialect::open`] tells. Errors: no such kind; the reader's.
+/// Assumptions are not returned; [`Dialect::open`] returns them. Errors: no such kind; the reader's.
 pub fn open(bytes: &[u8]) -> Result<Scene<f32>> {
     if bytes.starts_with(&playback::MAGIC) {
         return playback::read(bytes);

@@ -299,7 +299,7 @@ pub(crate) fn sealed(
     out
 }
 
-/// A file whose checksums nobody looks at, for tests of what else is looked at.
+/// A file whose checksums are not verified, for tests of the other checks.
 #[cfg(test)]
 pub(crate) fn unsealed(mut bytes: Vec<u8>) -> Vec<u8> {
     let key = CHECKSUMS.as_bytes();

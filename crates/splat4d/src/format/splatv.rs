@@ -1,6 +1,6 @@
 //! `.splatv`: moving Gaussians as the texture of splaTV's and gsplat.js's players.
 //!
-//! u32 0x674B, u32 length of a JSON text, the text (a list of chunks; ours and everybody's is one of type "splat" with
+//! u32 0x674B, u32 length of a JSON text, the text (a list of chunks; all known files have one of type "splat" with
 //! `size`, `texwidth` 4096, `texheight` and `cameras`), then the chunk: 64 bytes a Gaussian. Words: 0–2 position f32, 3–4
 //! quaternion 4×f16 wxyz, 5–6 **linear** scale 3×f16, 7 colour rgb and opacity u8, 8–12 path 9×f16, 13–14 quaternion rate
 //! 4×f16, 15 centre and width 2×f16. Opacity·exp(−((t − centre)/width)²), **no ½**; t runs from 0 to 1 over the clip.

@@ -111,7 +111,7 @@ impl GpuRenderer {
         Ok(Some(comparison))
     }
 
-    /// Draws, compares and goes back. `None`: it must be drawn in bands.
+    /// Renders, compares and runs the backward pass. `None`: it must be drawn in bands.
     fn compare_held(
         &mut self,
         shot: &Shot<'_, f32>,
@@ -173,7 +173,7 @@ impl GpuRenderer {
         b.d_planes.ensure(gpu, (4 * PLANES * w * h) as u64)
     }
 
-    /// One submission: draws, compares, goes back. What came means nothing if there are more pairs than there is room for.
+    /// One submission: rendering, comparison, backward pass. What came means nothing if there are more pairs than there is room for.
     fn there_and_back(
         &mut self,
         held: &Held,

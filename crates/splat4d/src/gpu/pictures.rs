@@ -43,7 +43,7 @@ pub(super) struct Pictures {
     bytes: u64,
     /// Most bytes kept; lowered where there is too little memory.
     pub budget: u64,
-    /// Memory of images that are not kept, which nobody uses now.
+    /// Memory of images that are not kept and not in use.
     spare: Vec<Grown>,
     /// Bytes of these and of those in use.
     passing: u64,
@@ -105,7 +105,7 @@ impl Pictures {
         Ok(Held { buffer: buffer.get().clone(), flags, weight, size, stays: false })
     }
 
-    /// Takes back an image that nobody compares with any more.
+    /// Takes back an image that is no longer compared with.
     pub(super) fn give_back(&mut self, held: Held) {
         if !held.stays {
             self.spare.push(Grown::of("an image's truth", held.buffer));

@@ -65,7 +65,7 @@ impl GpuRenderer {
         Ok(view.map_or_else(|_| Vec::new(), |view| bytemuck::pod_collect_to_vec(&view)))
     }
 
-    /// Units of work a second; `record` is told how often to do one.
+    /// Units of work a second; `record` receives how often to do one.
     fn best(&self, most: usize, mut record: impl FnMut(&mut wgpu::CommandEncoder, usize)) -> Result<f64> {
         let (mut times, mut best, mut runs) = (1, 0.0f64, 0);
         while runs < RUNS {

@@ -12,7 +12,7 @@ pub struct Tuning {
     pub rounds: usize,
     /// Splats that a tile reads at a time, to blend them.
     pub batch: usize,
-    /// Whether the blend goes back with subgroups, where the device has them: changes last bits.
+    /// Whether the backward pass of the blend uses subgroups, where the device has them: changes last bits.
     pub subgroups: bool,
     /// Whether the sorts' last dispatch uses them too: no bit depends on it.
     pub sort_subgroups: bool,

@@ -48,7 +48,7 @@ pub struct Dragged {
     pub positions: Vec<[f64; 3]>,
     /// How every node has turned (rows).
     pub rotations: Vec<[[f64; 3]; 3]>,
-    /// E at the start (everybody follows the handles as one rigid body) and after every iteration.
+    /// E at the start (all nodes follow the handles as one rigid body) and after every iteration.
     pub energies: Vec<f64>,
 }
 

@@ -250,7 +250,7 @@ impl Deform {
         (0..levels).map(|l| grids.iter().filter_map(|g| g.columns().get(l).cloned()).collect()).collect()
     }
 
-    /// Says whether the networks learn: while they do not and move nothing, nobody asks them (a static start costs what
+    /// Says whether the networks learn: while they do not and move nothing, they are not evaluated (a static start costs what
     /// `still` costs).
     pub fn let_learn<F: Real>(&self, p: &mut Params<F>, learns: bool) {
         let keys: Vec<Key> = self.trunk.keys().collect();

@@ -187,7 +187,7 @@ pub trait Motion<F: Real = f32>: Any + Send + Sync {
         false
     }
 
-    /// Properties that others act on. A model from outside the library that tells none promises nothing.
+    /// Properties that others act on. A model from outside the library that declares none promises nothing.
     fn capabilities(&self) -> Capabilities {
         self.spec().capabilities().unwrap_or_default()
     }

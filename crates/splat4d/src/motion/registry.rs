@@ -1,4 +1,4 @@
-//! The registry of motion models: the properties that a model tells of itself, and the macro that turns the list in
+//! The registry of motion models: the properties that a model declares, and the macro that turns the list in
 //! [`motion`](super) into [`Spec`](super::Spec), its names and [`build`](super::build).
 
 use super::Motion;
@@ -186,7 +186,7 @@ macro_rules! registry {
                 !matches!(self, Spec::Custom(_))
             }
 
-            /// Properties of the model; none for one from outside, which tells them itself
+            /// Properties of the model; none for one from outside, which declares its own
             /// ([`Motion::capabilities`]).
             pub fn capabilities(&self) -> Option<Capabilities> {
                 match self {
@@ -199,7 +199,7 @@ macro_rules! registry {
 
         /// Makes the model, and in `p` the tables it needs (or claims the loaded ones).
         ///
-        /// Errors: a `Spec::Custom` that nobody has registered; numbers out of their ranges; loaded arrays of the wrong
+        /// Errors: a `Spec::Custom` that is not registered; numbers out of their ranges; loaded arrays of the wrong
         /// shape.
         pub fn build(spec: &Spec, p: &mut Params) -> Result<Arc<dyn Motion>> {
             build_as(spec, p)

@@ -126,7 +126,7 @@ pub trait Backend<F: Real = f32>: Send {
     /// The device, in a word or two.
     fn name(&self) -> &str;
 
-    /// What happened since the last call that whoever runs it should know, in one line: what is drawn elsewhere, and why.
+    /// What happened since the last call that the user should know, in one line: what is drawn elsewhere, and why.
     fn notice(&mut self) -> Option<String> {
         None
     }

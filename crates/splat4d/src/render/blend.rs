@@ -26,7 +26,7 @@ pub(super) const BATCH: usize = 64;
 const GROUP: usize = 16;
 /// Splats between two tests whether all pixels of a tile have stopped.
 const EXIT_EVERY: usize = 16;
-/// The smallest T that is told from 0: the backward pass divides by it.
+/// The smallest T that differs from 0: the backward pass divides by it.
 const T_FLOOR: f64 = 1e-30;
 
 /// Lanes of a strip where a register holds one row of pixels, and where it holds two.

@@ -83,7 +83,7 @@ pub struct RenderConfig {
     pub simd: Simd,
 }
 
-/// The smallest α cut-off that is told from 0: an extent must be finite.
+/// The smallest α cut-off that differs from 0: an extent must be finite.
 const ALPHA_FLOOR: f64 = 1e-30;
 /// α never reaches 1, whatever the configuration: T must stay recoverable.
 const ALPHA_CEILING: f64 = 1.0 - 1e-6;

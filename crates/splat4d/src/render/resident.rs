@@ -163,7 +163,7 @@ pub struct KeptView<'a> {
     pub t: Time,
     /// Colour behind the scene.
     pub background: [f32; 3],
-    /// What it is compared with; a response is told by the camera's number alone.
+    /// What it is compared with; a response depends on the camera's number alone.
     pub target: Target<'a>,
     /// Number of the camera, where their colour matrices are kept.
     pub rig: usize,

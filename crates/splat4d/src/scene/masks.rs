@@ -8,7 +8,7 @@ pub(crate) const WORD: usize = u32::BITS as usize;
 /// A bit a Gaussian and key time. Between two key times a Gaussian is drawn only if its bit is set at one of them; before
 /// the first and after the last, if it is set there.
 ///
-/// Masks say who is worth drawing, a life says who is there: a layer draws whom both admit.
+/// Masks select Gaussians by importance, lifespans by time: a layer renders those that both admit.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct KeyMasks {
     times: Vec<f64>,

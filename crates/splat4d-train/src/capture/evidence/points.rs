@@ -304,7 +304,7 @@ fn by_views(capture: &Capture) -> Option<f64> {
 pub(super) enum Unit<'a> {
     /// There are no such maps, or it is right.
     Right,
-    /// How many times as far away things are as they say, what tells it, and a map's file.
+    /// How many times as far away things are as they say, the evidence, and a map's file.
     Wrong(f64, &'static str, &'a DepthFile),
     /// Neither points nor other maps tell it.
     Unknown,

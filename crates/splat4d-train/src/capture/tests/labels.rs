@@ -9,7 +9,7 @@ use serde_json::json;
 
 const MASK: &str = "labels/cam01/0005.png";
 
-/// Camera 1 has masks of two labels: the left half is 0, the right half 1, the first row nobody knows.
+/// Camera 1 has masks of two labels: the left half is 0, the right half 1, the first row is unknown.
 fn sample() -> Sample {
     let sample = samples::own();
     for name in [MASK, "labels/cam01/0006.png"] {

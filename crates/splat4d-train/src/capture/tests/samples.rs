@@ -42,7 +42,7 @@ impl Sample {
         std::fs::write(path, bytes).unwrap();
     }
 
-    /// An opaque image that tells cameras and frames apart.
+    /// An opaque image that distinguishes cameras and frames.
     pub(in crate::capture) fn rgb(&self, name: &str, camera: usize, frame: usize) {
         let pixel = |x: u32, y: u32| Rgb([(x * 10) as u8, (y * 15) as u8, (camera * 40 + frame * 7) as u8]);
         self.save(name, ImageBuffer::from_fn(WIDTH as u32, HEIGHT as u32, pixel));

@@ -12,7 +12,7 @@ use splat4d::scene::Planes;
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Depth(pub f64);
 
-/// Of the weight, what is left of it at the end of a stage (Kerbl et al. 2024 end at 0.01; truth is worth more than that).
+/// Of the weight, what is left of it at the end of a stage (Kerbl et al. 2024 end at 0.01; ground truth deserves more than that).
 const LAST: f64 = 0.1;
 
 impl<F: Real> ImageTerm<F> for Depth {

@@ -25,7 +25,7 @@ use std::sync::Arc;
 const MEASURED: usize = 16;
 /// Cameras that look at each.
 const CAMERAS: usize = 2;
-/// 8-bit steps in [0, 1]: flicker is told in these.
+/// 8-bit steps in [0, 1]: the unit of flicker.
 const LEVELS: f64 = 255.0;
 
 /// A take that was put together.

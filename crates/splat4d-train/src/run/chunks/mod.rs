@@ -377,7 +377,7 @@ impl Chunked {
     }
 }
 
-/// The first part of a take, which is as long for whoever has listed how much of it.
+/// The first part of a take, whose length does not depend on how much of the take is listed.
 fn beginning(capture: &Capture, plan: &ChunkPlan) -> Capture {
     let end = plan.take[0] + WHOLE;
     let train = capture.train.iter().copied().filter(|&i| capture.frames[i].index < end).collect();

@@ -45,7 +45,7 @@ const MEDIAN_OF: usize = 9;
 const CHANGED: f32 = 0.06;
 /// A pixel is calm where at most this share of the frames that are looked at has changed.
 const CALM: f64 = 0.1;
-/// Steps of the layer, in those of a chunk: every chunk shows it and none can mend it (docs/scale.md has what that is worth).
+/// Steps of the layer, in those of a chunk: every chunk shows it and none can mend it (docs/scale.md has the figures).
 pub(super) const STEPS: usize = 4;
 /// A Gaussian stays where at least this share of the cameras that look at it finds it calm.
 const AGREED: f64 = 0.5;

@@ -1,4 +1,4 @@
-//! A tiny take in three chunks: the same scene whoever does what when, and clear words where something is missing.
+//! A tiny take in three chunks: the same scene in whatever order workers take the parts, and clear words where something is missing.
 
 use super::tie::{Neighbour, Tie};
 use super::*;

@@ -181,7 +181,7 @@ pub(crate) struct Failing {
     device: Box<dyn Backend>,
     /// How often it takes tables over, takes steps and hands tables out.
     left: [usize; 3],
-    /// Whether it tells that it takes tables over.
+    /// Whether it reports that it takes tables over.
     keeps: bool,
     gone: bool,
 }

@@ -1,5 +1,5 @@
 //! Files of takes that are not finished: sections are appended, and a new index behind them; then the header names the new
-//! index. Whoever read the old header goes on with the old index, of which nothing was touched. What is finished is written
+//! index. A reader of the old header continues with the old index, of which nothing was touched. What is finished is written
 //! again as any other file, its index in front.
 
 use super::index::broken;

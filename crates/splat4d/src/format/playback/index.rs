@@ -149,7 +149,7 @@ struct Header {
 
 impl Index {
     /// Bytes from the start that [`parse`](Self::parse) wants: 64 as long as `prefix` is shorter, then the exact number. Of a
-    /// file that grows that is nearly all of it: whoever can read elsewhere asks for its [`place`](Self::place).
+    /// file that grows that is nearly all of it: a reader with random access uses its [`place`](Self::place).
     ///
     /// Errors: not a playback file, a newer major version, a damaged header.
     pub fn needed(prefix: &[u8]) -> Result<usize> {

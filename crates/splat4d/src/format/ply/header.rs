@@ -82,7 +82,7 @@ impl Element {
         self.properties.iter().position(|p| p.name == name && matches!(p.kind, Kind::Scalar(_)))
     }
 
-    /// The number that stands for full colour in a property: 1 in floating point (nobody writes another range), the
+    /// The number that stands for full colour in a property: 1 in floating point (no other range is written), the
     /// type's range in integers.
     pub(super) fn white(&self, property: usize) -> f64 {
         match self.properties[property].kind {

@@ -32,7 +32,7 @@ pub use ftgs::FTGS;
 pub(crate) use pack::write_compressed;
 pub use stg::{STG, is_stg, read_stg, write_stg};
 
-/// Plain 3DGS .ply, and any .ply that nobody else knows.
+/// Plain 3DGS .ply, and any .ply that no other dialect recognizes.
 pub const DIALECT: Dialect = Dialect {
     name: "3DGS .ply",
     ending: ".ply",
@@ -54,7 +54,7 @@ const GEOMETRY_NAMES: [&str; 11] =
     ["x", "y", "z", "rot_0", "rot_1", "rot_2", "rot_3", "scale_0", "scale_1", "scale_2", "opacity"];
 /// The base colour, coefficient 0 of red, green and blue.
 const DC_NAMES: [&str; 3] = ["f_dc_0", "f_dc_1", "f_dc_2"];
-/// Written as zeros by everybody and read by nobody.
+/// Written as zeros by all programs and read by none.
 const NORMAL_NAMES: [&str; 3] = ["nx", "ny", "nz"];
 /// Colours of point clouds.
 const RGB_NAMES: [&str; 3] = ["red", "green", "blue"];

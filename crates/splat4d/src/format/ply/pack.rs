@@ -1,4 +1,4 @@
-//! Writes PlayCanvas' compressed `.ply`; the layout is told where it is read, in `compressed.rs`.
+//! Writes PlayCanvas' compressed `.ply`; the layout is documented in the reader, `compressed.rs`.
 
 use crate::format::bytes::{SH_C0, sound_rows};
 use crate::format::warnings::Warnings;

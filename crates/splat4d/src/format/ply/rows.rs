@@ -57,7 +57,7 @@ impl Rows<'_> {
 }
 
 /// Walks through the body and returns the rows of the `wanted` elements (in that order; `None` where the file has no
-/// such element). Stops after the last wanted one: what follows is nobody's business.
+/// such element). Stops after the last wanted one: what follows is ignored.
 pub(super) fn find<'a, const N: usize>(
     header: &Header,
     bytes: &'a [u8],

@@ -67,7 +67,7 @@ pub(in crate::gpu) struct Flights {
     under_way: VecDeque<Flight>,
     /// Those that are done, not told yet.
     done: Vec<KeptStepped>,
-    /// Memory of records that nobody uses now.
+    /// Memory of records that are not in use.
     spare: Vec<Grown>,
     /// Steps that were begun again for want of room.
     #[cfg(test)]

@@ -36,7 +36,7 @@ impl Pulled {
     }
 }
 
-/// Renders and goes back; tables of colours get their gradients in `d_sh`.
+/// Renders and runs the backward pass; tables of colours get their gradients in `d_sh`.
 fn back(
     r: &mut dyn Backend<f32>,
     shot: &Shot<'_>,

@@ -19,7 +19,7 @@ const NODE: usize = 10;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DragSpec {
-    /// Tells the drags of a layer apart.
+    /// Distinguishes the drags of a layer.
     pub index: u32,
     /// Nodes.
     pub nodes: usize,
@@ -61,7 +61,7 @@ pub(super) struct Keys {
 }
 
 impl Keys {
-    /// Makes or claims the tables; new ones pull nobody.
+    /// Makes or claims the tables; new ones move nothing.
     pub(super) fn new<F: Real>(spec: &DragSpec, p: &mut Params<F>) -> Result<Self> {
         let numbers = spec.nodes * spec.times.len() * NODE;
         let nodes = p.array(&format!("drag_nodes.{}", spec.index), numbers, |_| {})?;
@@ -128,7 +128,7 @@ impl<'a, F: Real> Pulls<'a, F> {
         Self { nodes: (0..spec.nodes).map(node).collect(), table: &p[keys.pulls] }
     }
 
-    /// Where Gaussian `id` goes; none where nobody pulls it.
+    /// Where Gaussian `id` moves; none if it is not dragged.
     #[inline(always)]
     pub(super) fn of(&self, id: usize) -> Option<Affine<F>> {
         let count = self.table.width() / 2;

@@ -137,7 +137,7 @@ impl Native4d {
     }
 }
 
-/// Makes room for `blocks` blocks of SH coefficients. A table of one block is told from one of several by its width: 1, 4,
+/// Makes room for `blocks` blocks of SH coefficients. A table of one block differs from one of several by its width: 1, 4,
 /// 9 and 16 coefficients are no whole number of blocks of one another, but for one block.
 fn widen<F: Real>(p: &mut Params<F>, blocks: usize) -> Result<()> {
     let (rows, width) = (p.len(), p[SH].width());
@@ -233,7 +233,7 @@ impl<F: Real> Motion<F> for Native4d {
     }
 
     /// The parts of a split lie apart in time as a Gaussian of four dimensions does: δt ~ N(0, Σ_tt), and the mean goes
-    /// along its path; whoever splits adds what lies across it.
+    /// along its path; a split adds what lies across it.
     fn on_edit(&self, p: &mut Params<F>, edit: &RowEdit, rng: &Rng) {
         if edit.space != Space::Gaussians || !self.spec.split_time {
             return;

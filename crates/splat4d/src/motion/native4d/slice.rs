@@ -18,7 +18,7 @@ pub(super) const OWN: usize = 6;
 pub(super) const LOG_TIME_SCALE: usize = 1;
 /// First column of the right quaternion.
 pub(super) const RIGHT: usize = 2;
-/// The life's exponent stops at −30: e⁻³⁰ is seen by nobody, and in f32 products with it do not become subnormal.
+/// The life's exponent stops at −30: e⁻³⁰ is invisible, and in f32 products with it do not become subnormal.
 const FAINTEST: f64 = 60.0;
 
 /// Parameters of a slice in addition to the row: see [`super::Native4dSpec`].

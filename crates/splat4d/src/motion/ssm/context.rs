@@ -22,7 +22,7 @@ pub(crate) fn width(e: Equivariance) -> usize {
     }
 }
 
-/// Takes the nodes' surroundings again, from where they are at rest. Whoever moves nodes by other means than training
+/// Takes the nodes' surroundings again, from where they are at rest. Call it after moving nodes by other means than training
 /// calls it.
 ///
 /// Shapes: `node_context` [nodes, 3 | 21 | 15]. Lengths are in units of the cloud's radius or of the neighbours' distance,

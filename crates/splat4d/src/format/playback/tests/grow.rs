@@ -1,4 +1,4 @@
-//! Files that grow: what is there plays at any time, and what is finished is a file like any other, whoever added what when.
+//! Files that grow: what is there plays at any time, and what is finished is a file like any other, in whatever order it was added.
 
 use super::*;
 use std::io::{Cursor, ErrorKind as Io, Read, Seek, SeekFrom, Write};

@@ -20,7 +20,7 @@ fn path(node: usize, second: f64) -> [f64; 3] {
     [x, (2.0 * second + phase).cos(), (2.0 * second + phase).sin()]
 }
 
-/// Everywhere at random, with a turn about every two seconds: nothing that one node does tells of another, or of later.
+/// Everywhere at random, with a turn about every two seconds: the motion of one node predicts neither another's nor its own later motion.
 fn wander(node: usize, second: f64) -> [f64; 3] {
     let rng = Rng::new(7, "wander", 0).fork(node as u64);
     std::array::from_fn(|axis| {

@@ -1,0 +1,155 @@
+//! A map of the cameras from above, as SVG.
+
+use super::chart::escape;
+use splat4d::math::se3::{cross, dot, norm, sub};
+use splat4d_import::doctor::Grade;
+use splat4d_train::capture::Capture;
+use std::fmt::Write;
+
+/// Width of the map and its margin, units of the SVG.
+const WIDTH: f64 = 560.0;
+const MARGIN: f64 = 46.0;
+/// Most points that are drawn.
+const POINTS: usize = 600;
+/// Length of a viewing direction, of the map's width.
+const ARROW: f64 = 0.09;
+/// Most cameras with a name: more names cover each other.
+const NAMED: usize = 40;
+
+/// The map of fixed cameras; empty where there are fewer than two. `grade`: the worst finding of a camera.
+pub(super) fn svg(capture: &Capture, grade: &dyn Fn(&str) -> Option<Grade>) -> String {
+    let plan = Plan::new(capture.up);
+    let mut cameras = Vec::new();
+    for (k, rig) in capture.cameras.iter().enumerate().filter(|(_, rig)| rig.fixed) {
+        if let Some(frame) = capture.frames.iter().find(|f| f.camera == k) {
+            cameras.push((rig.name.as_str(), plan.of(frame.view.center()), plan.of(frame.view.forward())));
+        }
+    }
+    if cameras.len() < 2 {
+        return String::new();
+    }
+    let cloud = capture.points.as_ref().map_or(&[][..], |p| &p.points);
+    let stride = cloud.len().div_ceil(POINTS).max(1);
+    let mut points: Vec<[f64; 2]> = cloud.iter().step_by(stride).map(|x| plan.of(*x)).collect();
+    // Far points would shrink the rig to a dot.
+    let frame = Bounds::of(cameras.iter().map(|c| c.1)).grown(0.6);
+    points.retain(|p| frame.holds(*p));
+    let bounds = Bounds::of(cameras.iter().map(|c| c.1).chain(points.iter().copied()));
+    draw(&cameras, &points, &bounds, grade)
+}
+
+fn draw(
+    cameras: &[(&str, [f64; 2], [f64; 2])],
+    points: &[[f64; 2]],
+    bounds: &Bounds,
+    grade: &dyn Fn(&str) -> Option<Grade>,
+) -> String {
+    let scale = (WIDTH - 2.0 * MARGIN) / bounds.side(0).max(bounds.side(1)).max(f64::MIN_POSITIVE);
+    let height = bounds.side(1) * scale + 2.0 * MARGIN;
+    // Downwards in the plan is away from the reader.
+    let place =
+        |p: [f64; 2]| [MARGIN + (p[0] - bounds.low[0]) * scale, height - MARGIN - (p[1] - bounds.low[1]) * scale];
+    let mut out = format!("<svg viewBox=\"0 0 {WIDTH} {height:.0}\" role=\"img\" aria-label=\"Map of the cameras\">\n");
+    for p in points {
+        let [x, y] = place(*p);
+        let _ = writeln!(out, "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"1\" fill=\"var(--line)\"/>");
+    }
+    for (name, at, forward) in cameras {
+        let colour = match grade(name) {
+            Some(Grade::Bad) => "#d4351c",
+            Some(Grade::Warning) => "#e08a00",
+            _ => "var(--c1)",
+        };
+        let [x, y] = place(*at);
+        let length = forward[0].hypot(forward[1]);
+        let step = if length > 0.0 { ARROW * WIDTH / length } else { 0.0 };
+        let (tx, ty) = (x + step * forward[0], y - step * forward[1]);
+        let name = escape(name);
+        let _ = writeln!(
+            out,
+            "<g stroke=\"{colour}\" fill=\"{colour}\"><title>{name}</title><line x1=\"{x:.1}\" y1=\"{y:.1}\" x2=\"{tx:.1}\" \
+             y2=\"{ty:.1}\" stroke-width=\"1.6\"/><circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"4.5\" stroke=\"none\"/></g>"
+        );
+        if cameras.len() <= NAMED {
+            // Outside, away from where the camera looks.
+            let (nx, ny) = (x - 0.3 * (tx - x), y - 0.3 * (ty - y));
+            let _ = writeln!(
+                out,
+                "<text class=\"tick\" x=\"{nx:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{name}</text>",
+                ny + 4.0
+            );
+        }
+    }
+    out + "</svg>\n"
+}
+
+/// Two directions on the ground.
+struct Plan([[f64; 3]; 2]);
+
+impl Plan {
+    fn new(up: [f64; 3]) -> Self {
+        // The axis that is farthest from upwards makes the other two.
+        let axis = (0..3).min_by(|a, b| up[*a].abs().total_cmp(&up[*b].abs())).expect("there are three");
+        let mut east = [0.0; 3];
+        east[axis] = 1.0;
+        let along = dot(east, up);
+        let east = sub(east, up.map(|u| u * along));
+        let east = east.map(|e| e / norm(east));
+        Self([east, cross(up, east)])
+    }
+
+    fn of(&self, x: [f64; 3]) -> [f64; 2] {
+        self.0.map(|axis| dot(axis, x))
+    }
+}
+
+/// Least and greatest coordinates.
+struct Bounds {
+    low: [f64; 2],
+    high: [f64; 2],
+}
+
+impl Bounds {
+    fn of(points: impl Iterator<Item = [f64; 2]>) -> Self {
+        let empty = Self { low: [f64::INFINITY; 2], high: [f64::NEG_INFINITY; 2] };
+        points.fold(empty, |b, p| Self {
+            low: std::array::from_fn(|k| b.low[k].min(p[k])),
+            high: std::array::from_fn(|k| b.high[k].max(p[k])),
+        })
+    }
+
+    fn side(&self, k: usize) -> f64 {
+        self.high[k] - self.low[k]
+    }
+
+    fn grown(&self, share: f64) -> Self {
+        let by = share * self.side(0).max(self.side(1));
+        Self { low: self.low.map(|v| v - by), high: self.high.map(|v| v + by) }
+    }
+
+    fn holds(&self, p: [f64; 2]) -> bool {
+        (0..2).all(|k| (self.low[k]..=self.high[k]).contains(&p[k]))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cameras_stand_on_the_map_as_seen_from_above() {
+        let plan = Plan::new([0.0, 1.0, 0.0]);
+        let [a, b] = [plan.of([2.0, 5.0, 0.0]), plan.of([0.0, -3.0, 1.0])];
+        assert!(
+            (a[0].hypot(a[1]) - 2.0).abs() < 1e-12 && (b[0].hypot(b[1]) - 1.0).abs() < 1e-12,
+            "height does not count"
+        );
+        let cameras = [("left<1>", [0.0, 0.0], [1.0, 0.0]), ("right", [4.0, 2.0], [0.0, -1.0])];
+        let bounds = Bounds::of(cameras.iter().map(|c| c.1));
+        let svg = draw(&cameras, &[[1.0, 1.0]], &bounds, &|name| (name == "right").then_some(Grade::Bad));
+        assert!(svg.contains("left&lt;1&gt;") && !svg.contains("left<1>"));
+        assert_eq!(svg.matches("#d4351c").count(), 2, "line and dot of the bad one");
+        // The first stands at the left and looks to the right; y goes downwards in SVG.
+        assert!(svg.contains(&format!("x1=\"{MARGIN:.1}\"")), "{svg}");
+    }
+}
