@@ -1,15 +1,25 @@
 //! Baking, conversion and export as functions: the same files and events as the command's, without a terminal.
 
+use splat4d::ErrorKind;
+use splat4d::edit::Step;
 use splat4d::format::ply::write_placed;
 use splat4d::scene::params::{LOG_SCALE, QUAT};
 use splat4d::scene::{GEOMETRY, Params};
 use splat4d_workflow::baking::{self, Baking};
+use splat4d_workflow::comparison::compare;
+use splat4d_workflow::compressing::{CompressOptions, compress};
 use splat4d_workflow::converting::{self, Conversion};
+use splat4d_workflow::editing::{EditOptions, edit};
+use splat4d_workflow::evaluating::{Measure, evaluate};
 use splat4d_workflow::events::{Event, Listener, ignore};
 use splat4d_workflow::exporting;
+use splat4d_workflow::labelling::label;
+use splat4d_workflow::predicting::{PredictOptions, predict};
+use splat4d_workflow::rendering::{RenderOptions, film};
 use splat4d_workflow::source::Source;
 use std::cell::RefCell;
 use std::path::Path;
+use std::sync::atomic::AtomicBool;
 
 const GAUSSIANS: usize = 8;
 
@@ -66,4 +76,56 @@ fn what_cannot_be_written_is_an_error() {
     let convert = |out: &str| converting::run(&Conversion::new(&scene, at(out)), &ignore);
     assert!(convert("a.nothing").unwrap_err().to_string().contains("ending"));
     assert!(convert("scene.ply").is_err(), "the input stays");
+}
+
+#[test]
+fn a_scene_is_edited_and_filmed_and_scores_are_compared() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let scene = at("scene.ply");
+    write_scene(&scene);
+    let records = RefCell::new(Vec::new());
+    let listen = |event: &Event<'_>| {
+        if let Event::Record(value) = event {
+            records.borrow_mut().push((*value).clone());
+        }
+    };
+    // The three Gaussians at x = 0, 0.1 and 0.2.
+    let steps = vec![Step::Delete { select: "box(-0.05,-1,0, 0.25,1,2)".into() }];
+    let options =
+        EditOptions { scene: scene.clone(), output: Some(at("a.safetensors")), steps, ..EditOptions::default() };
+    edit(&options, &listen).unwrap();
+    assert_eq!(Source::open(&at("a.safetensors")).unwrap().scene.len(), GAUSSIANS - 3);
+    let options =
+        RenderOptions { output: Some(at("film")), size: Some([16, 12]), fps: Some(1.0), ..RenderOptions::default() };
+    film(&scene, &options, &listen).unwrap();
+    assert!(at("film/00000.png").is_file());
+    for (name, psnr) in [("one", 30.25), ("two", 31.5)] {
+        std::fs::create_dir(at(name)).unwrap();
+        std::fs::write(at(name).join("results.json"), format!("{{\"ours_10\": {{\"PSNR\": {psnr}}}}}")).unwrap();
+    }
+    compare(&[at("one"), at("two")], &[at("table.csv")], &listen).unwrap();
+    let table = std::fs::read_to_string(at("table.csv")).unwrap();
+    assert!(table.contains("30.25") && table.contains("31.50"), "{table}");
+    let records = records.borrow();
+    let of = |kind: &str| records.iter().find(|r: &&serde_json::Value| r["type"] == kind).unwrap();
+    assert_eq!((&of("edited")["before"], &of("edited")["gaussians"]), (&GAUSSIANS.into(), &(GAUSSIANS - 3).into()));
+    assert_eq!(of("compared")["runs"][1]["scores"]["PSNR"], 31.5);
+}
+
+#[test]
+fn workflows_of_runs_refuse_what_is_no_run() {
+    let folder = tempfile::tempdir().unwrap();
+    let (run, stop) = (folder.path(), AtomicBool::new(false));
+    let errors = [
+        evaluate(run, &Measure::default(), &ignore).err(),
+        compress(run, &CompressOptions::default(), &stop, &ignore).err(),
+        label(run, None, None, &ignore).err(),
+        predict(PredictOptions::new(run), &ignore).err(),
+    ];
+    for error in errors {
+        let error = error.expect("an empty folder is no run");
+        assert_eq!(error.kind(), ErrorKind::BadInput, "{error}");
+    }
+    assert_eq!(std::fs::read_dir(run).unwrap().count(), 0, "nothing is left behind");
 }
