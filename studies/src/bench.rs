@@ -1,10 +1,10 @@
 //! `bench`: how long every stage takes on pinned scenes, and how far that is from what this machine could do.
 
 #[cfg(feature = "gpu")]
-mod beside;
-#[cfg(feature = "gpu")]
 mod gpu;
 mod growth;
+#[cfg(feature = "gpu")]
+mod other_programs;
 mod playback;
 mod roofline;
 mod rows;
@@ -215,7 +215,7 @@ fn on_gpu(scenes: &[Pinned], way: Way, args: &Args, console: &Console) -> anyhow
     let defaults = splat4d::gpu::Tuning::default();
     let tunings = if args.sweep { splat4d::gpu::Tuning::sweep() } else { vec![defaults] };
     Ok(match &args.beside {
-        Some(folder) => gpu::beside(scenes, folder, way, &pool, &|text| console.aside(text))?,
+        Some(folder) => gpu::other_programs(scenes, folder, way, &pool, &|text| console.aside(text))?,
         None => gpu::measure(scenes, way, &tunings, &pool, &|text| console.note(text))?,
     })
 }

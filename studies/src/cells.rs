@@ -1,7 +1,7 @@
 //! What is done to a trained scene: a point of the study, and the points that it consists of.
 
 use splat4d_train::compress::Compression;
-use splat4d_train::upkeep::worth::{Combine, Spatial, Temporal};
+use splat4d_train::maintenance::importance::{Combine, Spatial, Temporal};
 
 /// Share of the Gaussians that goes where something else is varied, as 4DGS-1K on N3V.
 const AT: f64 = 0.8;

@@ -85,12 +85,12 @@ struct Study {
     version: u32,
     steps: usize,
     seeds: usize,
-    cells: Vec<Found>,
+    cells: Vec<FolderContent>,
 }
 
 /// One measured run.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-struct Found {
+struct FolderContent {
     key: String,
     seed: u64,
     /// Its recipe and capture, hexadecimal: runs of another recipe do not count.
@@ -124,7 +124,7 @@ impl Study {
         files::write(path, serde_json::to_string_pretty(self).expect("a study is plain data").as_bytes())
     }
 
-    fn of(&self, variant: &Variant) -> Vec<&Found> {
+    fn of(&self, variant: &Variant) -> Vec<&FolderContent> {
         self.cells.iter().filter(|f| f.key == variant.key).collect()
     }
 }
@@ -150,7 +150,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let file = args.output.join("e02.json");
     let mut study = Study::open(&file)?;
     files::make_folder(&args.output)?;
-    let wanted = |f: &Found| orders.iter().any(|o| o.variant.key == f.key && o.print == f.print);
+    let wanted = |f: &FolderContent| orders.iter().any(|o| o.variant.key == f.key && o.print == f.print);
     study.cells.retain(wanted);
     (study.steps, study.seeds) = (orders[0].recipe.run.iterations, orders.len() / variants.len());
     let stop = interrupt::flag("stopping: finished runs are kept, this one goes on next time");
@@ -185,7 +185,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     console.clear();
     let _ = std::fs::remove_dir(args.output.join("work"));
     study.save(&file)?;
-    tell(&study, &variants, args, console)
+    report_findings(&study, &variants, args, console)
 }
 
 /// Every run of the study: variants one after the other within a seed, so that a stopped study has compared something.
@@ -217,7 +217,7 @@ fn judge(
     folder: &Path,
     stop: &AtomicBool,
     console: &Console,
-) -> anyhow::Result<Option<Found>> {
+) -> anyhow::Result<Option<FolderContent>> {
     files::make_folder(folder)?;
     let owned = OutputFolder::amend(folder, "e02")?;
     // The run has been announced: that it begins and ends is no news.
@@ -249,7 +249,7 @@ fn judge(
     let scores = assess(&scene, capture, &store, outcome.iteration, &options, &mut listen)?;
     let flow = flow::error(&scene, capture, truths, antialias(recipe.appearance.antialias))?;
     let [psnr, psnr_dynamic, ssim, flicker] = ["PSNR", "PSNR-dynamic", "SSIM", "flicker"].map(|name| scores.held(name));
-    Ok(Some(Found {
+    Ok(Some(FolderContent {
         key: order.variant.key.into(),
         seed: recipe.run.seed,
         print: order.print.clone(),
@@ -264,7 +264,7 @@ fn judge(
 }
 
 /// The table and the curve.
-fn tell(study: &Study, variants: &[Variant], args: &Args, console: &Console) -> anyhow::Result<()> {
+fn report_findings(study: &Study, variants: &[Variant], args: &Args, console: &Console) -> anyhow::Result<()> {
     let mut text = page::markdown(study, variants, &args.motion);
     if let Some(svg) = page::plot(study, variants) {
         files::write(&args.output.join("e02.svg"), svg.as_bytes())?;

@@ -1,7 +1,7 @@
 //! `studies e03`: how much may be removed from a trained scene, by which score, and what the temporal filter costs.
 
 use crate::cells::{Cell, Grid};
-use crate::study::{Found, Judged, Place, Study, fill};
+use crate::study::{FolderContent, Judged, Place, Study, fill};
 use crate::tables;
 use serde_json::json;
 use splat4d::layers::Scene;
@@ -16,7 +16,7 @@ use splat4d_train::recipe::Recipe;
 use splat4d_train::run::TrainOptions;
 use splat4d_workflow::draw::antialias;
 use splat4d_workflow::files::{self, human_seconds};
-use splat4d_workflow::measure::{Look, SIZE, Side, Subject, What, in_turns, looks};
+use splat4d_workflow::measure::{MeasuredView, SIZE, Side, Subject, What, in_turns, measured_views};
 use splat4d_workflow::paths::parse_size;
 use splat4d_workflow::run_folder::Run;
 use splat4d_workflow::source::{not_empty, read_scene};
@@ -89,7 +89,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             let left = left.map_or_else(String::new, |s| format!(", about {} left", human_seconds(s)));
             console.note(&format!("{} {number}/{of}: {}{left}", trial.name, cell.words()));
         };
-        let keep = |findings: &crate::study::Findings, found: &Found| {
+        let keep = |findings: &crate::study::Findings, found: &FolderContent| {
             let whole = Study::of(others.iter().cloned().chain([findings.clone()]).collect());
             console.emit(&json!({"type": "cell", "run": trial.path, "cell": found}));
             whole.save(&file)
@@ -107,11 +107,11 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         let _ = std::fs::remove_dir_all(&work);
     }
     let _ = std::fs::remove_dir(args.output.join("work"));
-    tell(&study, &trials, &args.output, console)
+    report_findings(&study, &trials, &args.output, console)
 }
 
 /// Tables and images of the runs that were asked for.
-fn tell(study: &Study, trials: &[Trial], folder: &Path, console: &Console) -> anyhow::Result<()> {
+fn report_findings(study: &Study, trials: &[Trial], folder: &Path, console: &Console) -> anyhow::Result<()> {
     let mut page = String::from("# Pruning and the temporal filter\n");
     for trial in trials {
         let Some(findings) = study.runs.iter().find(|f| f.run == trial.path) else { continue };
@@ -143,7 +143,7 @@ struct Trial {
     capture: Arc<Capture>,
     recipe: Recipe,
     store: Arc<ImageStore>,
-    looks: Vec<Look>,
+    measured_views: Vec<MeasuredView>,
     grid: Grid,
 }
 
@@ -170,10 +170,20 @@ impl Trial {
         let own = run.iteration().unwrap_or(recipe.resolve().run.iterations);
         let steps = args.fine_tune.unwrap_or(((own as f64 * share) as usize).max(1));
         let size = args.size.unwrap_or(if args.quick { QUICK_SIZE } else { SIZE });
-        let looks = looks(&run.views()?, scene.clip, size);
+        let measured_views = measured_views(&run.views()?, scene.clip, size);
         let grid = if args.quick { Grid::quick(steps) } else { Grid::full(steps) };
         let folder = path.file_name().map_or_else(|| run.name(), |n| n.to_string_lossy().into_owned());
-        Ok(Self { path: path.to_owned(), name: plain(&folder), print, scene, capture, recipe, store, looks, grid })
+        Ok(Self {
+            path: path.to_owned(),
+            name: plain(&folder),
+            print,
+            scene,
+            capture,
+            recipe,
+            store,
+            measured_views,
+            grid,
+        })
     }
 
     /// Makes a cell's scene and measures it; None where it was stopped.
@@ -190,7 +200,8 @@ impl Trial {
         let scores = assess(scene, &self.capture, &self.store, cell.steps, &options, &mut listen)?;
         let antialias = antialias(self.recipe.appearance.antialias);
         let subjects = [&self.scene, scene].map(|s| Subject { what: What::Scene(s), antialias });
-        let sides = in_turns(&subjects, &self.looks, &mut |done, total| console.phase("playing", done, total))?;
+        let sides =
+            in_turns(&subjects, &self.measured_views, &mut |done, total| console.phase("playing", done, total))?;
         // A folder that stays costs room, not truth.
         let _ = std::fs::remove_dir_all(&folder);
         let [source, side] = <[Side; 2]>::try_from(sides).expect("two subjects give two sides");

@@ -9,7 +9,7 @@ use splat4d_cli::console::Console;
 use splat4d_cli::interrupt;
 use splat4d_workflow::draw::antialias;
 use splat4d_workflow::files::{self, grouped, human_bytes, human_seconds};
-use splat4d_workflow::measure::{SIZE, Side, Subject, What, in_turns, looks};
+use splat4d_workflow::measure::{SIZE, Side, Subject, What, in_turns, measured_views};
 use splat4d_workflow::run_folder::Run;
 use splat4d_workflow::source::read_scene;
 use std::fmt::Write;
@@ -163,8 +163,8 @@ fn train(capture: &Path, model: &str, folder: &Path, args: &Args, stop: &AtomicB
     let mut command = Command::new(own);
     command.arg("train").arg(capture).args(["--motion", model, "--minutes", &args.minutes.to_string()]);
     command.args(["--downscale", &args.downscale.to_string(), "--force", "-o"]).arg(folder);
-    for knob in &args.set {
-        command.args(["--set", knob]);
+    for setting in &args.set {
+        command.args(["--set", setting]);
     }
     let mut child = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(told).spawn()?;
     let begun = Instant::now();
@@ -192,8 +192,8 @@ fn judge(folder: &Path, capture: &str, model: &str, console: &Console) -> anyhow
     let scene = read_scene(&run.scene_file()?)?;
     let antialias = antialias(run.recipe()?.appearance.antialias);
     let subjects = [Subject { what: What::Scene(&scene), antialias }];
-    let looks = looks(&run.views()?, scene.clip, SIZE);
-    let sides = in_turns(&subjects, &looks, &mut |done, total| console.phase("playing", done, total))?;
+    let measured_views = measured_views(&run.views()?, scene.clip, SIZE);
+    let sides = in_turns(&subjects, &measured_views, &mut |done, total| console.phase("playing", done, total))?;
     let [side] = <[Side; 1]>::try_from(sides).expect("one subject gives one side");
     let steps = run.iteration().unwrap_or(0);
     Ok(Cell {

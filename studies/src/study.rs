@@ -26,12 +26,12 @@ pub(crate) struct Findings {
     pub name: String,
     /// Of the scene file, hexadecimal: cells of another scene do not count.
     pub scene: String,
-    pub cells: Vec<Found>,
+    pub cells: Vec<FolderContent>,
 }
 
 /// One measured cell.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Found {
+pub(crate) struct FolderContent {
     pub key: String,
     pub words: String,
     pub side: Side,
@@ -84,7 +84,7 @@ impl Study {
 }
 
 impl Findings {
-    pub(crate) fn of(&self, cell: &Cell) -> Option<&Found> {
+    pub(crate) fn of(&self, cell: &Cell) -> Option<&FolderContent> {
         let key = cell.key();
         self.cells.iter().find(|f| f.key == key)
     }
@@ -104,7 +104,7 @@ pub(crate) fn fill(
     cells: &[Cell],
     make: &mut dyn FnMut(&Cell) -> anyhow::Result<Option<Judged>>,
     mut progress: impl FnMut(&Cell, Place),
-    mut keep: impl FnMut(&Findings, &Found) -> Result<()>,
+    mut keep: impl FnMut(&Findings, &FolderContent) -> Result<()>,
 ) -> anyhow::Result<bool> {
     let missing: Vec<&Cell> = cells.iter().filter(|c| findings.of(c).is_none()).collect();
     let (started, mut spent) = (Instant::now(), 0.0);
@@ -116,7 +116,7 @@ pub(crate) fn fill(
         let Some(Judged { side, speed, raster_speed }) = make(cell)? else { return Ok(false) };
         spent += cell.cost();
         let seconds = clock.elapsed().as_secs_f64();
-        findings.cells.push(Found { key: cell.key(), words: cell.words(), side, speed, raster_speed, seconds });
+        findings.cells.push(FolderContent { key: cell.key(), words: cell.words(), side, speed, raster_speed, seconds });
         keep(findings, findings.cells.last().expect("one was pushed"))?;
     }
     Ok(true)

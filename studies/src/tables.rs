@@ -1,7 +1,7 @@
 //! What a study found, as tables for Markdown pages and as curves.
 
 use crate::cells::{Cell, Grid};
-use crate::study::{Findings, Found};
+use crate::study::{Findings, FolderContent};
 use splat4d_workflow::files::{grouped, human_bytes};
 use splat4d_workflow::measure::Side;
 use splat4d_workflow::report::chart::{self, Series};
@@ -67,7 +67,8 @@ fn shares(out: &mut String, findings: &Findings, grid: &Grid) {
     let line = |share: &f64| {
         let cells = grid.share(*share);
         let [pruned, tuned, filtered] = [0, 1, 2].map(|i| findings.of(&cells[i]));
-        let lost = |found: Option<&Found>| number(fair.zip(found.and_then(|f| f.side.psnr)).map(|(a, b)| a - b), 2);
+        let lost =
+            |found: Option<&FolderContent>| number(fair.zip(found.and_then(|f| f.side.psnr)).map(|(a, b)| a - b), 2);
         let gaussians = pruned.map_or_else(String::new, |f| grouped(f.side.gaussians));
         let mut line = vec![format!("{:.0} %", 100.0 * share), gaussians];
         line.extend(both(pruned));
@@ -124,11 +125,11 @@ fn rounds(out: &mut String, findings: &Findings, grid: &Grid) {
     table(out, &title, &["rounds", "PSNR", "moving"], grid.rounds.iter().map(line).collect());
 }
 
-fn both(found: Option<&Found>) -> [String; 2] {
+fn both(found: Option<&FolderContent>) -> [String; 2] {
     [found.and_then(|f| f.side.psnr), found.and_then(|f| f.side.psnr_dynamic)].map(|v| number(v, 2))
 }
 
-fn speed(found: Option<&Found>) -> String {
+fn speed(found: Option<&FolderContent>) -> String {
     found.map_or_else(String::new, |f| format!("{:.2}x ({:.2}x)", f.speed, f.raster_speed))
 }
 
@@ -180,7 +181,7 @@ mod tests {
         let page = markdown(&empty, &grid);
         assert!(page.starts_with("## knight") && !page.contains("NaN"), "{page}");
         assert!(plots(&empty, &grid).is_empty());
-        let found = |cell: &Cell| Found {
+        let found = |cell: &Cell| FolderContent {
             key: cell.key(),
             side: Side {
                 gaussians: (150_000.0 * (1.0 - cell.prune)).round() as usize,
@@ -191,7 +192,7 @@ mod tests {
                 ..Side::default()
             },
             speed: 1.0 + cell.prune,
-            ..Found::default()
+            ..FolderContent::default()
         };
         let full = Findings { cells: grid.cells().iter().map(found).collect(), ..empty };
         let page = markdown(&full, &grid);

@@ -150,9 +150,9 @@ fn the_suite_measures_every_capture_once_and_compares() {
     std::fs::write(&list, text).unwrap();
     let suite = |output: &str, more: &[&str]| {
         let output = work.path().join(output);
-        let knobs = ["num_pts=120", "max_cap=150", "sh_degree=1", "motion=spacetime"].map(|s| ["--set", s]);
+        let settings = ["num_pts=120", "max_cap=150", "sh_degree=1", "motion=spacetime"].map(|s| ["--set", s]);
         studies(&["suite", "--data", str(work.path()), "--list", str(&list), "-o", str(&output)])
-            .args(knobs.as_flattened())
+            .args(settings.as_flattened())
             .args(more)
             .run()
             .ok()

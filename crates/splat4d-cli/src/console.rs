@@ -79,8 +79,8 @@ impl Listener for Console {
             Event::Warning(text) => self.warn(text),
             Event::Written(path) => self.written(path),
             Event::Training(event) => self.event(event),
-            Event::StopPolled(reaction) => interrupt::asks(reaction.to_owned()),
-            Event::StopNotPolled(kept) => interrupt::ends(kept),
+            Event::StopPolled(reaction) => interrupt::stop_polled(reaction.to_owned()),
+            Event::StopNotPolled(kept) => interrupt::stop_not_polled(kept),
             _ => {}
         }
     }

@@ -60,7 +60,7 @@ impl State {
 pub fn flag(first: &'static str) -> Arc<AtomicBool> {
     let flag = Arc::new(AtomicBool::new(false));
     let raised = flag.clone();
-    asks(first);
+    stop_polled(first);
     // Where no handler can be set, Ctrl-C simply ends the program; checkpoints on disk stay valid.
     let _ = ctrlc::set_handler(move || {
         let reaction = state().signalled();
@@ -79,14 +79,14 @@ pub fn flag(first: &'static str) -> Arc<AtomicBool> {
 }
 
 /// From now on the work asks for the flag, and does what `first` says.
-pub(crate) fn asks(first: impl Into<Cow<'static, str>>) {
+pub(crate) fn stop_polled(first: impl Into<Cow<'static, str>>) {
     let mut state = state();
     (state.first, state.last) = (first.into(), None);
 }
 
 /// From now on a Ctrl-C ends the program after a moment, also where the work does not ask; `last` says what is kept and how to go
 /// on. A Ctrl-C that came before, and that nothing has followed, ends it now.
-pub(crate) fn ends(last: impl Into<String>) {
+pub(crate) fn stop_not_polled(last: impl Into<String>) {
     let last = last.into();
     let mut state = state();
     if state.raised && !state.embedded {

@@ -208,7 +208,7 @@ where
         Ok(()) => DONE,
         Err(error) => {
             let code = exit_code(&error);
-            console.error(&told(&error), code);
+            console.error(&error_text(&error), code);
             code
         }
     }
@@ -225,7 +225,7 @@ fn threads(count: Option<u16>) -> anyhow::Result<()> {
 }
 
 /// The error and its causes, but no cause whose words were said already.
-pub fn told(error: &anyhow::Error) -> String {
+pub fn error_text(error: &anyhow::Error) -> String {
     error.chain().map(ToString::to_string).fold(String::new(), |mut said, cause| {
         if said.is_empty() {
             said = cause;
@@ -261,7 +261,7 @@ mod tests {
     fn causes_are_printed_once() {
         let io = std::io::Error::other("disk on fire");
         let error = anyhow::Error::from(Error::io("cannot be read", io)).context("the report");
-        let text = told(&error);
+        let text = error_text(&error);
         assert!(text.starts_with("the report: ") && text.matches("disk on fire").count() == 1, "{text}");
     }
 

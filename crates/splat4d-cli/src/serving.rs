@@ -218,7 +218,7 @@ impl Watch {
     }
 
     /// Passes an event on, and waits after a step while the page has paused the run.
-    pub(crate) fn hear(&self, event: &Event) {
+    pub(crate) fn on_event(&self, event: &Event) {
         let Some(running) = &self.running else { return };
         let score = || self.held_out.lock().unwrap_or_else(PoisonError::into_inner);
         let state = |state: &str| running.publish(&News::Control(json!({ "state": state })));

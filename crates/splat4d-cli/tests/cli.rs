@@ -77,9 +77,9 @@ fn help_teaches_and_completions_complete() {
     let own = splat4d(&["predict", "--help"]).run().ok();
     let (of_verb, global) = own.split_once("Global options:").expect("a heading");
     assert!(of_verb.contains("--horizon") && !of_verb.contains("--threads") && global.contains("--threads"), "{own}");
-    let knobs = splat4d(&["train", "--help-knobs"]).run().ok();
-    for knob in ["position_lr_init", "densify_until_iter", "lambda_dssim", "densify.max_cap"] {
-        assert!(knobs.contains(knob), "{knob} is missing");
+    let settings = splat4d(&["train", "--help-knobs"]).run().ok();
+    for setting in ["position_lr_init", "densify_until_iter", "lambda_dssim", "densify.max_cap"] {
+        assert!(settings.contains(setting), "{setting} is missing");
     }
     // The studies are a program of their own.
     assert!(splat4d(&["lab", "e00"]).run().refused().contains("lab"));

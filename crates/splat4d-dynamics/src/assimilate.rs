@@ -16,10 +16,10 @@ use splat4d::math::se3::{add, norm, scale, sub};
 use splat4d::render::Backend;
 use splat4d::scene::Key;
 use splat4d_train::capture::frames::Frames;
+use splat4d_train::maintenance::Limits;
 use splat4d_train::methods::{Group, Rate, Stage};
 use splat4d_train::step::loss::TrainLoss;
 use splat4d_train::step::trainer::{Settings, Trainer};
-use splat4d_train::upkeep::Limits;
 use std::sync::Arc;
 
 /// Steps on the nodes for a new frame.
@@ -108,8 +108,8 @@ impl<'a> Filter<'a> {
         let rest = self.observed.paths.last();
         let mut sums = vec![([0.0; 3], [0.0; 4], 0.0); rest.len()];
         // A layer's nodes are moved by the images of its own Gaussians: they count by how many these are.
-        for (index, keys) in carried(trainer.learner.scene()) {
-            let layer = &trainer.learner.scene().layers[index];
+        for (index, keys) in carried(trainer.train_state.scene()) {
+            let layer = &trainer.train_state.scene().layers[index];
             let weight = layer.params.len() as f64;
             for (k, sum) in sums.iter_mut().enumerate() {
                 // Two keys: shifts 3 + 3, then turns 4 + 4.

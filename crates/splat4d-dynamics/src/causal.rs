@@ -14,7 +14,7 @@ use crate::paths::{Moment, nearest};
 use splat4d::Result;
 use splat4d::math::vec3::dot;
 use splat4d::math::{Real, Rng};
-use splat4d::nn::{InputGrad, Kept, Mlp, MlpShape, Passed};
+use splat4d::nn::{InputGrad, LayerOutputs, Mlp, MlpShape, Passed};
 use splat4d::scene::{Grads, Key, Params};
 
 /// Neighbours of a node.
@@ -78,7 +78,7 @@ pub struct Tick<F> {
     inputs: Vec<[F; 3]>,
     outputs: Vec<[F; 3]>,
     invariants: Vec<F>,
-    kept: Kept<F>,
+    kept: LayerOutputs<F>,
     gates: Vec<F>,
 }
 

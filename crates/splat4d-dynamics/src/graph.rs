@@ -21,7 +21,7 @@ use splat4d::Result;
 use splat4d::math::se3::{norm, sub};
 use splat4d::math::vec3::dot;
 use splat4d::math::{Real, Rng};
-use splat4d::nn::{InputGrad, Kept, Mlp, MlpShape, Passed};
+use splat4d::nn::{InputGrad, LayerOutputs, Mlp, MlpShape, Passed};
 use splat4d::scene::{Grads, Key, Params};
 
 /// Neighbours at rest.
@@ -85,7 +85,7 @@ pub struct Step<F> {
     state: State<F>,
     actions: Vec<Action<F>>,
     edges: Vec<Edge<F>>,
-    inputs: Vec<(Vec<F>, Kept<F>)>,
+    inputs: Vec<(Vec<F>, LayerOutputs<F>)>,
     along: Vec<F>,
     own: Vec<F>,
 }
@@ -278,7 +278,7 @@ impl Network for GraphNet {
         step.inputs.clear();
         let mut pass = |mlp: &Mlp, x: Vec<F>, rows: usize| {
             let mut out = vec![F::ZERO; rows * mlp.shape().outputs];
-            let mut kept = Kept::default();
+            let mut kept = LayerOutputs::default();
             mlp.forward_keeping(p, &x, &mut out, &mut kept);
             step.inputs.push((x, kept));
             out

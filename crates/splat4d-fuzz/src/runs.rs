@@ -6,7 +6,7 @@ use splat4d_train::output::{self, Owner};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::chunks::Chunked;
 use splat4d_train::run::corrected;
-use splat4d_workflow::run_folder::{Asked, Run};
+use splat4d_workflow::run_folder::{Run, RunRequest};
 use std::cell::OnceCell;
 use std::path::Path;
 use tempfile::TempDir;
@@ -47,7 +47,7 @@ fn run_json() -> String {
 }
 
 fn asked() -> String {
-    let asked = Asked::new(Path::new("/nowhere"), &Recipe::default(), Some(1.0), false);
+    let asked = RunRequest::new(Path::new("/nowhere"), &Recipe::default(), Some(1.0), false);
     serde_json::to_string(&asked).expect("it is plain data")
 }
 
@@ -65,7 +65,7 @@ fn open(file: &str, bytes: &[u8]) {
             drop((run.name(), run.iteration(), run.scene_file(), run.views()));
         }
         drop((corrected::read(run), Owner::holder(run)));
-        drop((Chunked::open(run).map(|c| c.parts()), Asked::unbegun(run), output::written(run)));
+        drop((Chunked::open(run).map(|c| c.parts()), RunRequest::unbegun(run), output::written(run)));
         std::fs::remove_file(path).expect("it is there");
     });
 }
@@ -102,7 +102,7 @@ mod tests {
         let run = Run::open(at).unwrap();
         assert_eq!((run.metrics.len(), run.views.len(), run.views().unwrap().len()), (1, 1, 1));
         assert_eq!((run.name().as_str(), output::written(at).len()), ("a", 4));
-        assert!(Asked::unbegun(at).is_some());
+        assert!(RunRequest::unbegun(at).is_some());
         assert!(Chunked::open(at).err().unwrap().to_string().contains("recipe"), "its fingerprint is another");
     }
 }

@@ -15,17 +15,17 @@
 //! | `corrections.rs` | `import.toml`: results per camera, corrected by hand and read again |
 //! | `write/` | images, masks, times and `capture.json`, continued after an interruption |
 //! | `shipped.rs` | frames of captures shipped as a video per camera with poses (Neural 3D Video) |
-//! | `take/` | the whole import: inputs, synchronisation, given calibrations, COLMAP, poses and time offsets in turn, unit and axes, delay of sound, cache, report |
+//! | `recording/` | the whole import: inputs, synchronisation, given calibrations, COLMAP, poses and time offsets in turn, unit and axes, delay of sound, cache, report |
 //! | `doctor/` | problems of a capture: one camera (`look.rs`, `alone.rs`), pairs of cameras (`between.rs`), time offsets and rolling shutters, the dynamic volume, the list of findings (`check.rs`) |
 
 pub mod board;
 pub mod calibration;
 pub mod corrections;
 pub mod doctor;
+pub mod recording;
 pub mod sfm;
 pub mod shipped;
 pub mod sync;
-pub mod take;
 pub mod video;
 pub mod write;
 

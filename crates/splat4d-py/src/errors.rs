@@ -27,7 +27,7 @@ impl<T> OrRaise<T> for anyhow::Result<T> {
     fn or_raise(self) -> PyResult<T> {
         self.map_err(|e| {
             let kind = e.downcast_ref::<splat4d::Error>().map(splat4d::Error::kind);
-            exception(&splat4d_cli::told(&e), kind)
+            exception(&splat4d_cli::error_text(&e), kind)
         })
     }
 }

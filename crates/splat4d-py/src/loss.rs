@@ -44,7 +44,7 @@ pub(crate) struct View {
 }
 
 /// The term that asks the function.
-struct Asked {
+struct RunRequest {
     function: Py<PyAny>,
     raised: Arc<Raised>,
 }
@@ -54,18 +54,18 @@ pub(crate) fn own_loss(function: Py<PyAny>, raised: &Arc<Raised>) -> OwnLoss {
     let raised = raised.clone();
     OwnLoss(Arc::new(move || {
         let function = Python::attach(|py| function.clone_ref(py));
-        Box::new(Asked { function, raised: raised.clone() })
+        Box::new(RunRequest { function, raised: raised.clone() })
     }))
 }
 
-impl ImageTerm for Asked {
+impl ImageTerm for RunRequest {
     fn needs(&self, _: &image::View<'_>) -> Needs {
         Needs::default()
     }
 
     fn eval(&mut self, info: &StepInfo, view: &image::View<'_>, shown: &Shown<'_>, d: &mut PictureGrads) -> f64 {
         let seen = View { time: view.t.0, frame: view.frame, camera: view.rig, iteration: info.iteration };
-        let answer = Python::attach(|py| self.ask(py, seen, shown.color, view.truth, d.color.add()));
+        let answer = Python::attach(|py| self.request(py, seen, shown.color, view.truth, d.color.add()));
         answer.unwrap_or_else(|error| {
             self.raised.raise(error);
             // Not a finite number: the step counts for nothing.
@@ -74,9 +74,9 @@ impl ImageTerm for Asked {
     }
 }
 
-impl Asked {
+impl RunRequest {
     /// The value; the gradient is added to `d`.
-    fn ask(
+    fn request(
         &self,
         py: Python<'_>,
         view: View,

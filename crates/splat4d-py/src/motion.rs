@@ -188,7 +188,7 @@ impl PyMotion {
     }
 
     /// Asks Python for the Gaussians at a time.
-    fn ask(&self, py: Python<'_>, q: &At<'_>) -> PyResult<Answer> {
+    fn request(&self, py: Python<'_>, q: &At<'_>) -> PyResult<Answer> {
         let n = q.len();
         let answer = self.hook.object.bind(py).call_method1("forward", (self.arguments(py, q)?, q.t.0))?;
         let wrong = || bad_input("the motion's forward did not return six things", "Return a splat4d.Motion's forward");
@@ -341,7 +341,7 @@ impl Motion for PyMotion {
         if self.rests || q.is_empty() {
             return Still.at(q, cache, tape);
         }
-        let answer = Python::attach(|py| self.ask(py, q)).unwrap_or_else(|error| {
+        let answer = Python::attach(|py| self.request(py, q)).unwrap_or_else(|error| {
             self.hook.raised.raise(error);
             // The canonical Gaussians: whoever asked hears of the error.
             let raw = |j| q.p[GEOMETRY].read::<11>(q.rows.id(j), 0);

@@ -22,7 +22,7 @@ use splat4d_workflow::editing::{EditOptions, edit};
 use splat4d_workflow::events::{Event, Listener};
 use splat4d_workflow::exporting;
 use splat4d_workflow::paths::View;
-use splat4d_workflow::sequence::moments;
+use splat4d_workflow::sequence::timestamps;
 use splat4d_workflow::source::{Source, not_empty, read_scene};
 use std::cell::RefCell;
 use std::path::{Path, PathBuf};
@@ -341,7 +341,7 @@ impl Scene {
         let scene = &self.source.scene;
         let times: Vec<f64> = match times {
             Some(times) => numbers::<f64>(times, "times")?.as_array().iter().copied().collect(),
-            None => moments(scene, None, [None, None]).or_raise()?.1,
+            None => timestamps(scene, None, [None, None]).or_raise()?.1,
         };
         times.iter().try_for_each(|t| time(*t).map(drop))?;
         let followed = py.detach(|| tracks::Tracks::follow(scene, &tracks::every(scene, every), &times));

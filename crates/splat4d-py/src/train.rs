@@ -12,7 +12,7 @@ use pyo3::prelude::*;
 use pyo3::types::{PyBool, PyDict};
 use splat4d::Result;
 use splat4d_train::event::Event;
-use splat4d_train::output::{Found, OutputFolder};
+use splat4d_train::output::{FolderContent, OutputFolder};
 use splat4d_train::recipe::{MotionName, Quality, Recipe};
 use splat4d_train::run::{self, Outcome, Stopwatch, TrainOptions, open_capture};
 use splat4d_workflow::run_folder;
@@ -71,27 +71,27 @@ pub(crate) fn train(
         recipe.set(&format!("motion={name}")).or_raise()?;
     }
     let names = set(&mut recipe, settings)?;
-    recipe.refuse_idle(names.iter().map(String::as_str)).or_raise()?;
+    recipe.refuse_unused(names.iter().map(String::as_str)).or_raise()?;
     let options =
         TrainOptions { device: named(device)?, minutes, clock: Stopwatch::start(), ..TrainOptions::default() };
     let listener = Listener::new(py, progress, loss, raised)?;
     listener.drive(py, options, |options, listen| {
         let capture = open_capture(&path, &recipe)?;
         let run = out.unwrap_or_else(|| run_folder::free_folder(&run_folder::usual_folder(&capture.name)));
-        let asked = run_folder::Asked::of(&capture, &recipe, minutes, false);
+        let asked = run_folder::RunRequest::of(&capture, &recipe, minutes, false);
         let (folder, found) = asked.begin(&run, force, "train (Python)")?;
         let stop = &listener.raised.stop;
-        let mut hear = |event: &Event| {
-            run_folder::hear(&folder, event);
+        let mut on_event = |event: &Event| {
+            run_folder::on_event(&folder, event);
             listen(event);
         };
-        let trained = if found == Found::Unfinished {
-            run::resume_with(&run, options, stop, &mut hear)
+        let trained = if found == FolderContent::Unfinished {
+            run::resume_with(&run, options, stop, &mut on_event)
         } else {
             run::checkpoint::write_atomically(&run.join("recipe.toml"), recipe.to_toml().as_bytes())?;
             let cameras = run_folder::cameras_json(&capture).to_string();
             run::checkpoint::write_atomically(&run.join("cameras.json"), cameras.as_bytes())?;
-            run::train(Arc::new(capture), recipe, &run, options, stop, &mut hear)
+            run::train(Arc::new(capture), recipe, &run, options, stop, &mut on_event)
         };
         if let Some(folder) = run_folder::left(folder, &run, &trained)
             && trained.as_ref().is_ok_and(|outcome| !outcome.interrupted)
@@ -165,7 +165,7 @@ impl Listener {
         let options = TrainOptions { own_loss, ..options };
         let done = py.detach(|| {
             work(&options, &mut |event| {
-                if let Err(error) = Python::attach(|py| self.hear(py, event)) {
+                if let Err(error) = Python::attach(|py| self.on_event(py, event)) {
                     self.raised.raise(error);
                 }
             })
@@ -181,7 +181,7 @@ impl Listener {
         }
     }
 
-    fn hear(&self, py: Python<'_>, event: &Event) -> PyResult<()> {
+    fn on_event(&self, py: Python<'_>, event: &Event) -> PyResult<()> {
         // Ctrl-C, and whatever other signals have Python functions.
         py.check_signals()?;
         if let Some(progress) = &self.progress {

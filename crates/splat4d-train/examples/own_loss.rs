@@ -13,10 +13,10 @@ use splat4d::scene::{Camera, GEOMETRY, LifeKind, Params, Planes, SH, Space, Tabl
 use splat4d_train::capture::frames::{Frames, Picture};
 use splat4d_train::loss::image::{Channel, ImageTerm, Needs, PictureGrads, Shown, View};
 use splat4d_train::loss::terms::StepInfo;
+use splat4d_train::maintenance::Limits;
 use splat4d_train::methods::{Group, Rate, Stage};
 use splat4d_train::step::loss::TrainLoss;
 use splat4d_train::step::trainer::{Settings, Trainer};
-use splat4d_train::upkeep::Limits;
 use std::sync::Arc;
 
 /// The column of a logit a Gaussian: does it belong to the ball on the right?

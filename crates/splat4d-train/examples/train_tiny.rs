@@ -13,11 +13,11 @@ use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LifeKind, Params, SH, Time};
 use splat4d_train::capture::frames::{Frames, Picture};
 use splat4d_train::init;
-use splat4d_train::methods::Plan;
+use splat4d_train::maintenance::Limits;
+use splat4d_train::methods::TrainContext;
 use splat4d_train::recipe::Recipe;
 use splat4d_train::step::loss::TrainLoss;
 use splat4d_train::step::trainer::{Settings, Trainer};
-use splat4d_train::upkeep::Limits;
 use std::sync::Arc;
 
 const CAMERAS: usize = 8;
@@ -92,10 +92,10 @@ fn main() -> Result<()> {
 
     // The recipe holds every setting; the plan adds what a program must know of the capture.
     let mut recipe = Recipe::default();
-    for knob in ["iterations=400", "init=random", "num_pts=400", "max_cap=800", "sh_degree=0", "half_size_until=0"] {
-        recipe.set(knob)?;
+    for setting in ["iterations=400", "init=random", "num_pts=400", "max_cap=800", "sh_degree=0", "half_size_until=0"] {
+        recipe.set(setting)?;
     }
-    let plan = Plan {
+    let plan = TrainContext {
         extent: 3.3,
         center: [0.0; 3],
         clip: [0.0, (TIMES - 1) as f64 / FPS],

@@ -38,10 +38,10 @@
 //! | `optim/` | Adam, sparse over the active set, sixteen rows at a time; position noise of MCMC |
 //! | `loss/` | L1 + D-SSIM in one fused pass, contracts of losses (`terms.rs`), and every regulariser once, for any model: rigidity, rotation, isometry, ARAP, elastic, velocity, jerk, planes, tracking |
 //! | `loss/image/`, `loss/transport/` | image losses as a list of `ImageTerm`s; transport losses with and without a filter |
-//! | `learner.rs`, `learner/` | `Learner`: scene, moments, statistics, and what cameras learn (exposure, poses, focal lengths, time offsets), which change together or not at all |
-//! | `upkeep/` | maintenance between steps, one operation per file: ADC with splits in time, MCMC, relocation, guided sampling, pruning, merging, nodes, opacity reset, Morton order, the split into static and dynamic layers |
-//! | `upkeep/worth/` | importance of every Gaussian in space and time, key masks |
-//! | `methods/`, `methods/control/` | how each motion model is learned: a `Program` with its `Stage`s; settings of all models (`common.rs`); the automatic choice (`auto.rs`), the filter around any model, losses on nodes |
+//! | `train_state.rs`, `train_state/` | `TrainState`: scene, moments, statistics, and what cameras learn (exposure, poses, focal lengths, time offsets), which change together or not at all |
+//! | `maintenance/` | maintenance between steps, one operation per file: ADC with splits in time, MCMC, relocation, guided sampling, pruning, merging, nodes, opacity reset, Morton order, the split into static and dynamic layers |
+//! | `maintenance/importance/` | importance of every Gaussian in space and time, key masks |
+//! | `methods/`, `methods/control/` | how each motion model is learned: a `Method` with its `Stage`s; settings of all models (`common.rs`); the automatic choice (`auto.rs`), the filter around any model, losses on nodes |
 //! | `init/` | first Gaussians: points, depth maps and their velocities, points added along surfaces (`fill.rs`), visual hulls, random points in the common volume |
 //! | `step/` | one step: the fixed chain (`chain.rs`), channels for losses, pixel weights (`emphasis.rs`), image losses, the engines on CPU and device (`engine.rs`, `resident.rs`), the trainer, the search of time offsets (`clocks.rs`), the schedule (`pace.rs`) |
 //! | `recipe.rs`, `recipe/` | all settings of a run, and the programs and plans built from them (`parts.rs`); TOML, `--set`, old names without tables |
@@ -62,8 +62,8 @@ pub mod files;
 pub mod init;
 pub mod keypoints;
 pub mod labels;
-pub mod learner;
 pub mod loss;
+pub mod maintenance;
 pub mod methods;
 pub mod optim;
 pub mod output;
@@ -74,8 +74,8 @@ pub mod sampler;
 pub mod settings;
 pub mod step;
 pub mod text;
+pub mod train_state;
 pub mod training;
-pub mod upkeep;
 pub mod vision;
 
 pub use splat4d::{Error, ErrorKind, Result};

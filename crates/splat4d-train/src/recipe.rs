@@ -19,22 +19,22 @@ mod text;
 
 use crate::capture::CaptureSettings;
 use crate::init::InitSettings;
-use crate::learner::RefineSettings;
 use crate::loss::{LossSettings, TransportSettings};
+use crate::maintenance::{
+    AdcSettings, DensifySettings, FloaterSettings, GuidedSettings, LEAST, McmcSettings, MergeSettings, NodeSettings,
+    OpacityResetSettings, PruneSettings, RelocateSettings, SplitSettings,
+};
 use crate::methods::{
     AppearanceSettings, ControlSettings, DeformSettings, FilterSettings, HexplaneSettings, LifeSettings,
     Native4dSettings, RateSettings, SpacetimeSettings, SsmSettings, TrackedSettings, still,
 };
 use crate::settings::Table;
-use crate::step::replans::Replans;
-use crate::upkeep::{
-    AdcSettings, DensifySettings, FloaterSettings, GuidedSettings, LEAST, McmcSettings, MergeSettings, NodeSettings,
-    OpacityResetSettings, PruneSettings, RelocateSettings, SplitSettings,
-};
+use crate::step::replans::ScheduleChanges;
+use crate::train_state::RefineSettings;
 pub use chunks::ChunkSettings;
 pub use quality::Quality;
 pub use run::{MotionName, RunSettings};
-pub use text::Idle;
+pub use text::UnusedSetting;
 
 macro_rules! recipe {
     ($($table:ident: $settings:ty,)*) => {
@@ -119,9 +119,9 @@ impl Recipe {
         }
         .resolve();
         let mut r = self.clone();
-        let back = |knob: &mut usize, follows: usize| {
-            if *knob == follows {
-                *knob = 0;
+        let back = |setting: &mut usize, follows: usize| {
+            if *setting == follows {
+                *setting = 0;
             }
         };
         back(&mut r.appearance.sh_degree_interval, follows.appearance.sh_degree_interval);
@@ -130,7 +130,7 @@ impl Recipe {
         back(&mut r.densify.until, follows.densify.until);
         back(&mut r.relocate.from, follows.relocate.from);
         back(&mut r.run.checkpoint_interval, follows.run.checkpoint_interval);
-        r.run.replans = Replans::default();
+        r.run.replans = ScheduleChanges::default();
         r
     }
 
@@ -138,9 +138,9 @@ impl Recipe {
     #[must_use]
     pub fn resolve(&self) -> Self {
         let mut r = self.clone();
-        let fill = |knob: &mut usize, value: usize| {
-            if *knob == 0 {
-                *knob = value.max(1);
+        let fill = |setting: &mut usize, value: usize| {
+            if *setting == 0 {
+                *setting = value.max(1);
             }
         };
         if r.spacetime.has_features() {

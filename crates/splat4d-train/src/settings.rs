@@ -11,7 +11,7 @@ pub use when::{When, is_off};
 
 /// One setting, for help, documents and checks.
 #[derive(Clone, Debug)]
-pub struct Knob {
+pub struct Setting {
     /// The table that it stands in.
     pub table: &'static str,
     /// Its name in that table.
@@ -26,7 +26,7 @@ pub struct Knob {
     pub choices: Vec<&'static str>,
 }
 
-impl Knob {
+impl Setting {
     /// `table.field`.
     pub fn key(&self) -> String {
         format!("{}.{}", self.table, self.field)
@@ -171,7 +171,7 @@ pub(crate) trait Table {
     /// When its settings have an effect.
     fn when(&self) -> When;
     /// Its settings, in order. `table`: the name that the recipe gives it.
-    fn knobs(&self, table: &'static str) -> Vec<Knob>;
+    fn settings(&self, table: &'static str) -> Vec<Setting>;
     /// The value of a setting; `None`: it has no such setting.
     fn get(&self, field: &str) -> Option<toml::Value>;
     /// Sets a setting. Errors: what its value must be, to stand behind "It must be"; an unknown name is our bug.
@@ -227,8 +227,8 @@ macro_rules! settings {
                 $crate::settings::settings!(@when $($when)?)
             }
 
-            fn knobs(&self, table: &'static str) -> Vec<$crate::settings::Knob> {
-                vec![$($crate::settings::Knob {
+            fn settings(&self, table: &'static str) -> Vec<$crate::settings::Setting> {
+                vec![$($crate::settings::Setting {
                     table,
                     field: stringify!($field),
                     default: $crate::settings::Value::to_toml(&Self::default().$field).to_string(),

@@ -12,11 +12,11 @@ use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::{Camera, Params, Splats, Time};
 use splat4d_train::capture::frames::{Frames, Picture};
 use splat4d_train::init::{self, Seeds};
-use splat4d_train::methods::{Group, Plan, Program, Rate, Stage, still};
+use splat4d_train::maintenance::Limits;
+use splat4d_train::methods::{Group, Method, Rate, Stage, TrainContext, still};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::step::loss::TrainLoss;
 use splat4d_train::step::trainer::{Settings, Trainer};
-use splat4d_train::upkeep::Limits;
 use std::sync::Arc;
 
 #[allow(dead_code)] // its own `main` and what that checks
@@ -33,18 +33,18 @@ const SIZE: usize = 40;
 const STEPS: usize = 120;
 
 /// How the model is learnt: as a still scene, and its amplitudes.
-struct SwayProgram;
+struct SwayMethod;
 
-impl Program for SwayProgram {
-    fn spec(&self, _plan: &Plan) -> Spec {
+impl Method for SwayMethod {
+    fn spec(&self, _plan: &TrainContext) -> Spec {
         Spec::Custom("sway".into())
     }
 
-    fn build(&self, _plan: &Plan, params: &mut Params) -> Result<Arc<dyn Motion>> {
+    fn build(&self, _plan: &TrainContext, params: &mut Params) -> Result<Arc<dyn Motion>> {
         Ok(Arc::new(Sway::new(2.0, params)?))
     }
 
-    fn stages(&self, plan: &Plan) -> Vec<Stage> {
+    fn stages(&self, plan: &TrainContext) -> Vec<Stage> {
         let mut stage = still::stage("sway", plan);
         stage.groups.push(Group::new("amplitudes", Rate::constant(5e-3 * plan.extent)));
         vec![stage]
@@ -109,10 +109,11 @@ fn a_model_from_outside_trains_and_its_file_plays() {
     let made = Arc::new(Made { cameras, pictures });
 
     let mut recipe = Recipe::default();
-    for knob in [&format!("iterations={STEPS}"), "strategy=none", "sh_degree=0", "half_size_until=0", "batch_size=2"] {
-        recipe.set(knob).unwrap();
+    for setting in [&format!("iterations={STEPS}"), "strategy=none", "sh_degree=0", "half_size_until=0", "batch_size=2"]
+    {
+        recipe.set(setting).unwrap();
     }
-    let plan = Plan {
+    let plan = TrainContext {
         extent: 4.4,
         clip: [0.0, (TIMES - 1) as f64 / FPS],
         fps: FPS,
@@ -127,11 +128,11 @@ fn a_model_from_outside_trains_and_its_file_plays() {
         let place = rest[splat4d::scene::GEOMETRY].read::<3>(row, 0).map(f64::from);
         seeds.push(place, [0.5; 3], None);
     }
-    let scene = init::scene(&plan, &recipe.init, &SwayProgram, &seeds, [1.0; 3], truth.up).unwrap();
+    let scene = init::scene(&plan, &recipe.init, &SwayMethod, &seeds, [1.0; 3], truth.up).unwrap();
     assert!(scene.layers[0].motion.capabilities().moves, "a model that says nothing may do anything");
     let mut trainer = Trainer::new(
         scene,
-        SwayProgram.stages(&plan),
+        SwayMethod.stages(&plan),
         made.clone(),
         Box::new(Renderer::new(RenderConfig::default())),
         TrainLoss::photometric(plan.common.loss.dssim),

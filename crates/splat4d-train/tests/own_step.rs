@@ -7,13 +7,13 @@ use splat4d::motion::Still;
 use splat4d::render::{Antialias, RenderConfig, Renderer};
 use splat4d::scene::{Camera, LifeKind, Params, Planes, RowEdit, SH, Space, Time};
 use splat4d_train::capture::frames::{Frames, Picture};
-use splat4d_train::learner::Learner;
+use splat4d_train::maintenance::{At, Change, Context, Limits, Maintenance};
 use splat4d_train::methods::{Group, Rate, Stage};
 use splat4d_train::run::checkpoint;
 use splat4d_train::step::engine::{CpuEngine, Engine, Fault, StepPlan, Stepped};
 use splat4d_train::step::loss::TrainLoss;
 use splat4d_train::step::trainer::{Settings, Trainer};
-use splat4d_train::upkeep::{At, Change, Context, Limits, Upkeep};
+use splat4d_train::train_state::TrainState;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -97,12 +97,12 @@ struct Counting {
 }
 
 impl Engine for Counting {
-    fn step(&mut self, learner: &mut Learner, plan: &mut StepPlan<'_>) -> Result<Result<Stepped, Fault>> {
+    fn step(&mut self, train_state: &mut TrainState, plan: &mut StepPlan<'_>) -> Result<Result<Stepped, Fault>> {
         self.steps.fetch_add(1, Ordering::Relaxed);
-        self.inner.step(learner, plan)
+        self.inner.step(train_state, plan)
     }
-    fn changed(&mut self, learner: &Learner) {
-        self.inner.changed(learner);
+    fn changed(&mut self, train_state: &TrainState) {
+        self.inner.changed(train_state);
     }
     fn antialias(&self) -> Antialias {
         self.inner.antialias()
@@ -127,21 +127,21 @@ struct Whiten {
     next: u32,
 }
 
-impl Upkeep for Whiten {
+impl Maintenance for Whiten {
     fn name(&self) -> &str {
         "whiten"
     }
     fn due(&self, at: &At) -> bool {
         at.step.is_multiple_of(7)
     }
-    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
-        learner.scene_mut().layers[0].params[SH].write(self.next as usize, 0, [1.5f32; 3]);
+    fn run(&mut self, train_state: &mut TrainState, c: &Context<'_>) -> Result<Change> {
+        train_state.scene_mut().layers[0].params[SH].write(self.next as usize, 0, [1.5f32; 3]);
         self.next += 1;
         // The last row goes: rows change together with their moments and statistics.
-        let mut edit = RowEdit::identity(Space::Gaussians, learner.scene().len());
+        let mut edit = RowEdit::identity(Space::Gaussians, train_state.scene().len());
         edit.parent.pop();
         edit.born.pop();
-        learner.apply(0, &edit, &c.rng("whiten"));
+        train_state.apply(0, &edit, &c.rng("whiten"));
         Ok(Change { removed: 1, ..Change::default() })
     }
     fn state(&self) -> Vec<u32> {
@@ -171,5 +171,5 @@ fn an_operation_of_ones_own_runs_and_resumes_to_the_bit() {
     checkpoint::read(&kept, &mut again, &checkpoint::Identity::default()).unwrap();
     finish(&mut again);
     assert!(saved(&again) == saved(&whole), "resumed, it ends elsewhere");
-    assert_eq!(again.stages[0].upkeep[0].state(), [4]);
+    assert_eq!(again.stages[0].maintenance[0].state(), [4]);
 }

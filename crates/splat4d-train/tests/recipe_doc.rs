@@ -1,7 +1,7 @@
 //! This test writes `docs/recipe*.md` from the recipe itself, so the reference cannot lag behind the code.
 
 use splat4d_train::recipe::Recipe;
-use splat4d_train::settings::{Knob, Range, When};
+use splat4d_train::settings::{Range, Setting, When};
 use std::path::Path;
 
 /// A page of the reference: its file in docs/, its title, and the tables that it holds; an empty list: all others.
@@ -116,25 +116,26 @@ fn text(page: &Page) -> String {
     let elsewhere = |table: &str| PAGES.iter().any(|p| p.tables.contains(&table));
     let mut text = page.head.to_owned();
     let mut table = "";
-    for knob in Recipe::knobs() {
-        let here = if page.tables.is_empty() { !elsewhere(knob.table) } else { page.tables.contains(&knob.table) };
+    for setting in Recipe::settings() {
+        let here =
+            if page.tables.is_empty() { !elsewhere(setting.table) } else { page.tables.contains(&setting.table) };
         if !here {
             continue;
         }
-        if knob.table != table {
-            table = knob.table;
+        if setting.table != table {
+            table = setting.table;
             let needs = Recipe::needs(table).map_or_else(String::new, |n| format!(" In effect with {n}."));
             text += &format!(
                 "\n## `[{table}]`\n\n{}{needs}\n\n| setting | default | range, unit | meaning | older name |\n|---|---|---|---|---|\n",
                 Recipe::about(table)
             );
         }
-        text += &row(&knob);
+        text += &row(&setting);
     }
     text
 }
 
-fn row(k: &Knob) -> String {
+fn row(k: &Setting) -> String {
     let default = if k.default == "\"\"" { "(empty)".to_owned() } else { format!("`{}`", k.default) };
     // The range of nearly every number is not repeated.
     let range = if k.rule.range == Range::NotNegative { String::new() } else { k.rule.range.to_string() };
@@ -170,7 +171,7 @@ fn every_table_is_on_one_page() {
     for page in &PAGES {
         for table in page.tables {
             assert!(
-                Recipe::knobs().iter().any(|k| k.table == *table),
+                Recipe::settings().iter().any(|k| k.table == *table),
                 "{} names {table}, which does not exist",
                 page.file
             );

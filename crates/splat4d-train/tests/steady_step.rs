@@ -8,11 +8,11 @@ use splat4d::scene::params::{LOG_SCALE, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LIFE, Planes, Time};
 use splat4d_train::capture::frames::{Frames, Picture};
 use splat4d_train::init;
-use splat4d_train::methods::Plan;
+use splat4d_train::maintenance::Limits;
+use splat4d_train::methods::TrainContext;
 use splat4d_train::recipe::Recipe;
 use splat4d_train::step::loss::TrainLoss;
 use splat4d_train::step::trainer::{Settings, Trainer};
-use splat4d_train::upkeep::Limits;
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -86,10 +86,10 @@ fn trainer() -> Result<Trainer<'static>> {
     let grey = Grey((0..CAMERAS).map(camera).collect());
     let mut recipe = Recipe::default();
     let points = format!("num_pts={GAUSSIANS}");
-    for knob in ["iterations=1000", "init=random", &points, "sh_degree=1", "half_size_until=0", "strategy=none"] {
-        recipe.set(knob)?;
+    for setting in ["iterations=1000", "init=random", &points, "sh_degree=1", "half_size_until=0", "strategy=none"] {
+        recipe.set(setting)?;
     }
-    let plan = Plan {
+    let plan = TrainContext {
         extent: 3.3,
         center: [0.0; 3],
         clip: [0.0, 0.1],

@@ -7,7 +7,7 @@ use crate::{evaluating, growing};
 use serde_json::json;
 use splat4d::Result;
 use splat4d_train::event::Event;
-use splat4d_train::run::chunks::{Chunked, Joined, Outlook, Part, Seams};
+use splat4d_train::run::chunks::{ChunkEstimate, Chunked, Joined, Part, Seams};
 use splat4d_train::run::{self, Outcome, TrainOptions};
 use std::path::Path;
 use std::str::FromStr;
@@ -21,14 +21,14 @@ const SEAMS: f64 = 0.25;
 
 /// The value of `--chunk`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Wanted {
+pub enum ChunkSelection {
     /// Whatever there is to do, until nothing is.
     All,
     /// One part.
     One(Part),
 }
 
-impl FromStr for Wanted {
+impl FromStr for ChunkSelection {
     type Err = String;
 
     fn from_str(text: &str) -> std::result::Result<Self, String> {
@@ -41,8 +41,8 @@ impl FromStr for Wanted {
 }
 
 /// The plan in a line.
-pub fn in_words(outlook: &Outlook) -> String {
-    let Outlook { recipe, plan, seconds, memory, .. } = outlook;
+pub fn in_words(outlook: &ChunkEstimate) -> String {
+    let ChunkEstimate { recipe, plan, seconds, memory, .. } = outlook;
     let longest = (0..plan.len()).map(|c| plan.frames(c).len()).max().unwrap_or(0);
     let mut words = format!(
         "{} chunks of at most {longest} frames and {} Gaussians, {} frames of overlap, {} steps each, after a shared \
@@ -64,7 +64,7 @@ pub fn in_words(outlook: &Outlook) -> String {
 pub fn work(
     run: &Path,
     chunked: &Chunked,
-    wanted: Wanted,
+    wanted: ChunkSelection,
     options: &TrainOptions,
     stop: &AtomicBool,
     console: &dyn Listener,
@@ -78,8 +78,8 @@ pub fn work(
         }
     };
     let outcome = match wanted {
-        Wanted::One(part) => chunked.work(part, options, stop, listen),
-        Wanted::All => {
+        ChunkSelection::One(part) => chunked.work(part, options, stop, listen),
+        ChunkSelection::All => {
             let mut finished = || {
                 append();
                 Ok(())

@@ -4,7 +4,7 @@ use crate::baking;
 use crate::draw::antialias;
 use crate::evaluating::{self, Measure};
 use crate::events::{Listener, Recorded};
-use crate::measure::{SIZE, Side, Subject, What, in_turns, looks_of};
+use crate::measure::{SIZE, Side, Subject, What, in_turns, measured_views_of};
 use crate::report::compress::{Compressed, Guard, Step, Tried};
 use crate::run_folder::{self, COMPRESS, ORDER, Run};
 use crate::source::{Source, not_empty, read_scene};
@@ -18,7 +18,7 @@ use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::capture::{Capture, ImageStore};
 use splat4d_train::compress::{self, Compression, Job, Level};
 use splat4d_train::eval::run::{EvalOptions, Scores, assess};
-use splat4d_train::output::{Found, Input, Mixes, OutputFolder, Request};
+use splat4d_train::output::{FolderContent, Input, Mixes, OutputFolder, Request};
 use splat4d_train::path_text::in_command;
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::{TrainOptions, checkpoint};
@@ -35,7 +35,7 @@ const GENTLER: f64 = 0.5;
 /// Settings that the user asked for; they lie in [`ORDER`], so that an interrupted compression knows them.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Order {
+pub struct CompressJob {
     /// The run that is compressed.
     #[serde(with = "splat4d_train::path_text")]
     pub source: PathBuf,
@@ -180,7 +180,7 @@ pub fn resume(dir: &Path, options: &CompressOptions, stop: &AtomicBool, listener
     work.run(options.eval, &options.measure, stop, listener)
 }
 
-impl Order {
+impl CompressJob {
     fn text(&self) -> String {
         toml::to_string(self).expect("an order is plain data")
     }
@@ -204,7 +204,7 @@ const COMMAND: &str = "compress";
 pub struct Work {
     dir: PathBuf,
     folder: OutputFolder,
-    order: Order,
+    order: CompressJob,
     /// Whether this call began it.
     fresh: bool,
     /// Renders while it is tuned. Not part of the order: it may continue on another device.
@@ -225,7 +225,7 @@ impl Work {
                 .remedy(format!("Finish it first: splat4d train --resume {}", in_command(source))));
         }
         let iterations = run.iteration().or_else(|| run.recipe().ok().map(|r| r.run.iterations)).unwrap_or(1);
-        let order = Order {
+        let order = CompressJob {
             source: std::path::absolute(source).map_err(|e| files::cannot_read(source, e))?,
             level: options.level,
             guard: options.guard,
@@ -246,14 +246,14 @@ impl Work {
         Self::place(dir, order, options.force)
     }
 
-    fn place(dir: PathBuf, order: Order, force: bool) -> Result<Self> {
+    fn place(dir: PathBuf, order: CompressJob, force: bool) -> Result<Self> {
         let asked = order.text();
         let origin = Run::open(&order.source)?.origin();
         let mut inputs = vec![Input::new(&order.source, "the run")];
         inputs.extend(origin.inputs());
         let request = Request { command: COMMAND, inputs: &inputs, asked: &asked, force, mixes: Mixes::Anything };
         let (folder, found) = OutputFolder::begin(&dir, &request)?;
-        if found == Found::Unfinished && dir.join(ORDER).is_file() {
+        if found == FolderContent::Unfinished && dir.join(ORDER).is_file() {
             return Self::opened(&dir, folder);
         }
         let work = Self { dir, folder, order, fresh: true, device: Device::Cpu, size: SIZE };
@@ -284,7 +284,7 @@ impl Work {
 
     fn opened(dir: &Path, folder: OutputFolder) -> Result<Self> {
         let path = dir.join(ORDER);
-        let order = Order::read(&files::read_text(&path)?).map_err(|e| e.at(path.display()))?;
+        let order = CompressJob::read(&files::read_text(&path)?).map_err(|e| e.at(path.display()))?;
         Ok(Self { dir: dir.to_owned(), folder, order, fresh: false, device: Device::Cpu, size: SIZE })
     }
 
@@ -379,8 +379,8 @@ impl Work {
         subjects.extend(plain.into_iter().map(What::File));
         subjects.extend(unpruned.iter().map(|(scene, _)| What::Scene(scene)));
         let subjects: Vec<Subject<'_>> = subjects.into_iter().map(|what| Subject { what, antialias: smooth }).collect();
-        let looks = looks_of(source, self.size)?;
-        let sides = in_turns(&subjects, &looks, &mut |done, total| console.phase("playing", done, total))?;
+        let measured_views = measured_views_of(source, self.size)?;
+        let sides = in_turns(&subjects, &measured_views, &mut |done, total| console.phase("playing", done, total))?;
         console.clear();
         let mut sides = sides.into_iter();
         let mut next = || sides.next().expect("a side for every subject");
@@ -479,7 +479,7 @@ impl Work {
         let job = original.job(&self.order.settings);
         let options = TrainOptions { device: self.device, ..TrainOptions::default() };
         let compressed = compress::compress(&job, &self.dir, &options, stop, &mut |event| {
-            run_folder::hear(&self.folder, event);
+            run_folder::on_event(&self.folder, event);
             console.event(event);
         })?;
         console.clear();

@@ -349,7 +349,7 @@ fn write_frames(
     writer: &Writer,
     console: &dyn Listener,
 ) -> Result<()> {
-    let (fps, times) = sequence::moments(scene, args.fps, [args.from, args.to])?;
+    let (fps, times) = sequence::timestamps(scene, args.fps, [args.from, args.to])?;
     let mut constant = args.constant.then(|| Constant::new(scene, times.clone())).transpose()?;
     let read = sequence::Read { path: &args.input, run };
     let owned = sequence::take(&[pattern], times.len(), &read, "convert", args.force)?;

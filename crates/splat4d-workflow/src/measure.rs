@@ -102,26 +102,26 @@ pub struct Subject<'a> {
 
 /// A camera and a time.
 #[derive(Clone, Debug)]
-pub struct Look {
+pub struct MeasuredView {
     pub camera: Camera,
     pub time: Time,
 }
 
 /// The source's own cameras over its clip, or an orbit where it names none.
-pub fn looks_of(source: &Source, size: [usize; 2]) -> Result<Vec<Look>> {
+pub fn measured_views_of(source: &Source, size: [usize; 2]) -> Result<Vec<MeasuredView>> {
     let views = source.views()?;
     if !views.is_empty() {
-        return Ok(looks(&views, source.scene.clip, size));
+        return Ok(measured_views(&views, source.scene.clip, size));
     }
     let stage = source.stage(&views);
     let orbit =
         |i: usize| View { camera: stage.orbit(i as f64 / LOOKS as f64), name: i.to_string(), time: 0.0, held: false };
-    Ok(looks(&(0..LOOKS).map(orbit).collect::<Vec<_>>(), source.scene.clip, size))
+    Ok(measured_views(&(0..LOOKS).map(orbit).collect::<Vec<_>>(), source.scene.clip, size))
 }
 
 /// Moments in the middle of equal parts of the clip, each from another camera: images of this size with the camera's
 /// vertical field of view. Panics: no views.
-pub fn looks(views: &[View], clip: [f64; 2], [width, height]: [usize; 2]) -> Vec<Look> {
+pub fn measured_views(views: &[View], clip: [f64; 2], [width, height]: [usize; 2]) -> Vec<MeasuredView> {
     let mut seen = BTreeSet::new();
     let cameras: Vec<&Camera> = views.iter().filter(|v| seen.insert(v.name.as_str())).map(|v| &v.camera).collect();
     let step = stride(cameras.len());
@@ -129,7 +129,7 @@ pub fn looks(views: &[View], clip: [f64; 2], [width, height]: [usize; 2]) -> Vec
         let camera = cameras[i * step % cameras.len()];
         let fov_y = 2.0 * (0.5 * camera.height as f64 / camera.intrinsics.fy).atan();
         let time = clip[0] + (clip[1] - clip[0]) * (i as f64 + 0.5) / LOOKS as f64;
-        Look { camera: Camera::with_fov_y(camera.cam_from_world, fov_y, width, height), time: Time(time) }
+        MeasuredView { camera: Camera::with_fov_y(camera.cam_from_world, fov_y, width, height), time: Time(time) }
     };
     (0..LOOKS).map(look).collect()
 }
@@ -152,22 +152,26 @@ fn stride(cameras: usize) -> usize {
 /// Panics: no looks.
 ///
 /// Errors: those of the file.
-pub fn in_turns(subjects: &[Subject<'_>], looks: &[Look], progress: &mut dyn FnMut(usize, usize)) -> Result<Vec<Side>> {
-    assert!(!looks.is_empty(), "a measurement needs something to look at");
-    let mut seats = subjects.iter().map(|s| Seat::new(s, looks.len())).collect::<Result<Vec<_>>>()?;
+pub fn in_turns(
+    subjects: &[Subject<'_>],
+    measured_views: &[MeasuredView],
+    progress: &mut dyn FnMut(usize, usize),
+) -> Result<Vec<Side>> {
+    assert!(!measured_views.is_empty(), "a measurement needs something to look at");
+    let mut seats = subjects.iter().map(|s| Seat::new(s, measured_views.len())).collect::<Result<Vec<_>>>()?;
     let total = DECODES + ROUNDS + 1;
     for round in 0..DECODES {
         for (seat, subject) in seats.iter_mut().zip(subjects) {
-            seat.decode_ms = seat.decode_ms.min(1e3 * first_picture(subject, &seat.stored, &looks[0])?);
+            seat.decode_ms = seat.decode_ms.min(1e3 * first_picture(subject, &seat.stored, &measured_views[0])?);
         }
         progress(round + 1, total);
     }
     for round in 0..=ROUNDS {
-        for (i, look) in looks.iter().enumerate() {
+        for (i, look) in measured_views.iter().enumerate() {
             for seat in &mut seats {
                 let seconds = seat.draw(look)?;
                 if round == 0 {
-                    seat.pairs += seat.renderer.count_pairs().tested as f64 / looks.len() as f64;
+                    seat.pairs += seat.renderer.count_pairs().tested as f64 / measured_views.len() as f64;
                 } else {
                     let best = &mut seat.best[i];
                     *best = [best[0].min(seconds[0]), best[1].min(seconds[1])];
@@ -196,7 +200,7 @@ struct Seat<'a> {
 }
 
 impl<'a> Seat<'a> {
-    fn new(subject: &Subject<'a>, looks: usize) -> Result<Self> {
+    fn new(subject: &Subject<'a>, measured_views: usize) -> Result<Self> {
         let (side, stored, player) = match &subject.what {
             What::Scene(scene) => {
                 let mut stored = Vec::new();
@@ -214,14 +218,14 @@ impl<'a> Seat<'a> {
             renderer: renderer(subject),
             image: Image::default(),
             rgb: Vec::new(),
-            best: vec![[f64::INFINITY; 2]; looks],
+            best: vec![[f64::INFINITY; 2]; measured_views],
             decode_ms: f64::INFINITY,
             pairs: 0.0,
         })
     }
 
     /// Draws one image; seconds of the blend stage and of all.
-    fn draw(&mut self, look: &Look) -> Result<[f64; 2]> {
+    fn draw(&mut self, look: &MeasuredView) -> Result<[f64; 2]> {
         let clock = Instant::now();
         let splats = self.player.at(look.time)?;
         self.renderer.render(&Shot::new(&splats, &look.camera, self.background), &mut self.image);
@@ -276,7 +280,7 @@ fn renderer(subject: &Subject<'_>) -> Renderer<f32> {
 }
 
 /// Seconds from bytes in memory to an image in 8 bits, by a renderer that has no memory yet.
-fn first_picture(subject: &Subject<'_>, stored: &Arc<[u8]>, look: &Look) -> Result<f64> {
+fn first_picture(subject: &Subject<'_>, stored: &Arc<[u8]>, look: &MeasuredView) -> Result<f64> {
     let clock = Instant::now();
     let (mut renderer, mut image, mut rgb) = (renderer(subject), Image::default(), Vec::new());
     match &subject.what {

@@ -11,7 +11,7 @@ const MOST_POINTS: usize = 1_000_000;
 
 /// A point of the file.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Asked {
+pub struct PointQuery {
     query: Query,
     /// The camera whose view of it is returned.
     camera: Option<String>,
@@ -37,7 +37,7 @@ fn remedy() -> String {
 ///
 /// Errors, with the line's number: columns that are unknown, missing or twice, a number that is none, a camera that is not
 /// there, a pixel outside of its image, a time outside of the clip.
-pub fn read(text: &str, views: &[View], clip: [f64; 2]) -> Result<Vec<Asked>> {
+pub fn read(text: &str, views: &[View], clip: [f64; 2]) -> Result<Vec<PointQuery>> {
     let mut lines = text.lines().enumerate().map(|(i, l)| (i + 1, l.trim())).filter(|(_, l)| !l.is_empty());
     let (_, header) = lines.next().ok_or_else(|| Error::input("the file of points is empty").remedy(remedy()))?;
     let mut columns = Vec::new();
@@ -107,7 +107,7 @@ pub fn read(text: &str, views: &[View], clip: [f64; 2]) -> Result<Vec<Asked>> {
             }
             None => return Err(place(Error::input("a pixel has no camera").remedy(remedy()))),
         };
-        out.push(Asked { query: Query { time, place }, camera });
+        out.push(PointQuery { query: Query { time, place }, camera });
     }
     if out.is_empty() {
         return Err(Error::input("the file contains no points").remedy(remedy()));
@@ -132,18 +132,18 @@ fn at<'a>(views: &'a [View], name: &str, t: f64) -> Result<&'a Camera> {
 }
 
 /// Points that were followed, and what their cameras see of them.
-pub struct Answer {
-    asked: Vec<Asked>,
+pub struct QueryResult {
+    asked: Vec<PointQuery>,
     followed: Followed,
     /// [points, times]
     sights: Vec<Option<Sight>>,
 }
 
-impl Answer {
+impl QueryResult {
     /// Follows points to some moments. `progress` hears how many moments of how many are done.
     pub fn of(
         scene: &Scene<f32>,
-        asked: Vec<Asked>,
+        asked: Vec<PointQuery>,
         views: &[View],
         times: &[f64],
         progress: &mut dyn FnMut(usize, usize),

@@ -10,7 +10,7 @@ use score::{Views, scores};
 
 use crate::events::Listener;
 use crate::files::human_seconds;
-use crate::report::predict::Told;
+use crate::report::predict::Summary;
 use crate::run_folder::Run;
 use crate::source::read_scene;
 use crate::{files, report};
@@ -206,22 +206,23 @@ impl Work {
         console.clear();
         let mut told = Vec::new();
         for (f, own) in forecasts.iter().zip(&cases) {
-            let mut worth = scores(f.model.name(), own, [&cases[0], &cases[1]], self.horizon);
-            worth.seconds_fit = f.seconds[0];
-            worth.seconds_rollout = f.seconds[1];
-            worth.backtest = f.backtest;
-            worth.diverged = diverged(&f.moments, self.observed.paths.last(), self.observed.size);
-            worth.node_error = truth.as_ref().map(|t| node_errors(&f.moments, t));
-            worth.calibration = truth.as_ref().zip(f.spread.as_ref()).and_then(|(t, s)| calibration(&f.moments, s, t));
-            worth.track_error = views.track_errors(self, &f.moments);
-            told.push(worth);
+            let mut model_scores = scores(f.model.name(), own, [&cases[0], &cases[1]], self.horizon);
+            model_scores.seconds_fit = f.seconds[0];
+            model_scores.seconds_rollout = f.seconds[1];
+            model_scores.backtest = f.backtest;
+            model_scores.diverged = diverged(&f.moments, self.observed.paths.last(), self.observed.size);
+            model_scores.node_error = truth.as_ref().map(|t| node_errors(&f.moments, t));
+            model_scores.calibration =
+                truth.as_ref().zip(f.spread.as_ref()).and_then(|(t, s)| calibration(&f.moments, s, t));
+            model_scores.track_error = views.track_errors(self, &f.moments);
+            told.push(model_scores);
         }
         let oracle = match &oracle {
             Some(scene) => {
                 let own = views.cases(self, scene)?;
-                let mut worth = scores("oracle", &own, [&cases[0], &cases[1]], self.horizon);
-                worth.track_error = truth.as_ref().and_then(|t| views.track_errors(self, t));
-                Some(worth)
+                let mut model_scores = scores("oracle", &own, [&cases[0], &cases[1]], self.horizon);
+                model_scores.track_error = truth.as_ref().and_then(|t| views.track_errors(self, t));
+                Some(model_scores)
             }
             None => None,
         };
@@ -230,7 +231,7 @@ impl Work {
             true => Some(assimilate::run(self, best, &views, [&cases[0], &cases[1]], console)?),
             false => None,
         };
-        let told = Told {
+        let told = Summary {
             run: self.order.run.clone(),
             until: self.clock.until,
             fps: self.clock.fps,
@@ -359,7 +360,7 @@ impl Work {
 }
 
 /// The figures in the terminal.
-fn say(told: &Told, console: &dyn Listener) {
+fn say(told: &Summary, console: &dyn Listener) {
     let number = |x: Option<f64>, digits: usize| x.map_or("–".to_owned(), |x| format!("{x:.digits$}"));
     console.say("model          PSNR  dynamic regions     skill over freeze  over velocity");
     for m in told.models.iter().chain(&told.assimilated).chain(&told.oracle) {

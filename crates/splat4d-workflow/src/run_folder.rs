@@ -10,7 +10,7 @@ use splat4d::scene::{Camera, Intrinsics, Lens};
 use splat4d::{Error, Result};
 use splat4d_train::capture::{Capture, Split};
 use splat4d_train::event::Event;
-use splat4d_train::output::{Found, Input, Mixes, OutputFolder, Owner, Request, STATE};
+use splat4d_train::output::{FolderContent, Input, Mixes, OutputFolder, Owner, Request, STATE};
 use splat4d_train::path_text::of_text;
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::{capture_options, checkpoint, recorded_elsewhere};
@@ -179,8 +179,8 @@ impl Run {
     }
 
     /// The setting `table.field` of the recipe, as text.
-    pub fn recipe_text(&self, knob: &str) -> Option<String> {
-        self.recipe().ok()?.get(knob).map(|v| v.as_str().map_or_else(|| v.to_string(), str::to_owned))
+    pub fn recipe_text(&self, setting: &str) -> Option<String> {
+        self.recipe().ok()?.get(setting).map(|v| v.as_str().map_or_else(|| v.to_string(), str::to_owned))
     }
 
     /// The recipe.
@@ -395,7 +395,7 @@ impl Origin {
 
 /// What a training run was asked for: the same command continues it, from whatever state a crash left.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Asked {
+pub struct RunRequest {
     version: String,
     /// The capture's real path.
     #[serde(with = "splat4d_train::path_text")]
@@ -411,7 +411,7 @@ pub struct Asked {
     elsewhere: BTreeSet<PathBuf>,
 }
 
-impl Asked {
+impl RunRequest {
     pub fn new(capture: &Path, recipe: &Recipe, minutes: Option<f64>, predict: bool) -> Self {
         let capture = capture.canonicalize().unwrap_or_else(|_| capture.to_owned());
         let (version, recipe) = (env!("CARGO_PKG_VERSION").into(), recipe.to_toml());
@@ -434,22 +434,22 @@ impl Asked {
     }
 
     /// Takes the folder of the run for a new training or the rest of one. What is there of one that took no step is removed.
-    pub fn begin(&self, run: &Path, force: bool, command: &str) -> Result<(OutputFolder, Found)> {
+    pub fn begin(&self, run: &Path, force: bool, command: &str) -> Result<(OutputFolder, FolderContent)> {
         let asked = serde_json::to_string(self).expect("it is plain data");
         let origin = Origin { capture: Some(self.capture.clone()), elsewhere: self.elsewhere.clone() };
         let inputs: Vec<Input<'_>> = origin.inputs().collect();
         let request = Request { command, inputs: &inputs, asked: &asked, force, mixes: Mixes::Anything };
         let (folder, found) = OutputFolder::begin(run, &request)?;
-        if found == Found::Unfinished && checkpoint::list(run).is_empty() {
+        if found == FolderContent::Unfinished && checkpoint::list(run).is_empty() {
             folder.clear()?;
-            return Ok((folder, Found::Nothing));
+            return Ok((folder, FolderContent::Nothing));
         }
         Ok((folder, found))
     }
 }
 
 /// Takes note of an event of a run that is written into a folder: from its first step on the run is kept.
-pub fn hear(folder: &OutputFolder, event: &Event) {
+pub fn on_event(folder: &OutputFolder, event: &Event) {
     match event {
         Event::Checkpoint { iteration: 1.., .. } | Event::Finished { .. } => folder.begun(),
         _ => {}
@@ -486,7 +486,7 @@ pub fn free_folder(wanted: &Path) -> PathBuf {
 
 /// An entry `ours_N` of `results.json` next to the one that the run is judged by.
 #[derive(Clone, Debug)]
-pub struct Beside<'a> {
+pub struct Baseline<'a> {
     /// What it is called: a split, and a background where it is not the run's own.
     pub name: &'a str,
     pub step: usize,
@@ -494,9 +494,9 @@ pub struct Beside<'a> {
 }
 
 /// The newest of each, by name.
-pub fn beside(results: &Value) -> Vec<Beside<'_>> {
+pub fn baselines(results: &Value) -> Vec<Baseline<'_>> {
     let entries = results.as_object().into_iter().flatten();
-    entries.filter_map(|(name, entry)| newest(entry).map(|(step, scores)| Beside { name, step, scores })).collect()
+    entries.filter_map(|(name, entry)| newest(entry).map(|(step, scores)| Baseline { name, step, scores })).collect()
 }
 
 /// The entry `ours_N` with the largest N.

@@ -283,7 +283,7 @@ fn number_in(name: &OsStr) -> Option<u64> {
 /// The moments, in seconds, of a sequence of a scene: `fps` a second from `from` to `to`.
 ///
 /// Errors: there are none, or too many.
-pub fn moments(scene: &Scene<f32>, fps: Option<f64>, range: [Option<f64>; 2]) -> Result<(f64, Vec<f64>)> {
+pub fn timestamps(scene: &Scene<f32>, fps: Option<f64>, range: [Option<f64>; 2]) -> Result<(f64, Vec<f64>)> {
     let fps = fps.unwrap_or(if scene.fps > 0.0 { scene.fps } else { DEFAULT_FPS });
     let [from, to] = [range[0].unwrap_or(scene.clip[0]), range[1].unwrap_or(scene.clip[1])];
     let count = ((to - from) * fps + 1e-6).floor() + 1.0;

@@ -7,7 +7,7 @@ use divan::counter::ItemsCount;
 use rayon::prelude::*;
 use splat4d::math::Rng;
 use splat4d::nn::matmul::{Matrix, product};
-use splat4d::nn::{HashGrid, HashShape, InputGrad, Kept, Mlp, MlpShape, Passed};
+use splat4d::nn::{HashGrid, HashShape, InputGrad, LayerOutputs, Mlp, MlpShape, Passed};
 use splat4d::scene::{Grads, Params};
 
 const ROWS: usize = 50_000;
@@ -38,7 +38,7 @@ fn network(bencher: Bencher<'_, '_>, threads: usize, shape: MlpShape) {
     let mut p = Params::<f32>::new(0, 1, &[]);
     let mlp = Mlp::new("net", shape, 1.0, Rng::new(1, "bench", 1), &mut p).expect("the shape is sound");
     let (x, d_out) = (numbers(ROWS * shape.inputs), numbers(ROWS * shape.outputs));
-    let (mut out, mut kept, mut d) = (vec![0.0; d_out.len()], Kept::default(), Grads::new(&p));
+    let (mut out, mut kept, mut d) = (vec![0.0; d_out.len()], LayerOutputs::default(), Grads::new(&p));
     // Forward, gradient to weights, gradient to inputs of all maps but the first.
     let products: usize = shape.maps().expect("sound").iter().map(|(i, o)| 3 * i * o).sum();
     let flops = 2 * ROWS * (products - shape.inputs * shape.width);

@@ -1,10 +1,10 @@
 //! The device that draws: the GPU where there is one that can, else the CPU, and a sentence that says why.
 
-mod kept;
+mod resident;
 #[cfg(test)]
 mod tests;
 
-pub use kept::KeptMotion;
+pub use resident::ResidentMotion;
 
 #[cfg(feature = "gpu")]
 use crate::gpu::{Adapters, Gpu, GpuRenderer, Tuning};

@@ -119,9 +119,9 @@ pub fn flow_columns<F: Real>(scene: &Scene<F>, start: &Evaluation<F>, from: &Cam
 fn follow<F: Real>(scene: &Scene<F>, of: &Evaluation<F>, t: Time, out: &mut Evaluation<F>) {
     out.begin();
     for (layer, from) in of.tapes().enumerate() {
-        out.ask(layer, Space::Gaussians, from.rows(), t);
+        out.request(layer, Space::Gaussians, from.rows(), t);
     }
-    out.answer(&scene.layers);
+    out.evaluate(&scene.layers);
 }
 
 /// Blends vectors (all columns but the last) and divides by the blended last column, 1 where there is a vector.

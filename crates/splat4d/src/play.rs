@@ -255,8 +255,8 @@ impl<'a> Player<'a> {
             h.look_up(t);
             let rows = if h.alive.all { Rows::All } else { Rows::Some(&h.ids) };
             h.evaluation.begin();
-            h.evaluation.ask(0, Space::Gaussians, rows, t);
-            h.evaluation.answer(std::slice::from_ref(h.layer.as_ref()));
+            h.evaluation.request(0, Space::Gaussians, rows, t);
+            h.evaluation.evaluate(std::slice::from_ref(h.layer.as_ref()));
         });
         let parts = self.shown.iter().map(|&i| self.held[i].layer.part(self.held[i].evaluation.tape(0))).collect();
         Ok(Splats { parts, head: self.head })

@@ -8,12 +8,12 @@ use super::scenes::Pinned;
 use super::stages::{Way, gradient, zeros};
 use super::training::{self, Held};
 use splat4d::Result;
-use splat4d::device::KeptMotion;
+use splat4d::device::ResidentMotion;
 use splat4d::gpu::{Adapters, Gpu, GpuRenderer, GpuRoofline, GpuStats, GpuTimings, StageClock, Tuning};
 use splat4d::layers::{ALPHA_MIN, Layer};
 use splat4d::math::Se3;
 use splat4d::play::Player;
-use splat4d::render::{Backend, Image, ImageGrads, KeptLayer, KeptTable, RenderConfig, RenderGrads, Shot};
+use splat4d::render::{Backend, Image, ImageGrads, RenderConfig, RenderGrads, ResidentLayer, ResidentTable, Shot};
 use splat4d::scene::{Camera, Splats, Table, Time};
 use std::path::Path;
 use std::sync::Arc;
@@ -159,7 +159,7 @@ pub(super) fn measure(
 }
 
 /// Trains still scenes as other programs do whose runs lie in a folder, and leaves there what they need for it.
-pub(super) fn beside(
+pub(super) fn other_programs(
     scenes: &[Pinned],
     folder: &Path,
     way: Way,
@@ -168,10 +168,10 @@ pub(super) fn beside(
 ) -> Result<Vec<Row>> {
     let one = |pinned: &Pinned| {
         let mut renderer = renderer(Tuning::default())?;
-        renderer.config = super::beside::config();
+        renderer.config = super::other_programs::config();
         let name = renderer.gpu().describe();
         note(&format!("scene {} on {name}, against others ...", pinned.name));
-        let measured = pool.install(|| super::beside::measure(pinned, folder, way, Box::new(renderer), &name));
+        let measured = pool.install(|| super::other_programs::measure(pinned, folder, way, Box::new(renderer), &name));
         let (row, verdicts) = measured?;
         verdicts.iter().for_each(|verdict| note(&format!("scene {}: {verdict}", pinned.name)));
         Ok(Row { device: Some(name), simd: "gpu".into(), ..row })
@@ -297,21 +297,21 @@ fn film(pinned: &Pinned, way: Way, renderer: &mut GpuRenderer, stages: &[Row]) -
     let path: Vec<(Camera, Time)> = (0..frames).map(|i| along(pinned, i as f64 / frames as f64)).collect();
     let mut best = f64::MAX;
     let times: Vec<Time> = path.iter().map(|p| p.1).collect();
-    let known: Option<Vec<_>> = pinned.scene.layers.iter().map(|l| KeptMotion::new(l, &times)).collect();
+    let known: Option<Vec<_>> = pinned.scene.layers.iter().map(|l| ResidentMotion::new(l, &times)).collect();
     let Some(known) = known else { return Ok(Vec::new()) };
     // Three columns a row, in blocks of sixteen.
     let stats: Vec<Vec<f32>> =
         pinned.scene.layers.iter().map(|l| vec![0.0; 3 * l.params.len().next_multiple_of(16)]).collect();
-    fn kept<'a>(((layer, known), stats): ((&'a Layer, &KeptMotion), &'a Vec<f32>)) -> KeptLayer<'a> {
+    fn kept<'a>(((layer, known), stats): ((&'a Layer, &ResidentMotion), &'a Vec<f32>)) -> ResidentLayer<'a> {
         let tables = known.keys.map(|key| {
-            key.map_or(KeptTable::default(), |key| {
+            key.map_or(ResidentTable::default(), |key| {
                 let table = &layer.params[key];
-                KeptTable { width: table.width(), params: table.data(), moments: &[] }
+                ResidentTable { width: table.width(), params: table.data(), moments: &[] }
             })
         });
-        KeptLayer { rows: layer.params.len(), moves: known.moves, life: layer.life, tables, stats, ties: None }
+        ResidentLayer { rows: layer.params.len(), moves: known.moves, life: layer.life, tables, stats, ties: None }
     }
-    let layers: Vec<KeptLayer<'_>> = pinned.scene.layers.iter().zip(&known).zip(&stats).map(kept).collect();
+    let layers: Vec<ResidentLayer<'_>> = pinned.scene.layers.iter().zip(&known).zip(&stats).map(kept).collect();
     for _ in 0..way.rounds.min(FILMS) {
         let film = renderer.film(&layers, ALPHA_MIN, pinned.scene.background, &path)?;
         let Some(seconds) = film else { return Ok(Vec::new()) };

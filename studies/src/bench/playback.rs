@@ -5,7 +5,7 @@ use splat4d::Result;
 use splat4d_cli::console::Console;
 use splat4d_workflow::draw::antialias;
 use splat4d_workflow::files::{self, grouped, human_bytes};
-use splat4d_workflow::measure::{Side, Subject, What, in_turns, looks_of};
+use splat4d_workflow::measure::{Side, Subject, What, in_turns, measured_views_of};
 use splat4d_workflow::source::{Source, not_empty};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -26,7 +26,7 @@ pub(super) fn measure(files: &[PathBuf], size: [usize; 2], console: &Console) ->
     let sources = files.iter().map(|f| Opened::new(f)).collect::<Result<Vec<_>>>()?;
     // Frame rates compare only where the images do: all are seen from the first one's cameras that has some.
     let first = sources.iter().position(|s| s.source.run.is_some() || s.source.playback.is_some()).unwrap_or(0);
-    let looks = looks_of(&sources[first].source, size)?;
+    let measured_views = measured_views_of(&sources[first].source, size)?;
     let subjects: Vec<Subject<'_>> = sources
         .iter()
         .map(|one| Subject {
@@ -34,7 +34,7 @@ pub(super) fn measure(files: &[PathBuf], size: [usize; 2], console: &Console) ->
             antialias: antialias(one.smooth()),
         })
         .collect();
-    let sides = in_turns(&subjects, &looks, &mut |done, total| console.phase("playing", done, total));
+    let sides = in_turns(&subjects, &measured_views, &mut |done, total| console.phase("playing", done, total));
     console.clear();
     let rows = sides?.into_iter().zip(files).zip(&sources).map(|((side, file), one)| Played {
         file: file.clone(),

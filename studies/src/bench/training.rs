@@ -12,13 +12,13 @@ use splat4d::render::{Backend, Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::{Camera, Planes, SH, Time};
 use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::capture::frames::{Frames, Picture};
-use splat4d_train::methods::{Group, Plan, Stage};
+use splat4d_train::maintenance::Limits;
+use splat4d_train::maintenance::Strategy;
+use splat4d_train::methods::{Group, Stage, TrainContext};
 use splat4d_train::recipe::{MotionName, Recipe};
 use splat4d_train::run::peak_memory;
 use splat4d_train::step::loss::TrainLoss;
 use splat4d_train::step::trainer::{Settings, Stepped, Trainer};
-use splat4d_train::upkeep::Limits;
-use splat4d_train::upkeep::Strategy;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
@@ -123,7 +123,7 @@ fn stage(scene: &Scene<f32>, extent: f64) -> Result<Stage> {
         r.densify.strategy = Strategy::None;
         r.run.half_size_until = 0.0;
     });
-    let plan = Plan {
+    let plan = TrainContext {
         extent,
         center: [0.0; 3],
         clip: scene.clip,

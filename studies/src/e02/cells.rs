@@ -10,13 +10,13 @@ pub(crate) struct Variant {
     pub key: &'static str,
     /// For people.
     pub name: &'static str,
-    knobs: &'static [&'static str],
+    settings: &'static [&'static str],
     /// Whether a glance looks at it too.
     quick: bool,
 }
 
-const fn variant(key: &'static str, name: &'static str, knobs: &'static [&'static str], quick: bool) -> Variant {
-    Variant { key, name, knobs, quick }
+const fn variant(key: &'static str, name: &'static str, settings: &'static [&'static str], quick: bool) -> Variant {
+    Variant { key, name, settings, quick }
 }
 
 /// The first is what all are compared with.
@@ -86,7 +86,7 @@ impl Variant {
     pub(crate) fn recipe(&self, base: &Recipe, seed: u64) -> Result<Recipe> {
         let off = ["filter=off", "transport=off", "filter_predictor=wasserstein"];
         let mut recipe = base.clone().with(|r| r.run.seed = seed);
-        off.iter().chain(self.knobs).try_for_each(|knob| recipe.set(knob))?;
+        off.iter().chain(self.settings).try_for_each(|setting| recipe.set(setting))?;
         Ok(recipe)
     }
 }

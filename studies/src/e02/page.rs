@@ -1,14 +1,14 @@
 //! What the ablation found, as a table and a curve.
 
 use super::cells::Variant;
-use super::{Found, Study};
+use super::{FolderContent, Study};
 use crate::tables::{number, table};
 use splat4d_workflow::report::chart::{self, Series};
 
-type Get = fn(&Found) -> Option<f64>;
+type Get = fn(&FolderContent) -> Option<f64>;
 
 /// Mean over the seeds, and the spread of its ends where there are several.
-fn over(found: &[&Found], get: Get) -> Option<(f64, Option<f64>)> {
+fn over(found: &[&FolderContent], get: Get) -> Option<(f64, Option<f64>)> {
     let values: Vec<f64> = found.iter().filter_map(|f| get(f)).collect();
     let mean = (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)?;
     let [low, high] = [f64::min, f64::max].map(|f| values.iter().copied().reduce(f).unwrap_or(mean));
@@ -103,14 +103,14 @@ mod tests {
         assert!(!empty.contains("NaN") && plot(&study, &all).is_none());
         for (i, v) in all.iter().enumerate() {
             for seed in 0..2 {
-                study.cells.push(Found {
+                study.cells.push(FolderContent {
                     key: v.key.into(),
                     seed,
                     psnr: Some(25.0 + seed as f64),
                     flicker: Some(2.0 - 0.1 * i as f64),
                     flow: Some(FlowError { all: 1.0, moving: Some(4.0) }),
                     minutes: 1.0,
-                    ..Found::default()
+                    ..FolderContent::default()
                 });
             }
         }

@@ -82,7 +82,7 @@ pub(crate) struct Args {
 /// What one capture came to in so many steps. Values are dB unless named otherwise.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
-struct Found {
+struct FolderContent {
     capture: String,
     steps: usize,
     /// Of the program, the recipe and the capture's place.
@@ -113,7 +113,7 @@ struct Found {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 struct Results {
     version: u32,
-    cells: Vec<Found>,
+    cells: Vec<FolderContent>,
 }
 
 impl Results {
@@ -189,8 +189,8 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
 }
 
 /// Where the rule is broken.
-fn judged(cells: &[Found]) -> String {
-    let longer = |s: &Found| cells.iter().find(|l| l.capture == s.capture && l.steps == s.steps * MORE);
+fn judged(cells: &[FolderContent]) -> String {
+    let longer = |s: &FolderContent| cells.iter().find(|l| l.capture == s.capture && l.steps == s.steps * MORE);
     let broken: Vec<String> = cells.iter().filter_map(|s| longer(s).map(|l| broken(s, l))).flatten().collect();
     match broken[..] {
         [] => "\nThe rule holds everywhere.\n".into(),
@@ -242,9 +242,14 @@ fn recipe(entry: &Entry, steps: usize, args: &Args) -> Result<Recipe> {
 }
 
 /// Trains and measures; a capture that refuses is a finding too. Errors: stopped; files that cannot be written.
-fn measure(order: &Order<'_>, args: &Args, stop: &AtomicBool, console: &Console) -> anyhow::Result<Found> {
+fn measure(order: &Order<'_>, args: &Args, stop: &AtomicBool, console: &Console) -> anyhow::Result<FolderContent> {
     let steps = order.recipe.run.iterations;
-    let blank = Found { capture: order.entry.name.clone(), steps, print: order.print.clone(), ..Found::default() };
+    let blank = FolderContent {
+        capture: order.entry.name.clone(),
+        steps,
+        print: order.print.clone(),
+        ..FolderContent::default()
+    };
     let run = args.output.join("runs").join(format!("{}-{steps}", order.entry.name));
     files::make_folder(&run)?;
     let folder = OutputFolder::amend(&run, "suite")?;
@@ -252,7 +257,7 @@ fn measure(order: &Order<'_>, args: &Args, stop: &AtomicBool, console: &Console)
     let found = trained(order, &run, blank.clone(), stop, console);
     let interrupted = |e: &Error| e.kind() == ErrorKind::Interrupted;
     let mut found = match found {
-        Err(error) if !interrupted(&error) => return Ok(Found { refused: Some(error.to_string()), ..blank }),
+        Err(error) if !interrupted(&error) => return Ok(FolderContent { refused: Some(error.to_string()), ..blank }),
         found => found.map_err(|e| e.at(args.output.display()).remedy("The same command goes on with it."))?,
     };
     if args.playback || args.tier == Tier::Full {
@@ -264,7 +269,13 @@ fn measure(order: &Order<'_>, args: &Args, stop: &AtomicBool, console: &Console)
     Ok(found)
 }
 
-fn trained(order: &Order<'_>, run: &Path, blank: Found, stop: &AtomicBool, console: &Console) -> Result<Found> {
+fn trained(
+    order: &Order<'_>,
+    run: &Path,
+    blank: FolderContent,
+    stop: &AtomicBool,
+    console: &Console,
+) -> Result<FolderContent> {
     let capture = Arc::new(open_capture(&order.folder, &order.recipe)?);
     if capture.held.is_empty() {
         return Err(Error::input("it holds out no view, so that nothing can be measured")
@@ -301,7 +312,7 @@ fn trained(order: &Order<'_>, run: &Path, blank: Found, stop: &AtomicBool, conso
     let scores = judge.scores(&run.join("scene.safetensors"), outcome.iteration, console)?;
     let [psnr, psnr_cc, psnr_dynamic, ssim, flicker] =
         ["PSNR", "PSNR-cc", "PSNR-dynamic", "SSIM", "flicker"].map(|name| scores.held(name));
-    Ok(Found {
+    Ok(FolderContent {
         motion: effective.run.motion.as_str().into(),
         psnr,
         psnr_cc,
@@ -403,7 +414,11 @@ mod tests {
     fn results_are_read_back_and_foreign_files_refused() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("results.json");
-        let cell = Found { capture: "a".into(), probes: vec![Probe { step: 5, psnr: 20.0 }], ..Found::default() };
+        let cell = FolderContent {
+            capture: "a".into(),
+            probes: vec![Probe { step: 5, psnr: 20.0 }],
+            ..FolderContent::default()
+        };
         Results { version: VERSION, cells: vec![cell.clone()] }.save(&file).unwrap();
         assert_eq!(Results::read(&file).unwrap().cells, [cell]);
         for text in ["", "{}", "{\"version\": 9, \"cells\": []}"] {

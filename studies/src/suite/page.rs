@@ -1,11 +1,11 @@
 //! What the suite found, as a Markdown table.
 
-use super::Found;
+use super::FolderContent;
 use splat4d_workflow::files::grouped;
 use std::fmt::Write;
 
 /// The table: a line a cell, then their mean.
-pub(crate) fn table(cells: &[Found]) -> String {
+pub(crate) fn table(cells: &[FolderContent]) -> String {
     let mut out = String::from(
         "| capture | motion | PSNR | corrected | moving | still | training | fall | Gaussians | steps | seconds | file |\n\
          |---|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|\n",
@@ -34,7 +34,7 @@ pub(crate) fn table(cells: &[Found]) -> String {
             ),
         };
     }
-    let mean = |of: &dyn Fn(&Found) -> Option<f64>| {
+    let mean = |of: &dyn Fn(&FolderContent) -> Option<f64>| {
         let all: Vec<f64> = cells.iter().filter_map(of).collect();
         number((!all.is_empty()).then(|| all.iter().sum::<f64>() / all.len() as f64))
     };
@@ -53,7 +53,7 @@ pub(crate) fn table(cells: &[Found]) -> String {
 }
 
 /// Differences to earlier results: a line for each cell that both have.
-pub(crate) fn differences(cells: &[Found], earlier: &[Found]) -> String {
+pub(crate) fn differences(cells: &[FolderContent], earlier: &[FolderContent]) -> String {
     let mut out = String::from(
         "| capture | steps | PSNR | before | difference | moving | difference | fall | before |\n\
          |---|---:|---:|---:|---:|---:|---:|---:|---:|\n",
@@ -97,9 +97,9 @@ mod tests {
 
     #[test]
     fn every_line_has_as_many_cells_as_its_head() {
-        let cell = Found { capture: "knight".into(), steps: 10, psnr: Some(30.0), ..Found::default() };
-        let refused = Found { refused: Some("no | poses".into()), ..cell.clone() };
-        let better = Found { psnr: Some(30.5), ..cell.clone() };
+        let cell = FolderContent { capture: "knight".into(), steps: 10, psnr: Some(30.0), ..FolderContent::default() };
+        let refused = FolderContent { refused: Some("no | poses".into()), ..cell.clone() };
+        let better = FolderContent { psnr: Some(30.5), ..cell.clone() };
         let pages = [table(&[cell.clone(), refused]), differences(std::slice::from_ref(&better), &[cell])];
         for page in &pages {
             let counts: Vec<usize> =
@@ -107,7 +107,7 @@ mod tests {
             assert!(counts.len() >= 3 && counts.windows(2).all(|w| w[0] == w[1]), "{page}");
         }
         assert!(pages[1].contains("| +0.50 |") && pages[1].contains("+0.50 dB in the mean"), "{}", pages[1]);
-        let other = Found { steps: 40, ..better.clone() };
+        let other = FolderContent { steps: 40, ..better.clone() };
         assert!(!differences(&[better], &[other]).contains("knight"), "runs of other lengths do not compare");
     }
 }

@@ -1,7 +1,7 @@
 //! The rule that a recipe must keep on every capture: more steps do not cost quality, and training views do not get
 //! worse on the way.
 
-use super::Found;
+use super::FolderContent;
 use serde::{Deserialize, Serialize};
 
 /// Times as many steps as the shorter run.
@@ -48,7 +48,7 @@ pub(crate) fn largest_fall(probes: &[Probe], change: usize) -> Option<Fall> {
 }
 
 /// What a capture's runs break, a sentence each.
-pub(crate) fn broken(short: &Found, long: &Found) -> Vec<String> {
+pub(crate) fn broken(short: &FolderContent, long: &FolderContent) -> Vec<String> {
     let mut out = Vec::new();
     if let (Some(before), Some(after)) = (short.psnr, long.psnr)
         && after < before - LOSS
@@ -97,19 +97,19 @@ mod tests {
 
     #[test]
     fn a_broken_rule_is_reported() {
-        let found = |steps: usize, psnr: f64, db: f64| Found {
+        let found = |steps: usize, psnr: f64, db: f64| FolderContent {
             capture: "knight".into(),
             steps,
             psnr: Some(psnr),
             fall: Some(Fall { db, from: 40, to: 80 }),
-            ..Found::default()
+            ..FolderContent::default()
         };
         assert!(broken(&found(100, 30.0, 0.9), &found(400, 29.95, 1.0)).is_empty());
         let less = broken(&found(100, 30.0, 0.0), &found(400, 29.5, 0.0));
         assert!(less.len() == 1 && less[0].contains("0.50 dB less"), "{less:?}");
         let falls = broken(&found(100, 30.0, 1.2), &found(400, 31.0, 4.0));
         assert!(falls.len() == 2 && falls[1].contains("400 steps: training views fall by 4.00 dB"), "{falls:?}");
-        let refused = Found { capture: "knight".into(), ..Found::default() };
+        let refused = FolderContent { capture: "knight".into(), ..FolderContent::default() };
         assert!(broken(&refused, &refused).is_empty());
     }
 }

@@ -29,8 +29,8 @@ const ORDER: [(&str, &[&str]); 9] = [
             "sampler",
             "optim",
             "loss",
-            "learner",
-            "upkeep",
+            "train_state",
+            "maintenance",
             "methods",
             "init",
             "step",
@@ -67,7 +67,7 @@ const ORDER: [(&str, &[&str]); 9] = [
     ),
     (
         "crates/splat4d-import",
-        &["board", "calibration", "video", "sync", "sfm", "corrections", "write", "shipped", "take", "doctor"],
+        &["board", "calibration", "video", "sync", "sfm", "corrections", "write", "shipped", "recording", "doctor"],
     ),
     (
         "crates/splat4d-serve",

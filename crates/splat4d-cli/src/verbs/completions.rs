@@ -28,10 +28,10 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
 
 /// The command with the words that its options take. The command that runs checks them itself, with better messages.
 fn completed() -> clap::Command {
-    let knobs = Recipe::knobs();
-    let models = knobs.iter().find(|k| k.key() == "run.motion").map(|k| k.choices.clone()).unwrap_or_default();
+    let settings = Recipe::settings();
+    let models = settings.iter().find(|k| k.key() == "run.motion").map(|k| k.choices.clone()).unwrap_or_default();
     // Words of a command live as long as the program.
-    let settings: Vec<&'static str> = knobs.iter().map(|k| &*format!("{}=", k.key()).leak()).collect();
+    let settings: Vec<&'static str> = settings.iter().map(|k| &*format!("{}=", k.key()).leak()).collect();
     let with_settings =
         |verb: clap::Command| verb.mut_arg("set", |a| a.value_parser(PossibleValuesParser::new(settings.clone())));
     crate::command()

@@ -150,7 +150,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     }
     if args.baseline {
         let stop = interrupt::flag("stopping");
-        interrupt::ends("the same command begins again");
+        interrupt::stop_not_polled("the same command begins again");
         baseline(&folder, &run, &measure, &stop, console)?;
     }
     if args.no_film {

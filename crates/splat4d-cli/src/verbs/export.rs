@@ -10,7 +10,7 @@ use splat4d::math::Rng;
 use splat4d::scene::{RowEdit, Space, Time, labels};
 use splat4d_workflow::exporting;
 use splat4d_workflow::files;
-use splat4d_workflow::point_queries::{self, Answer};
+use splat4d_workflow::point_queries::{self, QueryResult};
 use splat4d_workflow::sequence;
 use splat4d_workflow::source::{Source, not_empty};
 use std::path::{Path, PathBuf};
@@ -157,7 +157,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         };
     }
     if let Some(folder) = &args.sequence {
-        let (fps, times) = sequence::moments(scene, args.fps, [args.from, args.to])?;
+        let (fps, times) = sequence::timestamps(scene, args.fps, [args.from, args.to])?;
         let pattern = sequence::Pattern::in_folder(folder);
         let read = sequence::Read { path, run: source.run.as_ref() };
         let owned = sequence::take(&[&pattern], times.len(), &read, "export", args.force)?;
@@ -207,7 +207,7 @@ fn is_json(out: &Path) -> splat4d::Result<bool> {
 /// Writes where points of a file go, and who sees them.
 fn followed(source: &Source, args: &Args, [points, out]: [&PathBuf; 2], console: &Console) -> anyhow::Result<()> {
     let (scene, json) = (&source.scene, is_json(out)?);
-    let (_, times) = sequence::moments(scene, args.fps, [args.from, args.to])?;
+    let (_, times) = sequence::timestamps(scene, args.fps, [args.from, args.to])?;
     let views = source.views()?;
     let asked =
         point_queries::read(&files::read_text(points)?, &views, scene.clip).map_err(|e| e.at(points.display()))?;
@@ -216,7 +216,7 @@ fn followed(source: &Source, args: &Args, [points, out]: [&PathBuf; 2], console:
             .remedy("Give fewer points, or fewer times with --fps, --from or --to.")
             .into());
     }
-    let answer = Answer::of(scene, asked, &views, &times, &mut |done, of| console.phase("following", done, of));
+    let answer = QueryResult::of(scene, asked, &views, &times, &mut |done, of| console.phase("following", done, of));
     console.clear();
     if answer.missing() > 0 {
         console.warn(&format!(
@@ -237,7 +237,7 @@ fn followed(source: &Source, args: &Args, [points, out]: [&PathBuf; 2], console:
 /// Writes where Gaussians are over time.
 fn tracks(scene: &Scene<f32>, args: &Args, out: &Path, console: &Console) -> anyhow::Result<()> {
     let json = is_json(out)?;
-    let (_, times) = sequence::moments(scene, args.fps, [args.from, args.to])?;
+    let (_, times) = sequence::timestamps(scene, args.fps, [args.from, args.to])?;
     let mut members = match args.near[..] {
         [] => every(scene, args.every.unwrap_or(1) as usize),
         [x, y, z] if [x, y, z].iter().all(|v| v.is_finite()) => {

@@ -7,7 +7,7 @@ use splat4d::{Error, ErrorKind};
 use splat4d_import::board::Board;
 use splat4d_import::corrections;
 use splat4d_import::doctor::{Grade, Report as Looked};
-use splat4d_import::take::{self, CameraReport, Report, Request, Rig};
+use splat4d_import::recording::{self, CameraReport, Report, Request, Rig};
 use splat4d_import::video::{Crop, Cropping, Selection};
 use splat4d_import::write::Format;
 use splat4d_train::event::Progress;
@@ -196,9 +196,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         synchronous: args.synchronous,
     };
     let stop = interrupt::flag("stopping: stored results are kept");
-    interrupt::ends("stored results are kept, and the same command continues from there");
+    interrupt::stop_not_polled("stored results are kept, and the same command continues from there");
     let mut tell = |event: &splat4d_train::event::Event| console.event(event);
-    let made = take::import(&request, &mut Progress(&mut tell), &|| stop.load(Ordering::SeqCst));
+    let made = recording::import(&request, &mut Progress(&mut tell), &|| stop.load(Ordering::SeqCst));
     console.clear();
     let report = made.map_err(|e| match e.kind() {
         ErrorKind::Interrupted => e,

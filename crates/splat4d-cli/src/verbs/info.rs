@@ -18,7 +18,7 @@ use splat4d_train::event::Event;
 use splat4d_train::output::check_apart;
 use splat4d_train::path_text::{in_command, to_text};
 use splat4d_train::recipe::Recipe;
-use splat4d_train::run::chunks::Outlook;
+use splat4d_train::run::chunks::ChunkEstimate;
 use splat4d_train::run::{Stopwatch, memory_estimate, open_capture};
 use splat4d_workflow::files::{self, grouped, human_bytes, human_seconds};
 use splat4d_workflow::run_folder::{Origin, Run};
@@ -164,9 +164,9 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
     if let Some(rule) = &args.hold_out {
         recipe.set(&format!("hold_out={}", toml::Value::String(rule.clone())))?;
     }
-    for (knob, value) in [("capture.images", &args.images), ("capture.poses", &args.poses)] {
+    for (setting, value) in [("capture.images", &args.images), ("capture.poses", &args.poses)] {
         if let Some(value) = value {
-            recipe.set(&format!("{knob}={}", toml::Value::String(value.clone())))?;
+            recipe.set(&format!("{setting}={}", toml::Value::String(value.clone())))?;
         }
     }
     for assignment in &args.set {
@@ -194,7 +194,7 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
     let (times, sizes) = (capture.times(), sizes(&capture));
     let capture = Arc::new(capture);
     let mut listen = |event: &Event| console.event(event);
-    let outlook = Outlook::new(&capture, &recipe, None, 0.0, true, &Stopwatch::start(), &mut listen)?;
+    let outlook = ChunkEstimate::new(&capture, &recipe, None, 0.0, true, &Stopwatch::start(), &mut listen)?;
     console.clear();
     let memory = outlook.as_ref().map_or_else(|| memory_estimate(&capture, &recipe), |o| o.memory);
     let checked = capture.check_poses();

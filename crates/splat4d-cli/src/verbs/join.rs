@@ -31,7 +31,7 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     args.measure.check()?;
     let stop = interrupt::flag("stopping");
-    interrupt::ends("all parts are kept, and the same command joins them");
+    interrupt::stop_not_polled("all parts are kept, and the same command joins them");
     let chunked = Chunked::open(&args.run)?;
     let _folder = OutputFolder::amend(&args.run, "join")?;
     chunked::join(&args.run, &chunked, args.no_eval, &args.measure.options(), &Deadline::default(), &stop, console)?;

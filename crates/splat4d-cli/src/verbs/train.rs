@@ -10,18 +10,18 @@ use splat4d::{Error, ErrorKind};
 use splat4d_import::shipped;
 use splat4d_train::capture::{Capture, Lenses, Severity, Timing};
 use splat4d_train::event::{Event, Progress};
-use splat4d_train::output::{Found, OutputFolder, Owner};
+use splat4d_train::output::{FolderContent, OutputFolder, Owner};
 use splat4d_train::path_text::in_command;
 use splat4d_train::recipe::{MotionName, Quality, Recipe};
-use splat4d_train::run::chunks::{Chunked, Outlook, look_ahead};
+use splat4d_train::run::chunks::{ChunkEstimate, Chunked, look_ahead};
 use splat4d_train::run::{self, Outcome, Stopwatch, TrainOptions};
 use splat4d_train::run::{memory_estimate, open_capture, open_frames};
-use splat4d_train::settings::{Knob, nearest};
-use splat4d_workflow::chunked::{self, Wanted};
+use splat4d_train::settings::{Setting, nearest};
+use splat4d_workflow::chunked::{self, ChunkSelection};
 use splat4d_workflow::deadline::Deadline;
 use splat4d_workflow::device::chosen;
 use splat4d_workflow::files::{self, human_bytes, parse_bytes};
-use splat4d_workflow::run_folder::{self, Asked, Run, write_cameras};
+use splat4d_workflow::run_folder::{self, Run, RunRequest, write_cameras};
 use splat4d_workflow::{evaluating, labelling};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -140,7 +140,7 @@ pub struct Args {
     /// Train one part and end: shared, then even chunks by number, then odd ones; or all, in parallel with other
     /// workers on the same RUN. Finished parts are skipped; `splat4d join RUN` ends the run
     #[arg(long, value_name = "PART", help_heading = "Long captures", requires = "output", conflicts_with = "force")]
-    chunk: Option<Wanted>,
+    chunk: Option<ChunkSelection>,
     /// Memory for decoded images [default: 1GiB]
     #[arg(long, value_name = "SIZE", value_parser = parse_bytes, help_heading = "Input")]
     image_memory: Option<u64>,
@@ -184,7 +184,7 @@ pub struct Args {
 
 pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     if let Some(topic) = &args.help_knobs {
-        console.result(knob_list(topic)?.trim_end());
+        console.result(setting_list(topic)?.trim_end());
         return Ok(());
     }
     let stop = interrupt::flag(SAVING);
@@ -194,7 +194,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     if !args.view && args.place.is_told() {
         return Err(Error::input("--port, --host and --no-open need --view").remedy("Add --view.").into());
     }
-    interrupt::ends("training had not begun, and the same command begins it");
+    interrupt::stop_not_polled("training had not begun, and the same command begins it");
     let watch = |title: &str, capture: Option<&Arc<Capture>>| {
         Watch::start(title, capture.cloned(), args.view.then_some(&args.place), &control, console)
     };
@@ -202,7 +202,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let images = |run: &Run| args.view.then(|| run.open_capture().ok()).flatten().map(|(capture, _)| Arc::new(capture));
     let snapshots = |watch: &Watch| watch.is_on().then_some(SNAPSHOT_INTERVAL);
     let listen = |event: &Event, watch: &Watch| {
-        watch.hear(event);
+        watch.on_event(event);
         console.event(event);
     };
     if let Some(run) = args.resume.as_ref().filter(|run| Chunked::is(run)) {
@@ -213,7 +213,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         return in_chunks(args, run, &chunked, clock, &stop, &watch, console);
     }
     // A run that ended before its first checkpoint begins again, as it was asked for.
-    let again = args.resume.as_ref().and_then(|run| Some((run.clone(), Asked::unbegun(run)?)));
+    let again = args.resume.as_ref().and_then(|run| Some((run.clone(), RunRequest::unbegun(run)?)));
     let (folder, run, watch, trained) = if let Some(run) = args.resume.as_ref().filter(|_| again.is_none()) {
         let opened = Run::open(run)?;
         let watch = watch(&opened.name(), images(&opened).as_ref());
@@ -221,7 +221,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         let device = chosen(args.device.into(), "training", console);
         let clock = clock.clone();
         let options = TrainOptions { device, snapshots: snapshots(&watch), clock, ..TrainOptions::default() };
-        interrupt::asks(SAVING);
+        interrupt::stop_polled(SAVING);
         let trained = run::resume_with(run, &options, &stop, &mut |event| listen(event, &watch));
         (folder, run.clone(), watch, trained)
     } else {
@@ -233,7 +233,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             }
         };
         let typed = args.set.iter().filter_map(|a| Some(a.split_once('=')?.0));
-        recipe.refuse_idle(typed).map_err(|e| e.at("--set"))?;
+        recipe.refuse_unused(typed).map_err(|e| e.at("--set"))?;
         if again.is_none() {
             extract(&source, &stop, console)?;
         }
@@ -241,7 +241,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         // Of a long take no more is listed than tells that it is one.
         let capture = Arc::new(open_frames(&source, &recipe, look_ahead(&recipe), &Lenses::default())?);
         let output = again.as_ref().map(|(run, _)| run).or(args.output.as_ref());
-        let asked = Asked::of(&capture, &recipe, minutes, predict);
+        let asked = RunRequest::of(&capture, &recipe, minutes, predict);
         let place = || place(args, output, &capture, &asked, console);
         // A take that is not told to be cut keeps to its minutes at once.
         let at_once = minutes.is_some() && recipe.chunks.frames == 0;
@@ -259,7 +259,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             false => {
                 let finish = evaluating::steps(&capture, &recipe, args.no_eval);
                 let listen = &mut |event: &Event| console.event(event);
-                Outlook::new(&capture, &recipe, minutes, finish, false, &clock, listen)?
+                ChunkEstimate::new(&capture, &recipe, minutes, finish, false, &clock, listen)?
             }
         };
         console.clear();
@@ -314,19 +314,19 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             own_loss: None,
             snapshots: snapshots(&watch),
         };
-        let mut hear = |event: &Event| {
-            run_folder::hear(&folder, event);
+        let mut on_event = |event: &Event| {
+            run_folder::on_event(&folder, event);
             listen(event, &watch);
         };
-        interrupt::asks(SAVING);
-        let trained = if found == Found::Unfinished {
+        interrupt::stop_polled(SAVING);
+        let trained = if found == FolderContent::Unfinished {
             console.say(&format!("{} contains an unfinished run of the same command: it is continued", run.display()));
-            run::resume_with(&run, &options, &stop, &mut hear)
+            run::resume_with(&run, &options, &stop, &mut on_event)
         } else {
             // The recipe first: whatever comes to pass from here on, the folder is known for what it is.
             files::write(&run.join("recipe.toml"), recipe.to_toml().as_bytes())?;
             write_cameras(&run, &whole)?;
-            run::train(whole, recipe, &run, &options, &stop, &mut hear)
+            run::train(whole, recipe, &run, &options, &stop, &mut on_event)
         };
         match run_folder::left(folder, &run, &trained) {
             Some(folder) => (folder, run, watch, trained),
@@ -350,7 +350,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         .into());
     }
     let name = in_command(&run);
-    interrupt::ends(format!(
+    interrupt::stop_not_polled(format!(
         "the scene is trained and saved: splat4d eval {name} makes the scores, the film and the report"
     ));
     console.say(&format!("wrote {}", run.join("scene.safetensors").display()));
@@ -373,7 +373,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     console.emit(&json!({"type": "done", "run": run.to_string_lossy()}));
     if watch.is_on() && console.terminal() {
         console.say("the player keeps running until Ctrl-C");
-        interrupt::asks("stopping");
+        interrupt::stop_polled("stopping");
         serving::wait(&stop);
     }
     Ok(())
@@ -396,10 +396,10 @@ fn in_chunks(
         snapshots: watch.is_on().then_some(SNAPSHOT_INTERVAL),
         ..TrainOptions::default()
     };
-    let wanted = args.chunk.unwrap_or(Wanted::All);
-    interrupt::asks(SAVING);
+    let wanted = args.chunk.unwrap_or(ChunkSelection::All);
+    interrupt::stop_polled(SAVING);
     let outcome = chunked::work(run, chunked, wanted, &options, stop, console, &mut |event| {
-        watch.hear(event);
+        watch.on_event(event);
         console.event(event);
     });
     console.clear();
@@ -413,7 +413,7 @@ fn in_chunks(
     match args.chunk {
         Some(_) => console.emit(&json!({"type": "done", "run": run.to_string_lossy()})),
         None => {
-            interrupt::ends(format!("all parts are kept: splat4d join {} joins them", in_command(run)));
+            interrupt::stop_not_polled(format!("all parts are kept: splat4d join {} joins them", in_command(run)));
             // The other workers are done with it, or wait for the same.
             let _owner = Owner::wait(run, JOIN, &mut |_| !stop.load(Ordering::Relaxed))?;
             let deadline = Deadline::of(clock, args.minutes);
@@ -442,7 +442,8 @@ fn recipe(args: &Args) -> anyhow::Result<Recipe> {
     if (args.iterations.is_some() || typed("run.iterations")) && args.quality.is_none() {
         recipe = recipe.unresolved();
     }
-    let mut set = |knob: &str, value: Option<String>| value.map_or(Ok(()), |v| recipe.set(&format!("{knob}={v}")));
+    let mut set =
+        |setting: &str, value: Option<String>| value.map_or(Ok(()), |v| recipe.set(&format!("{setting}={v}")));
     let quoted = |text: &String| toml::Value::String(text.clone()).to_string();
     set("motion", args.motion.as_ref().map(quoted))?;
     set("seed", args.seed.map(|v| v.to_string()))?;
@@ -491,9 +492,9 @@ fn place(
     args: &Args,
     output: Option<&PathBuf>,
     capture: &Capture,
-    asked: &Asked,
+    asked: &RunRequest,
     console: &Console,
-) -> anyhow::Result<(OutputFolder, Found)> {
+) -> anyhow::Result<(OutputFolder, FolderContent)> {
     if let Some(run) = output {
         return Ok(asked.begin(run, args.force, TRAIN)?);
     }
@@ -566,31 +567,31 @@ fn minutes(text: &str) -> Result<f64, String> {
 
 /// The examples, and the settings that most runs change.
 fn long_help() -> String {
-    let knobs = Recipe::knobs();
+    let settings = Recipe::settings();
     let lines: String = IMPORTANT
         .iter()
-        .map(|key| line(knobs.iter().find(|k| k.key() == *key).expect("IMPORTANT lists settings of the recipe")))
+        .map(|key| line(settings.iter().find(|k| k.key() == *key).expect("IMPORTANT lists settings of the recipe")))
         .collect();
     format!("{EXAMPLES}\n\nSettings (--set KEY=VALUE, or a TOML file for --recipe; --help-knobs: all):\n{lines}")
 }
 
 /// Every setting, those of a table, or those with the topic in their name. Errors: there is none.
-fn knob_list(topic: &str) -> Result<String, Error> {
-    let knobs = Recipe::knobs();
-    let named = |k: &Knob| k.key().contains(topic) || Recipe::flat_name(&k.key()).is_some_and(|n| n.contains(topic));
-    let of_table = knobs.iter().any(|k| k.table == topic);
+fn setting_list(topic: &str) -> Result<String, Error> {
+    let settings = Recipe::settings();
+    let named = |k: &Setting| k.key().contains(topic) || Recipe::flat_name(&k.key()).is_some_and(|n| n.contains(topic));
+    let of_table = settings.iter().any(|k| k.table == topic);
     let mut text = String::new();
     let mut table = "";
-    for knob in knobs.iter().filter(|k| if of_table { k.table == topic } else { named(k) }) {
-        if knob.table != table {
-            table = knob.table;
+    for setting in settings.iter().filter(|k| if of_table { k.table == topic } else { named(k) }) {
+        if setting.table != table {
+            table = setting.table;
             let needs = Recipe::needs(table).map_or_else(String::new, |n| format!(" In effect with {n}."));
             text += &format!("[{table}] {}{needs}\n", Recipe::about(table));
         }
-        text += &line(knob);
+        text += &line(setting);
     }
     if text.is_empty() {
-        let mut tables: Vec<&str> = knobs.iter().map(|k| k.table).collect();
+        let mut tables: Vec<&str> = settings.iter().map(|k| k.table).collect();
         tables.dedup();
         let near = nearest(topic, &tables).map_or_else(String::new, |n| format!("Did you mean `{n}`? "));
         return Err(Error::input(format!("no setting or table has `{topic}` in its name"))
@@ -601,13 +602,14 @@ fn knob_list(topic: &str) -> Result<String, Error> {
 }
 
 /// A setting in a line of help: its names, meaning, unit and default.
-fn line(knob: &Knob) -> String {
-    let default = if knob.default == "\"\"" { "empty" } else { &knob.default };
-    let unit = if knob.rule.unit.is_empty() { String::new() } else { format!(" {}", knob.rule.unit) };
-    let alone =
-        Recipe::flat_name(&knob.key()).filter(|n| *n != knob.field).map_or_else(String::new, |n| format!(" ({n})"));
-    let name = format!("{}{alone}", knob.key());
-    format!("  {name:<42} {} [{default}{unit}]\n", knob.doc.trim_end_matches('.'))
+fn line(setting: &Setting) -> String {
+    let default = if setting.default == "\"\"" { "empty" } else { &setting.default };
+    let unit = if setting.rule.unit.is_empty() { String::new() } else { format!(" {}", setting.rule.unit) };
+    let alone = Recipe::flat_name(&setting.key())
+        .filter(|n| *n != setting.field)
+        .map_or_else(String::new, |n| format!(" ({n})"));
+    let name = format!("{}{alone}", setting.key());
+    format!("  {name:<42} {} [{default}{unit}]\n", setting.doc.trim_end_matches('.'))
 }
 
 #[cfg(test)]
@@ -648,13 +650,13 @@ mod tests {
 
     #[test]
     fn settings_are_listed_by_topic() {
-        let all = knob_list("").unwrap();
-        assert!(Recipe::knobs().iter().all(|k| all.contains(&k.key())));
-        let merge = knob_list("merge").unwrap();
+        let all = setting_list("").unwrap();
+        assert!(Recipe::settings().iter().all(|k| all.contains(&k.key())));
+        let merge = setting_list("merge").unwrap();
         assert!(merge.starts_with("[merge]") && merge.lines().count() == 4, "{merge}");
-        assert!(knob_list("velocity").unwrap().contains("spacetime.velocity_lr_init"));
-        assert!(knob_list("crowding").unwrap().contains("merge.pair (crowding)"));
-        assert!(knob_list("spacetme").unwrap_err().to_string().contains("`spacetime`"));
+        assert!(setting_list("velocity").unwrap().contains("spacetime.velocity_lr_init"));
+        assert!(setting_list("crowding").unwrap().contains("merge.pair (crowding)"));
+        assert!(setting_list("spacetme").unwrap_err().to_string().contains("`spacetime`"));
         assert!(long_help().contains("densify.max_cap"));
     }
 }

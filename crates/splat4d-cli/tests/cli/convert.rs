@@ -214,7 +214,7 @@ fn other_axes_rotate_every_model_as_a_whole() {
             let (a, b) = (&kept.layers[0].params, &other.layers[0].params);
             let mut rotated = kept.layers[0].clone();
             rotated.frame = Sim3::from_rotation(r);
-            rotated.absorb_frame();
+            rotated.apply_transform();
             let shape = |p: &Params, row: usize| {
                 let q = quat::normalize(p[GEOMETRY].read::<4>(row, QUAT).map(f64::from)).0;
                 sym3::from_quat_log_scales(q, p[GEOMETRY].read::<3>(row, LOG_SCALE).map(f64::from))

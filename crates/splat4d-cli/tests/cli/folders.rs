@@ -7,7 +7,7 @@ use splat4d::scene::params::QUAT;
 use splat4d::scene::{GEOMETRY, LifeKind, Params};
 use splat4d_train::output::Owner;
 use splat4d_train::recipe::{MotionName, Recipe};
-use splat4d_workflow::run_folder::Asked;
+use splat4d_workflow::run_folder::RunRequest;
 use std::path::Path;
 
 /// A file of one Gaussian.
@@ -84,7 +84,7 @@ fn a_folder_in_use_is_refused_and_read() {
         r.set(s).unwrap();
         r
     });
-    let asked = serde_json::to_string(&Asked::new(&capture, &recipe, None, false)).unwrap();
+    let asked = serde_json::to_string(&RunRequest::new(&capture, &recipe, None, false)).unwrap();
     std::fs::write(run.join(".splat4d/asked"), asked).unwrap();
     splat4d(&["train", "--resume", str(&run), "--no-eval"]).run().ok();
     assert!(std::fs::read(run.join("scene.safetensors")).unwrap() == wanted);

@@ -40,7 +40,7 @@ pub struct Placed {
 
 /// What is known of the whole take.
 #[derive(Clone, Debug, Default)]
-pub struct Take {
+pub struct Recording {
     /// A short name; the folder's if there is none.
     pub name: Option<String>,
     /// Upwards in the world.
@@ -56,7 +56,7 @@ pub struct Take {
 /// Writes `capture.json` into the folder that holds the images; the file.
 ///
 /// Errors: no cameras, no images of one, poses that are not as many as shots, no space.
-pub fn capture(folder: &Path, take: &Take, cameras: &[Placed]) -> Result<PathBuf> {
+pub fn capture(folder: &Path, take: &Recording, cameras: &[Placed]) -> Result<PathBuf> {
     if cameras.is_empty() {
         return Err(Error::input("there is no camera whose place is known").remedy("See the report for why."));
     }

@@ -7,7 +7,7 @@ mod capture;
 mod masks;
 mod pictures;
 
-pub use capture::{Placed, Poses, Take, capture};
+pub use capture::{Placed, Poses, Recording, capture};
 pub use masks::{Begin, Masks, masks};
 pub use pictures::{Clip, Format, Pictures, Shot, camera_names, pictures};
 

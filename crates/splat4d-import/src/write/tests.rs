@@ -209,7 +209,7 @@ fn the_capture_is_read_as_it_was_meant() {
             masks: None,
         },
     ];
-    let take = Take { up: Some([0.0, -1.0, 0.0]), hold_out: vec!["cam_1".into()], ..Take::default() };
+    let take = Recording { up: Some([0.0, -1.0, 0.0]), hold_out: vec!["cam_1".into()], ..Recording::default() };
     capture(out.path(), &take, &cameras).unwrap();
     let read = Arc::new(Capture::open(out.path(), &CaptureOptions::default()).unwrap());
     assert_eq!((read.cameras.len(), read.frames.len(), read.fps, read.held.len()), (2, 31, 25.0, 11));
@@ -225,7 +225,7 @@ fn the_capture_is_read_as_it_was_meant() {
     assert!(off.fold(0.0, f64::max) < 1e-12 && found.translation == truth.translation);
     // All cameras of a fixed rig train.
     let rig = [cameras[0].clone(), Placed { poses: Poses::Fixed(pose(1.0)), ..cameras[1].clone() }];
-    capture(out.path(), &Take::default(), &rig).unwrap();
+    capture(out.path(), &Recording::default(), &rig).unwrap();
     let all = Capture::open(out.path(), &CaptureOptions::default()).unwrap();
     assert_eq!((all.train.len(), all.held.len()), (all.frames.len(), 0));
     let picture = ImageStore::new(Arc::clone(&read), 0).load(2).unwrap().to_picture();

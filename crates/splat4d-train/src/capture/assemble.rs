@@ -5,8 +5,8 @@ use super::account::{Aspect, Remark, first_names};
 use super::options::Lenses;
 use super::pose::{SAME_POSE, same_pose};
 use super::{
-    Capture, CaptureKind, CaptureOptions, Exif, Extent, FlowFile, Frame, HoldOut, PointCloud, RawFrame, Rig, Split,
-    Take, Timing,
+    Capture, CaptureKind, CaptureOptions, Exif, Extent, FlowFile, Frame, HoldOut, PointCloud, RawCapture, RawFrame,
+    Rig, Split, Timing,
 };
 use super::{borders, evidence, lookup, masks, options, panorama, picture, plausible, pose, rig};
 use splat4d::math::se3::{norm, normalize};
@@ -22,7 +22,7 @@ const HOLD_EVERY: usize = 8;
 const WHITE: [f32; 3] = [1.0; 3];
 
 /// Checks a take and turns it into a capture.
-pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Capture> {
+pub(super) fn assemble(mut take: RawCapture, options: &CaptureOptions) -> Result<Capture> {
     let root = take.root.clone();
     let located = |e: Error| e.at(root.display());
     if take.frames.is_empty() {
@@ -118,7 +118,7 @@ pub(super) fn assemble(mut take: Take, options: &CaptureOptions) -> Result<Captu
 }
 
 /// Names point clouds next to the capture's files, where it has no points: nothing says that they are in its world.
-fn unread_clouds(take: &mut Take) {
+fn unread_clouds(take: &mut RawCapture) {
     let clouds: Vec<String> =
         rig::file_names(&take.root).into_iter().filter(|n| n.to_ascii_lowercase().ends_with(".ply")).collect();
     if !clouds.is_empty() {
@@ -224,7 +224,7 @@ fn check_frame(frame: &mut RawFrame, camera: &str, options: &CaptureOptions) -> 
 
 /// Cameras without frames would be rows without meaning everywhere else. `listed` are those that had some before missing images
 /// were skipped, which was said.
-fn drop_unused_cameras(take: &mut Take, listed: &BTreeSet<usize>) {
+fn drop_unused_cameras(take: &mut RawCapture, listed: &BTreeSet<usize>) {
     let used: BTreeSet<usize> = take.frames.iter().map(|f| f.camera).collect();
     let unused: Vec<&str> =
         take.cameras.iter().enumerate().filter(|(i, _)| !listed.contains(i)).map(|(_, n)| n.as_str()).collect();
@@ -237,7 +237,7 @@ fn drop_unused_cameras(take: &mut Take, listed: &BTreeSet<usize>) {
 }
 
 /// Which cameras keep one pose.
-fn rigs(take: &Take) -> Vec<Rig> {
+fn rigs(take: &RawCapture) -> Vec<Rig> {
     let mut first: Vec<Option<&RawFrame>> = vec![None; take.cameras.len()];
     let mut fixed = vec![true; take.cameras.len()];
     for frame in &take.frames {
@@ -249,7 +249,7 @@ fn rigs(take: &Take) -> Vec<Rig> {
 
 /// Two fixed cameras with one pose are a slip of the hand: a copied matrix. Photos may be taken twice from one place,
 /// but what is measured then was learnt.
-fn check_poses(take: &mut Take, cameras: &[Rig]) -> Result<()> {
+fn check_poses(take: &mut RawCapture, cameras: &[Rig]) -> Result<()> {
     let mut first: BTreeMap<usize, &RawFrame> = BTreeMap::new();
     for frame in take.frames.iter().filter(|f| cameras[f.camera].fixed) {
         first.entry(frame.camera).or_insert(frame);
@@ -293,7 +293,7 @@ fn warn_of_shared(shared: usize, warnings: &mut Vec<String>) {
 
 /// One camera takes one image at a time. Where the data set names none, one "camera" may stand for several, so that
 /// the pose counts too.
-fn check_duplicates(take: &mut Take, cameras: &[Rig]) -> Result<()> {
+fn check_duplicates(take: &mut RawCapture, cameras: &[Rig]) -> Result<()> {
     let mut groups: BTreeMap<(usize, u64), Vec<usize>> = BTreeMap::new();
     let mut shared = 0;
     for (i, frame) in take.frames.iter().enumerate() {
@@ -324,7 +324,7 @@ fn check_duplicates(take: &mut Take, cameras: &[Rig]) -> Result<()> {
 }
 
 /// Takes out the frames whose image is missing. Errors: too many are.
-fn skip_missing(take: &mut Take, options: &CaptureOptions) -> Result<()> {
+fn skip_missing(take: &mut RawCapture, options: &CaptureOptions) -> Result<()> {
     let there: Vec<bool> = take.frames.iter().map(|f| f.image.is_file()).collect();
     let all = there.len();
     let shown = |f: &RawFrame| f.image.strip_prefix(&take.root).unwrap_or(&f.image).display().to_string();
@@ -362,7 +362,7 @@ fn skip_missing(take: &mut Take, options: &CaptureOptions) -> Result<()> {
 }
 
 /// Takes out frames that are listed twice: with one image, pose, time and purpose.
-fn skip_repeated(take: &mut Take) {
+fn skip_repeated(take: &mut RawCapture) {
     let mut earlier: BTreeMap<&Path, Vec<usize>> = BTreeMap::new();
     let mut repeated = BTreeSet::new();
     for (i, frame) in take.frames.iter().enumerate() {
@@ -393,7 +393,7 @@ fn skip_repeated(take: &mut Take) {
 }
 
 /// Says which frames have one image and different poses: one of them shows something else.
-fn shared_images(take: &mut Take) {
+fn shared_images(take: &mut RawCapture) {
     let mut first: BTreeMap<&Path, usize> = BTreeMap::new();
     let mut twice = Vec::new();
     for (i, frame) in take.frames.iter().enumerate() {
@@ -430,7 +430,7 @@ fn fits(size: (usize, usize), camera: &Camera) -> bool {
 /// whether any image has an alpha channel, for each whether its EXIF orientation is applied, and those of which
 /// sizes do
 /// not say so.
-fn fit_pictures(take: &mut Take, options: &CaptureOptions) -> Result<(bool, Vec<bool>, Vec<usize>)> {
+fn fit_pictures(take: &mut RawCapture, options: &CaptureOptions) -> Result<(bool, Vec<bool>, Vec<usize>)> {
     let mut alpha = false;
     let mut resized = Vec::new();
     let mut upright = Vec::with_capacity(take.frames.len());
@@ -494,13 +494,13 @@ fn fit_pictures(take: &mut Take, options: &CaptureOptions) -> Result<(bool, Vec<
             resized.iter().all(|(image, ..)| image.ancestors().any(lookup::is_reduced)) || options.images.is_some();
         take.account.add(Aspect::Assumed, if meant { Severity::Note } else { Severity::Warning }, what);
     }
-    tell_of_orientation(take, as_stored, by_size);
+    report_orientation(take, as_stored, by_size);
     plausible::check(take);
     Ok((alpha, upright, unsure))
 }
 
 /// Says what was done with EXIF orientations of COLMAP's images, and of those whose sizes decide.
-fn tell_of_orientation(take: &mut Take, as_stored: usize, by_size: [usize; 2]) {
+fn report_orientation(take: &mut RawCapture, as_stored: usize, by_size: [usize; 2]) {
     let all = take.frames.len();
     let mut say = |n: usize, what: &str| {
         if n > 0 {
@@ -537,7 +537,7 @@ fn settle_orientation(capture: &mut Capture, unsure: &[usize]) {
 }
 
 /// An error if masks exist and not one of them shows anything; stops at the first that does.
-fn check_masks(take: &Take, has_alpha: bool) -> Result<()> {
+fn check_masks(take: &RawCapture, has_alpha: bool) -> Result<()> {
     check_mask_shapes(take)?;
     let masked: Vec<&RawFrame> = take.frames.iter().filter(|f| f.mask.is_some() || has_alpha).collect();
     let Some(first) = masked.first() else { return Ok(()) };
@@ -567,7 +567,7 @@ fn check_masks(take: &Take, has_alpha: bool) -> Result<()> {
 const SHAPES: usize = 50;
 
 /// An error if a mask has another shape than its image.
-fn check_mask_shapes(take: &Take) -> Result<()> {
+fn check_mask_shapes(take: &RawCapture) -> Result<()> {
     let masked: Vec<(&RawFrame, &PathBuf)> = take.frames.iter().filter_map(|f| Some((f, f.mask.as_ref()?))).collect();
     for (frame, mask) in masked.iter().step_by(masked.len().div_ceil(SHAPES).max(1)) {
         let own = panorama::stored(&frame.source);
@@ -583,7 +583,7 @@ fn check_mask_shapes(take: &Take) -> Result<()> {
 type Indices = Vec<usize>;
 
 /// The training, held-out and validation frames.
-fn split(take: &mut Take, cameras: &[Rig], options: &CaptureOptions) -> Result<(Indices, Indices, Indices)> {
+fn split(take: &mut RawCapture, cameras: &[Rig], options: &CaptureOptions) -> Result<(Indices, Indices, Indices)> {
     let told = options.hold_out.clone().or_else(|| take.hold_out.clone());
     let of = |split: Split| -> Indices { (0..take.frames.len()).filter(|&i| take.frames[i].split == split).collect() };
     let validation = of(Split::Validation);

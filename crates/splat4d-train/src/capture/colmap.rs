@@ -14,7 +14,7 @@ use super::convention::{Convention, Poses};
 use super::lookup::{self, Lookup};
 use super::points::read_ply;
 use super::splits::Lists;
-use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take, beside, rig, sequence};
+use super::{CaptureKind, CaptureOptions, PointCloud, RawCapture, RawFrame, Split, extra_model, rig, sequence};
 use splat4d::math::{Se3, quat};
 use splat4d::scene::Camera;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -44,7 +44,7 @@ const LARGE_ERROR: f64 = 1.5;
 
 /// Reads the reconstruction at `marker`: a folder with models, of which the one with most images is taken, or a model's
 /// own file.
-pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
+pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<RawCapture> {
     let fps = options.fps.unwrap_or(DEFAULT_FPS);
     let (mut warnings, mut notes, mut account) = (Vec::new(), Vec::new(), Account::default());
     let models = if marker.is_file() { marker.parent().unwrap_or(root) } else { marker };
@@ -69,7 +69,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     let names: Vec<&str> = shots.iter().map(|(name, _)| name.as_str()).collect();
     let poses: Vec<Se3> = shots.iter().map(|(_, source)| source.cam_from_world).collect();
     let order = sequence::order(&names, &poses, options.sequence, fps, &mut warnings, &mut notes);
-    let splits = Lists::beside_model(root, &folder)?.settle(&names, &mut account)?;
+    let splits = Lists::next_to_model(root, &folder)?.settle(&names, &mut account)?;
     let frame = |(((split, image), (_, source)), &place): (((Option<Split>, PathBuf), &Shot), &_)| {
         Some(RawFrame { split: split?, ..RawFrame::new(place, source.clone(), image) })
     };
@@ -80,7 +80,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         account.add(Aspect::Assumed, Severity::Note, what);
     }
     frames.sort_by(|a, b| (a.camera, a.index, &a.image).cmp(&(b.camera, b.index, &b.image)));
-    lookup.tell(&mut account);
+    lookup.report(&mut account);
     let mut cloud = cloud_of(&points, &folder)?;
     if cloud.is_none() {
         cloud = multiview::points(root)?;
@@ -91,7 +91,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
             cloud.points.len()
         ));
     }
-    Ok(Take {
+    Ok(RawCapture {
         cameras: order.cameras,
         frames,
         named: order.named,
@@ -101,7 +101,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         warnings,
         notes,
         account,
-        ..Take::new(root, CaptureKind::Colmap, Convention::COLMAP)
+        ..RawCapture::new(root, CaptureKind::Colmap, Convention::COLMAP)
     })
 }
 
@@ -283,11 +283,11 @@ fn aligned_points(root: &Path, sparse: &Path, frames: &[RawFrame]) -> Result<(Po
     let mut cloud = cloud_of(&colmap_files::points(&folder)?, &folder)?
         .ok_or_else(|| Error::input("it has no points").remedy("Triangulate them (colmap point_triangulator)."))?;
     let model: BTreeMap<String, Se3> =
-        registered.iter().map(|r| Ok((beside::key(Path::new(&r.name)), pose_of(r)?))).collect::<Result<_>>()?;
-    let key = |frame: &RawFrame| beside::key(frame.image.strip_prefix(root).unwrap_or(&frame.image));
+        registered.iter().map(|r| Ok((extra_model::key(Path::new(&r.name)), pose_of(r)?))).collect::<Result<_>>()?;
+    let key = |frame: &RawFrame| extra_model::key(frame.image.strip_prefix(root).unwrap_or(&frame.image));
     let pairs: Vec<(Se3, Se3)> =
         frames.iter().filter_map(|f| Some((f.source.cam_from_world, *model.get(&key(f))?))).collect();
-    let world_from_model = beside::align(&pairs)?;
+    let world_from_model = extra_model::align(&pairs)?;
     cloud.points.iter_mut().for_each(|p| *p = world_from_model.apply(*p));
     let how = match world_from_model.is_identity() {
         true => "whose cameras agree with",

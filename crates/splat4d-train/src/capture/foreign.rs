@@ -10,7 +10,7 @@ mod tests;
 
 use super::convention::{Convention, Poses};
 use super::points::read_ply;
-use super::{CaptureKind, CaptureOptions, DepthFile, PointCloud, RawFrame, Take, Timing, rig, sequence};
+use super::{CaptureKind, CaptureOptions, DepthFile, PointCloud, RawCapture, RawFrame, Timing, rig, sequence};
 use super::{lookup, pose};
 use splat4d::math::Se3;
 use splat4d::scene::Camera;
@@ -26,14 +26,14 @@ struct Export {
     /// Whether a path that somebody gives is such a file.
     is: fn(&Path) -> bool,
     /// Reads the capture in a folder from that file.
-    read: fn(&Path, &Path, &CaptureOptions) -> Result<Take>,
+    read: fn(&Path, &Path, &CaptureOptions) -> Result<RawCapture>,
 }
 
 /// In the order in which they are looked for: those that are recognized by their content come last.
 const EXPORTS: [Export; 4] = [polycam::EXPORT, record3d::EXPORT, metashape::EXPORT, realityscan::EXPORT];
 
 /// Reads the export in a folder, or that a file is. `None`: it is none.
-pub(super) fn read(path: &Path, options: &CaptureOptions) -> Option<Result<Take>> {
+pub(super) fn read(path: &Path, options: &CaptureOptions) -> Option<Result<RawCapture>> {
     if path.is_file() {
         let root = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
         return EXPORTS.iter().find(|e| (e.is)(path)).map(|e| (e.read)(root, path, options));
@@ -70,7 +70,7 @@ fn opengl_pose(rows: &[[f64; 4]; 4]) -> Result<Se3> {
 }
 
 /// The take of some shots: of one moving camera where they have times, else as their names say.
-fn take(root: &Path, mut shots: Vec<Shot>, said: Said, options: &CaptureOptions) -> Result<Take> {
+fn take(root: &Path, mut shots: Vec<Shot>, said: Said, options: &CaptureOptions) -> Result<RawCapture> {
     let Said { kind, convention, fps, points, up, mut warnings, mut notes } = said;
     let fps = options.fps.or(fps).unwrap_or(DEFAULT_FPS);
     for shot in &mut shots {
@@ -84,15 +84,15 @@ fn take(root: &Path, mut shots: Vec<Shot>, said: Said, options: &CaptureOptions)
         let first = shots[0].time.unwrap_or_default();
         let frame = |(index, s): (usize, &Shot)| (0, index, s.time.unwrap_or_default() - first);
         let frames = shots.iter().enumerate().map(frame).collect();
-        sequence::Order { cameras: vec!["moving".into()], frames, named: false, timing: Timing::Told }
+        sequence::FrameOrder { cameras: vec!["moving".into()], frames, named: false, timing: Timing::Told }
     } else {
         let poses: Vec<Se3> = shots.iter().map(|s| s.source.cam_from_world).collect();
         sequence::order(&names, &poses, options.sequence, fps, &mut warnings, &mut notes)
     };
-    let sequence::Order { cameras, frames: places, named, timing } = order;
+    let sequence::FrameOrder { cameras, frames: places, named, timing } = order;
     let frame =
         |(shot, place): (Shot, _)| RawFrame { depth: shot.depth, ..RawFrame::new(place, shot.source, shot.image) };
-    Ok(Take {
+    Ok(RawCapture {
         cameras,
         frames: shots.into_iter().zip(places).map(frame).collect(),
         named,
@@ -102,7 +102,7 @@ fn take(root: &Path, mut shots: Vec<Shot>, said: Said, options: &CaptureOptions)
         up,
         warnings,
         notes,
-        ..Take::new(root, kind, convention)
+        ..RawCapture::new(root, kind, convention)
     })
 }
 

@@ -2,12 +2,12 @@
 //! where there
 //! is none.
 
-use super::{CaptureOptions, Take, colmap, foreign, llff, n3dv, nerfies, own, panoptic, rig, stray, transforms};
+use super::{CaptureOptions, RawCapture, colmap, foreign, llff, n3dv, nerfies, own, panoptic, rig, stray, transforms};
 use splat4d::{Error, ErrorKind, Result};
 use std::path::Path;
 
 /// A reader: the capture's folder and the marker file that was found, to what the files say.
-type Reader = fn(&Path, &Path, &CaptureOptions) -> Result<Take>;
+type Reader = fn(&Path, &Path, &CaptureOptions) -> Result<RawCapture>;
 
 /// Marker files (or folders) in the order in which they are looked for, with their readers.
 const READERS: &[(&str, Reader)] = &[
@@ -53,7 +53,7 @@ const FOREIGN: &[(&str, &str)] =
     &[("reconstruction.json", "OpenSfM reconstructions"), ("sfm_data.json", "OpenMVG reconstructions")];
 
 /// Reads the capture in a folder, or that of a marker file or of a COLMAP model's folder.
-pub(super) fn read(path: &Path, options: &CaptureOptions) -> Result<Take> {
+pub(super) fn read(path: &Path, options: &CaptureOptions) -> Result<RawCapture> {
     if !path.exists() {
         return Err(Error::input("there is no such file or folder")
             .at(path.display())
@@ -97,7 +97,7 @@ pub(super) fn read(path: &Path, options: &CaptureOptions) -> Result<Take> {
 }
 
 /// Says which of several COLMAP models was read.
-fn remark_models(take: &mut Take, path: &Path, marker: &str, unread: &[&str]) {
+fn remark_models(take: &mut RawCapture, path: &Path, marker: &str, unread: &[&str]) {
     // One model as two files.
     let unread: Vec<&&str> =
         unread.iter().filter(|m| !(path.join(m).is_file() && path.join(marker).is_file())).collect();
@@ -148,7 +148,7 @@ pub(super) fn is_metadata(path: &Path) -> bool {
 }
 
 /// LLFF's poses: of the cameras of a rig with folders of frames, or of the images of one folder.
-fn read_bounds(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
+fn read_bounds(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<RawCapture> {
     if n3dv::applies(root) { n3dv::read(root, marker, options) } else { llff::read(root, marker, options) }
 }
 
@@ -158,7 +158,7 @@ fn is_capture(folder: &Path) -> bool {
 }
 
 /// Says which of several layouts was read, why, and how to choose another.
-fn remark(take: &mut Take, path: &Path, marker: &str, others: &[&str]) {
+fn remark(take: &mut RawCapture, path: &Path, marker: &str, others: &[&str]) {
     // Files of one family tell of the same images, and a model next to poses was asked for its points.
     let family = [transforms::TRAIN, transforms::ALL];
     let (same, foreign): (Vec<&str>, Vec<&str>) = others

@@ -2,7 +2,7 @@
 
 use super::convention::Convention;
 use super::lookup::Lookup;
-use super::{CaptureKind, CaptureOptions, RawFrame, Take};
+use super::{CaptureKind, CaptureOptions, RawCapture, RawFrame};
 use super::{n3dv, picture, rig, sequence};
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -10,7 +10,7 @@ use splat4d::{Error, Result};
 use std::path::{Path, PathBuf};
 
 /// Reads poses and images; names say whether they show one moment.
-pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
+pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<RawCapture> {
     let fps = options.fps.unwrap_or(DEFAULT_FPS);
     let rows = n3dv::rows(marker)?;
     let lookup = Lookup::new(root, options)?;
@@ -37,7 +37,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     let poses: Vec<Se3> = shots.iter().map(|(_, source)| source.cam_from_world).collect();
     let order = sequence::order(&short, &poses, options.sequence, fps, &mut warnings, &mut notes);
     let frame = |((image, source), &place): ((PathBuf, _), &_)| RawFrame::new(place, source, image);
-    Ok(Take {
+    Ok(RawCapture {
         cameras: order.cameras,
         frames: shots.into_iter().zip(&order.frames).map(frame).collect(),
         named: order.named,
@@ -46,6 +46,6 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         points: n3dv::points(root)?,
         warnings,
         notes,
-        ..Take::new(root, CaptureKind::Llff, Convention::NERF)
+        ..RawCapture::new(root, CaptureKind::Llff, Convention::NERF)
     })
 }

@@ -377,7 +377,7 @@ impl Lookup {
     }
 
     /// Says in one remark which names were not exact.
-    pub(super) fn tell(&self, account: &mut Account) {
+    pub(super) fn report(&self, account: &mut Account) {
         let bare = self.bare.borrow();
         if let Some((file, others)) = bare.iter().next() {
             let what = format!(
@@ -483,7 +483,7 @@ mod tests {
         let (dir, lookup) = lookup(files);
         let found = lookup.image(&lookup.bases(), name).unwrap();
         let mut account = Account::default();
-        lookup.tell(&mut account);
+        lookup.report(&mut account);
         let relative = found.map(|f| f.strip_prefix(dir.path()).unwrap().to_str().unwrap().to_owned());
         (relative, account.remarks.first().map_or_else(String::new, |r| r.what.clone()))
     }
@@ -524,7 +524,7 @@ mod tests {
         assert!(refuse("a.png").contains("A.png, a.PNG") && refuse("b.jpg").contains("b.png, b.webp"));
         assert!(there.image(&there.bases(), "b").unwrap().unwrap().ends_with("b.png"), "no ending is stated");
         let mut account = Account::default();
-        there.tell(&mut account);
+        there.report(&mut account);
         let said = &account.remarks[0];
         assert!(
             said.severity == Severity::Warning && said.what.contains("b.png: it is read, and b.webp is not"),

@@ -6,7 +6,7 @@
 use super::account::Severity;
 use super::account::{Aspect, first_names};
 use super::lookup::{fold, is_image_folder, key, may_hold_masks, without_ending};
-use super::{CaptureKind, RawFrame, Take, rig};
+use super::{CaptureKind, RawCapture, RawFrame, rig};
 use splat4d::{Error, Result};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -20,11 +20,11 @@ const PREFIXES: [&str; 2] = ["mask_", "mask-"];
 const MOST_LEVELS: usize = 4;
 
 /// Gives frames without a mask theirs. Errors: two masks of one image.
-pub(super) fn fill(take: &mut Take) -> Result<()> {
+pub(super) fn fill(take: &mut RawCapture) -> Result<()> {
     let folders: Vec<String> = rig::file_names(&take.root).into_iter().filter(|n| take.root.join(n).is_dir()).collect();
     let named = |known: &&str| folders.iter().find(|n| fold(n) == **known);
     let Some(name) = FOLDERS.iter().find_map(named) else {
-        tell_of_others(take, &folders);
+        report_others(take, &folders);
         return Ok(());
     };
     let folder = take.root.join(name);
@@ -86,7 +86,7 @@ pub(super) fn fill(take: &mut Take) -> Result<()> {
         used.extend(fitting.iter().copied());
         filled += 1;
     }
-    tell(take, &folder, (files.len(), &by_name, &used, filled));
+    report(take, &folder, (files.len(), &by_name, &used, filled));
     Ok(())
 }
 
@@ -96,7 +96,7 @@ fn below(root: &Path, image: &Path) -> String {
 }
 
 /// Names folders that may hold masks and are not read, where no frame has one.
-fn tell_of_others(take: &mut Take, folders: &[String]) {
+fn report_others(take: &mut RawCapture, folders: &[String]) {
     let others: Vec<&String> = folders.iter().filter(|n| may_hold_masks(n)).collect();
     let images: BTreeSet<String> = take.frames.iter().map(|f| image_key(&below(&take.root, &f.image))).collect();
     let fits = |folder: &&&String| {
@@ -144,8 +144,8 @@ fn tell_of_others(take: &mut Take, folders: &[String]) {
 }
 
 /// Says how many masks and images have no counterpart.
-fn tell(
-    take: &mut Take,
+fn report(
+    take: &mut RawCapture,
     folder: &Path,
     (all, by_name, used, filled): (usize, &BTreeMap<String, Vec<&String>>, &BTreeSet<&String>, usize),
 ) {

@@ -2,12 +2,11 @@
 //!
 //! [`Capture::open`] identifies the layout of a folder, reads poses and times, checks them and converts them to one
 //! form: pinhole cameras with OpenCV axes, seconds, and one held-out split. An [`ImageStore`] decodes images on demand
-//! within a byte budget. Every reader produces a `Take` (the content of the files); `assemble` alone turns takes into
+//! within a byte budget. Every reader produces a `RawCapture` (the content of the files); `assemble` alone turns takes into
 //! captures, so all layouts are checked alike.
 
 mod account;
 mod assemble;
-mod beside;
 mod borders;
 mod colmap;
 mod colmap_files;
@@ -16,6 +15,7 @@ mod depth;
 mod elsewhere;
 mod evidence;
 mod exr;
+mod extra_model;
 pub(crate) mod features;
 pub(crate) mod flow;
 mod foreign;
@@ -251,7 +251,7 @@ pub struct Capture {
 }
 
 /// A reader's findings in the files, before any check.
-struct Take {
+struct RawCapture {
     name: Option<String>,
     root: PathBuf,
     kind: CaptureKind,
@@ -280,7 +280,7 @@ struct Take {
     convention: Convention,
 }
 
-impl Take {
+impl RawCapture {
     /// An empty take of a layout; readers fill in what it states.
     fn new(root: &Path, kind: CaptureKind, convention: Convention) -> Self {
         Self {

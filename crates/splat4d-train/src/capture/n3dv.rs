@@ -5,7 +5,7 @@ use super::account::{Account, Aspect, first_names};
 use super::convention::{Convention, Poses};
 use super::points::read_ply;
 use super::stray::{ffmpeg_command, videos};
-use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take};
+use super::{CaptureKind, CaptureOptions, PointCloud, RawCapture, RawFrame, Split};
 use super::{json, lookup, picture, pose, rig, sequence};
 use splat4d::format::npy::Npy;
 use splat4d::math::Se3;
@@ -57,7 +57,7 @@ pub(super) fn points(root: &Path) -> Result<Option<PointCloud>> {
 }
 
 /// Reads poses and frame folders; the first camera is held out.
-pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
+pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<RawCapture> {
     let place = |e: Error| e.at(marker.display());
     let rows = rows(marker)?;
     let folders = folders(root);
@@ -85,14 +85,14 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
             frames.push(RawFrame { split, ..RawFrame::new(place, source.clone(), image.clone()) });
         }
     }
-    Ok(Take {
+    Ok(RawCapture {
         cameras: folders.into_iter().map(|f| f.name).collect(),
         frames,
         named: true,
         fps,
         points: points(root)?,
         account,
-        ..Take::new(root, CaptureKind::N3dv, Convention::NERF)
+        ..RawCapture::new(root, CaptureKind::N3dv, Convention::NERF)
     })
 }
 

@@ -11,7 +11,7 @@ use super::account::{Account, Aspect, first_names};
 use super::convention::{Convention, Poses};
 use super::json::{self, Node};
 use super::lookup::Lookup;
-use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take, pose};
+use super::{CaptureKind, CaptureOptions, PointCloud, RawCapture, RawFrame, Split, pose};
 use splat4d::format::npy::Npy;
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -115,7 +115,7 @@ fn stated_rate(root: &Path) -> Result<Option<f64>> {
 }
 
 /// Reads a capture.
-pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
+pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<RawCapture> {
     let lookup = Lookup::new(root, options)?;
     let mut account = Account::default();
     let stated = stated_rate(root)?;
@@ -180,16 +180,16 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
             format!("{left_out} of {} images are neither trained on nor held out by the split lists.", ids.len());
         account.add(Aspect::NotRead, Severity::Note, what);
     }
-    lookup.tell(&mut account);
+    lookup.report(&mut account);
     let named = cameras.len() > 1;
-    Ok(Take {
+    Ok(RawCapture {
         cameras: cameras.iter().map(|c| format!("camera{c}")).collect(),
         frames,
         named,
         fps,
         points: points(root, &framing)?,
         account,
-        ..Take::new(root, CaptureKind::Nerfies, Convention::NERFIES)
+        ..RawCapture::new(root, CaptureKind::Nerfies, Convention::NERFIES)
     })
 }
 

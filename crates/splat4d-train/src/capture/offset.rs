@@ -1,14 +1,14 @@
 //! Captures far from the origin of their world, as maps have them: the one place where the offset is subtracted, in f64,
 //! from the poses and points of all layouts. Depth maps and tracks are relative to their cameras.
 
-use super::{Capture, Take};
+use super::{Capture, RawCapture};
 use splat4d::math::Se3;
 use splat4d::math::se3::{mat_vec, sub};
 use splat4d::scene::offset::offset_of;
 
 /// Subtracts the offset that the take needs from its poses and points, and returns it: zero near the origin, where every
 /// bit stays.
-pub(super) fn subtract(take: &mut Take) -> [f64; 3] {
+pub(super) fn subtract(take: &mut RawCapture) -> [f64; 3] {
     let centers: Vec<[f64; 3]> = take.frames.iter().map(|f| f.source.center()).collect();
     let points = take.points.as_ref().map_or(&[][..], |p| &p.points);
     let offset = offset_of(&centers, points);

@@ -5,7 +5,7 @@ use super::convention::Convention;
 use super::json::{self, Node};
 use super::lookup::Lookup;
 use super::points::read_ply;
-use super::{CaptureKind, CaptureOptions, DepthFile, DepthKind, Extent, HoldOut, RawFrame, Take, Tracks, pose};
+use super::{CaptureKind, CaptureOptions, DepthFile, DepthKind, Extent, HoldOut, RawCapture, RawFrame, Tracks, pose};
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::scene::{Camera, Intrinsics, Lens};
@@ -67,12 +67,12 @@ const MOST_MISSING: usize = 100;
 const MAX_DIGITS: usize = 32;
 
 /// Reads a `capture.json`.
-pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
+pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<RawCapture> {
     let value = json::read(marker)?;
     read_value(root, &Node::root(&value), options).map_err(|e| e.at(marker.display()))
 }
 
-fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<Take> {
+fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<RawCapture> {
     let version = top.get("version")?.count()?;
     if version != VERSION {
         return Err(Error::new(ErrorKind::Unsupported, format!("the format version is {version}, not {VERSION}"))
@@ -116,10 +116,10 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<T
         cameras.push(name);
     }
     let mut account = Account::default();
-    lookup.tell(&mut account);
+    lookup.report(&mut account);
     let convention = Convention { world_to_camera: !inverse, opengl, quaternions: false };
     let points = top.opt("points")?.map(|n| lookup.file(n.text()?)).transpose()?;
-    Ok(Take {
+    Ok(RawCapture {
         name: top.opt("name")?.map(|n| n.text()).transpose()?.map(str::to_string),
         cameras,
         frames,
@@ -134,7 +134,7 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<T
         up: top.opt("up")?.map(|n| n.numbers::<3>()).transpose()?,
         labels,
         account,
-        ..Take::new(root, CaptureKind::Own, convention)
+        ..RawCapture::new(root, CaptureKind::Own, convention)
     })
 }
 

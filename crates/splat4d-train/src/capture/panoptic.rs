@@ -6,7 +6,7 @@ use super::convention::Convention;
 use super::json::{self, Node};
 use super::lookup::{self, Lookup};
 use super::points::read_ply;
-use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Split, Take, rig};
+use super::{CaptureKind, CaptureOptions, PointCloud, RawCapture, RawFrame, Split, rig};
 use splat4d::format::npy::Npy;
 use splat4d::math::Se3;
 use splat4d::scene::time::DEFAULT_FPS;
@@ -18,7 +18,7 @@ use std::path::Path;
 const UP: [f64; 3] = [0.0, -1.0, 0.0];
 
 /// Reads both files; the cameras of `test_meta.json` are held out.
-pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
+pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<RawCapture> {
     let fps = options.fps.unwrap_or(DEFAULT_FPS);
     let lookup = Lookup::new(root, options)?;
     let mut found: Vec<(usize, RawFrame)> = Vec::new();
@@ -40,8 +40,8 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     let mut warnings = Vec::new();
     let points = read_points(root, &mut warnings)?;
     let mut account = Account::default();
-    lookup.tell(&mut account);
-    Ok(Take {
+    lookup.report(&mut account);
+    Ok(RawCapture {
         cameras: ids.iter().map(ToString::to_string).collect(),
         frames: found.into_iter().map(|(_, f)| f).collect(),
         named: true,
@@ -50,7 +50,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         up: Some(UP),
         warnings,
         account,
-        ..Take::new(root, CaptureKind::Panoptic, Convention::OPENCV)
+        ..RawCapture::new(root, CaptureKind::Panoptic, Convention::OPENCV)
     })
 }
 

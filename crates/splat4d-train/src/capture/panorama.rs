@@ -1,7 +1,7 @@
 //! Equirectangular panoramas (COLMAP's and Nerfstudio's EQUIRECTANGULAR) become six pinhole views each, the faces of a cube.
 //! Views are cut out of the panorama when an image is loaded; nothing is written.
 
-use super::{HoldOut, RawFrame, Split, Take, Timing};
+use super::{HoldOut, RawCapture, RawFrame, Split, Timing};
 use splat4d::math::Se3;
 use splat4d::math::se3::{mat_mul, mat_vec};
 use splat4d::scene::{Camera, Intrinsics, Lens};
@@ -34,7 +34,7 @@ pub(super) fn whole(size: [usize; 2]) -> (Intrinsics, Lens) {
 }
 
 /// Splits the panoramas of a take; others stay.
-pub(super) fn split(take: &mut Take, hold_out: Option<&HoldOut>) -> Result<()> {
+pub(super) fn split(take: &mut RawCapture, hold_out: Option<&HoldOut>) -> Result<()> {
     let is_panorama = |f: &RawFrame| matches!(f.source.lens, Lens::Equirectangular { .. });
     let count = take.frames.iter().filter(|f| is_panorama(f)).count();
     if count == 0 {

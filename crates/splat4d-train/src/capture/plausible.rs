@@ -3,7 +3,7 @@
 use super::account::Aspect;
 use super::account::Severity;
 use super::lens::Distortion;
-use super::{RawFrame, Take};
+use super::{RawCapture, RawFrame};
 use splat4d::scene::{Camera, Lens};
 use std::collections::BTreeSet;
 
@@ -29,7 +29,7 @@ const DOUBTS: [(Doubt, &str); 3] = [
 ];
 
 /// Warns of intrinsics that are hardly those of the images.
-pub(super) fn check(take: &mut Take) {
+pub(super) fn check(take: &mut RawCapture) {
     for (doubt, cause) in DOUBTS {
         let odd: Vec<(&RawFrame, String)> = take.frames.iter().filter_map(|f| Some((f, doubt(&f.source)?))).collect();
         let Some((first, what)) = odd.first() else { continue };

@@ -17,7 +17,7 @@ pub enum Timing {
 }
 
 /// Who took every image, and when.
-pub(super) struct Order {
+pub(super) struct FrameOrder {
     /// Camera names.
     pub cameras: Vec<String>,
     /// For each image its camera, its frame number and its time in seconds.
@@ -50,7 +50,7 @@ pub(super) fn order(
     fps: f64,
     warnings: &mut Vec<String>,
     notes: &mut Vec<String>,
-) -> Order {
+) -> FrameOrder {
     let naming = rig::naming(names);
     let rig = naming.told && naming.cameras.len() > 1;
     let mut groups = vec![Vec::new(); naming.cameras.len()];
@@ -96,7 +96,7 @@ pub(super) fn order(
         let number = if moment { 0 } else { number };
         (camera, number, number as f64 / fps)
     };
-    Order {
+    FrameOrder {
         frames: naming.frames.iter().map(place).collect(),
         cameras: naming.cameras,
         named: rig,
@@ -105,7 +105,7 @@ pub(super) fn order(
 }
 
 /// One moment: every image has a place of its own, and is its own camera.
-pub(super) fn moment(names: &[&str]) -> Order {
+pub(super) fn moment(names: &[&str]) -> FrameOrder {
     let stem = |name: &str| name.rsplit_once('.').map_or(name, |(stem, _)| stem).to_owned();
     let short = |name: &str| stem(name.rsplit_once('/').map_or(name, |(_, file)| file));
     let distinct = names.iter().map(|n| short(n)).collect::<BTreeSet<_>>().len() == names.len();
@@ -114,7 +114,7 @@ pub(super) fn moment(names: &[&str]) -> Order {
     let mut frames = vec![(0, 0, 0.0); names.len()];
     sorted.values().enumerate().for_each(|(camera, &i)| frames[i].0 = camera);
     let cameras = sorted.keys().map(|(name, _)| (*name).to_owned()).collect();
-    Order { cameras, frames, named: false, timing: Timing::Moment }
+    FrameOrder { cameras, frames, named: false, timing: Timing::Moment }
 }
 
 /// Whether the images are frames of one camera's film: it never moves, or they are numbered evenly as films are.

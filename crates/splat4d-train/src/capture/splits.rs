@@ -30,7 +30,7 @@ impl Lists {
     }
 
     /// Those next to a COLMAP model.
-    pub(super) fn beside_model(root: &Path, model: &Path) -> Result<Self> {
+    pub(super) fn next_to_model(root: &Path, model: &Path) -> Result<Self> {
         let list = |path: &Path| -> Result<Vec<String>> {
             if !path.is_file() {
                 return Ok(Vec::new());

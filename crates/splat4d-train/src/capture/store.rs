@@ -178,7 +178,7 @@ struct Shared {
 
 #[derive(Default)]
 struct State {
-    kept: BTreeMap<usize, Kept>,
+    kept: BTreeMap<usize, CachedImages>,
     bytes: usize,
     peak: usize,
     clock: u64,
@@ -188,7 +188,7 @@ struct State {
     closed: bool,
 }
 
-struct Kept {
+struct CachedImages {
     picture: Arc<StoredPicture>,
     used: u64,
 }
@@ -324,7 +324,7 @@ impl Shared {
         state.peak = state.peak.max(state.bytes);
         state.clock += 1;
         let used = state.clock;
-        state.kept.insert(frame, Kept { picture: Arc::clone(picture), used });
+        state.kept.insert(frame, CachedImages { picture: Arc::clone(picture), used });
     }
 
     /// The prefetch thread.

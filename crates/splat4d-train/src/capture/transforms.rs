@@ -13,9 +13,9 @@ use super::convention::{Convention, Poses};
 use super::json::{self, Node};
 use super::lookup::Lookup;
 use super::points::read_ply;
-use super::sequence::{self, Order};
+use super::sequence::{self, FrameOrder};
 use super::splits::Lists;
-use super::{CaptureKind, CaptureOptions, PointCloud, RawFrame, Sequence, Split, Take, colmap, picture};
+use super::{CaptureKind, CaptureOptions, PointCloud, RawCapture, RawFrame, Sequence, Split, colmap, picture};
 use frame::Entry;
 use splat4d::Result;
 use splat4d::scene::Camera;
@@ -33,7 +33,7 @@ const BLENDER_UP: [f64; 3] = [0.0, 0.0, 1.0];
 
 /// Reads the marker and what lies next to it. Cameras are distinguished by image names (`cam/frame`), else by repeated
 /// poses; times come from `time`, else from what `sequence` makes of the names.
-pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
+pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<RawCapture> {
     let several = marker.file_name().is_some_and(|name| name == TRAIN);
     let (mut warnings, mut notes, mut account) = (Vec::new(), Vec::new(), Account::default());
     let lookup = Lookup::new(root, options)?;
@@ -60,7 +60,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         Some(told) => told,
         None => (untimed(&entries, options, several, (&mut warnings, &mut notes), first.fps), first.fps),
     };
-    let Order { cameras, frames: places, named, timing } = order;
+    let FrameOrder { cameras, frames: places, named, timing } = order;
     let blender = several && entries.iter().all(|e| e.by_angle);
     let frame = |(entry, place): (Entry, _)| RawFrame {
         mask: entry.mask,
@@ -75,9 +75,9 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         None => colmap::points_beside(root, marker, &frames, &mut warnings, &mut notes),
     };
     warnings.extend(first.warning);
-    lookup.tell(&mut account);
+    lookup.report(&mut account);
     let kind = if several { CaptureKind::DNerf } else { CaptureKind::Nerfstudio };
-    Ok(Take {
+    Ok(RawCapture {
         cameras,
         frames,
         named,
@@ -89,7 +89,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         warnings,
         notes,
         account,
-        ..Take::new(root, kind, Convention::NERF)
+        ..RawCapture::new(root, kind, Convention::NERF)
     })
 }
 
@@ -117,7 +117,7 @@ fn untimed(
     several: bool,
     (warnings, notes): (&mut Vec<String>, &mut Vec<String>),
     fps: f64,
-) -> Order {
+) -> FrameOrder {
     let names: Vec<&str> = entries.iter().map(|e| e.name.as_str()).collect();
     let poses: Vec<_> = entries.iter().map(|e| e.source.cam_from_world).collect();
     if several && options.sequence == Sequence::Auto {

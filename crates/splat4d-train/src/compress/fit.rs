@@ -1,7 +1,7 @@
 //! Settings with which a file stays within so many bytes.
 
 use super::{Compression, Level, MOST_PRUNED, draft};
-use crate::upkeep::worth::{Scores, prune};
+use crate::maintenance::importance::{Scores, prune};
 use crate::{Error, Result};
 use splat4d::format::playback::{WriteConfig, write};
 use splat4d::layers::Scene;

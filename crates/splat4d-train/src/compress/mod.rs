@@ -21,12 +21,12 @@ pub use settings::{Compression, Level, MOST_PRUNED};
 
 use crate::capture::Capture;
 use crate::event::Event;
+use crate::maintenance::Strategy;
+use crate::maintenance::importance::{Scores, score};
 use crate::recipe::Recipe;
 use crate::run::{Outcome, TrainOptions};
 use crate::run::{Refine, refine};
 use crate::run::{plan, training_frames};
-use crate::upkeep::Strategy;
-use crate::upkeep::worth::{Scores, score};
 use crate::{Error, Result};
 use splat4d::bake::{self, bake};
 use splat4d::format::playback::{Draft, Meta, Pages, feature_ranges};

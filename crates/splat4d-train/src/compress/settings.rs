@@ -1,7 +1,7 @@
 //! Settings of compression, and the three levels.
 
+use crate::maintenance::importance::{Combine, Spatial, Temporal};
 use crate::settings::nearest;
-use crate::upkeep::worth::{Combine, Spatial, Temporal};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use splat4d::format::playback::{Depths, MAX_PALETTE, WriteConfig};

@@ -8,9 +8,9 @@ use crate::capture::frames::Frames;
 use crate::event::Progress;
 use crate::loss::scene::MeanOpacity;
 use crate::loss::terms::ParamLoss;
-use crate::methods::{Hook, Plan, Rate, Stage, tuning};
+use crate::maintenance::importance::{MaskConfig, ScoreConfig, key_masks, prune, score};
+use crate::methods::{Hook, Rate, Stage, TrainContext, tuning};
 use crate::recipe::Recipe;
-use crate::upkeep::worth::{MaskConfig, ScoreConfig, key_masks, prune, score};
 use splat4d::format::playback::{WriteConfig, read_pages, write};
 use splat4d::layers::Scene;
 use splat4d::math::Rng;
@@ -29,7 +29,7 @@ const FILE_RATES: f64 = 0.5;
 #[derive(Clone)]
 pub(super) struct Prepared {
     pub frames: Arc<dyn Frames>,
-    pub plan: Plan,
+    pub plan: TrainContext,
     pub recipe: Recipe,
     pub cameras: Vec<Camera>,
     pub settings: Compression,

@@ -3,7 +3,6 @@
 
 use crate::Result;
 use crate::capture::{Capture, ImageStore};
-use crate::learner::{Corrections, Origin, RefineSettings, Scale};
 use crate::loss::image::View;
 use crate::loss::terms::StepInfo;
 use crate::recipe::Recipe;
@@ -12,6 +11,7 @@ use crate::run::{learnable, plan, scale};
 use crate::step::chain::{Chain, Losses, Step};
 use crate::step::clocks::Look;
 use crate::step::loss::TrainLoss;
+use crate::train_state::{Corrections, Origin, RefineSettings, Scale};
 use serde_json::Value;
 use splat4d::layers::Scene;
 use splat4d::render::Backend;

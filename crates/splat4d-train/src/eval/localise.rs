@@ -9,7 +9,7 @@
 //! has another exposure. What does not fit the scene much better than one plain colour would is refused ([`Located::is_sure`]).
 
 use crate::Result;
-use crate::learner::moved;
+use crate::train_state::moved;
 use splat4d::device;
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::cholesky::Cholesky;

@@ -102,7 +102,7 @@ mod tests {
     use super::*;
     use crate::capture::DepthKind;
     use crate::capture::frames::Depth;
-    use crate::methods::Plan;
+    use crate::methods::TrainContext;
     use crate::recipe::Recipe;
     use crate::step::tests::Made;
     use splat4d::math::se3::{dot, norm, normalize, sub};
@@ -179,7 +179,7 @@ mod tests {
         assert!(none.is_empty(), "no maps, no points");
         // Gaussians that live through the whole clip begin with what moves at one moment of it.
         let recipe = Recipe::default().with(|r| r.init.count = 400);
-        let plan = Plan { clip: [deep.0.time_of(0), deep.0.time_of(2)], times: 3, fps: 10.0, ..recipe.plan() };
+        let plan = TrainContext { clip: [deep.0.time_of(0), deep.0.time_of(2)], times: 3, fps: 10.0, ..recipe.plan() };
         let one = super::super::one_moment(&plan, &recipe.init, &deep, None).unwrap();
         let off = |i: usize, k: usize| norm(sub(one.points[i], deep.0.object_at(deep.0.time_of(k)))) - Made::RADIUS;
         let near = |i: usize, k: usize| off(i, k).abs() < 1e-3;

@@ -10,7 +10,7 @@ pub(crate) mod volume;
 
 use crate::capture::PointCloud;
 use crate::capture::frames::Frames;
-use crate::methods::{Beginning, Plan, Program};
+use crate::methods::{InitialMotion, Method, TrainContext};
 use crate::settings::{Value, among, settings};
 use crate::{Error, Result};
 use splat4d::layers::{Head, Layer, Scene};
@@ -188,7 +188,7 @@ const INITIAL_SOFTNESS_FRAMES: f64 = 1.0;
 const OPEN_LIFE: (f64, f64) = (0.3, 0.25);
 
 /// The keyframe times of the plan: evenly over the clip, at least one.
-pub(crate) fn keyframes(plan: &Plan, settings: &InitSettings) -> Vec<f64> {
+pub(crate) fn keyframes(plan: &TrainContext, settings: &InitSettings) -> Vec<f64> {
     let count = match settings.keyframes {
         0 => plan.times.div_ceil(FRAMES_PER_KEYFRAME).max(1),
         k => k.min(plan.times.max(1)),
@@ -198,7 +198,7 @@ pub(crate) fn keyframes(plan: &Plan, settings: &InitSettings) -> Vec<f64> {
 
 /// Chooses initial points. `points`: the capture's own.
 pub fn seeds(
-    plan: &Plan,
+    plan: &TrainContext,
     settings: &InitSettings,
     frames: &dyn Frames,
     points: Option<Seeds>,
@@ -259,7 +259,7 @@ pub fn seeds(
 /// Initial points for Gaussians that live through the whole clip: those of its middle, where what moves is on average
 /// nearest to where it will be.
 pub(crate) fn one_moment(
-    plan: &Plan,
+    plan: &TrainContext,
     settings: &InitSettings,
     frames: &dyn Frames,
     points: Option<Seeds>,
@@ -279,9 +279,9 @@ pub(crate) fn one_moment(
 
 /// One layer of Gaussians at the seeds: isotropic, as large as the distance to their neighbours of the same moment.
 pub fn scene(
-    plan: &Plan,
+    plan: &TrainContext,
     settings: &InitSettings,
-    program: &dyn Program,
+    program: &dyn Method,
     seeds: &Seeds,
     background: [f32; 3],
     up: [f64; 3],
@@ -291,8 +291,8 @@ pub fn scene(
     let n = seeds.len();
     let mut params = Params::<f32>::new(n, (degree + 1) * (degree + 1), life.columns());
     let scales = scales(seeds, plan);
-    let begin = |i: usize| Beginning { life: first_life(plan, settings, seeds, i), velocity: seeds.velocities[i] };
-    let beginnings: Vec<Beginning> = (0..n).map(begin).collect();
+    let begin = |i: usize| InitialMotion { life: first_life(plan, settings, seeds, i), velocity: seeds.velocities[i] };
+    let beginnings: Vec<InitialMotion> = (0..n).map(begin).collect();
     let logit = (settings.opacity / (1.0 - settings.opacity)).ln() as f32;
     for i in 0..n {
         let geometry = &mut params[GEOMETRY];
@@ -323,7 +323,7 @@ pub fn scene(
 }
 
 /// Centre and width (seconds) of the life that a Gaussian at a seed starts with.
-fn first_life(plan: &Plan, settings: &InitSettings, seeds: &Seeds, i: usize) -> (f64, f64) {
+fn first_life(plan: &TrainContext, settings: &InitSettings, seeds: &Seeds, i: usize) -> (f64, f64) {
     let gap = plan.seconds() / keyframes(plan, settings).len() as f64;
     let short = match seeds.life {
         _ if settings.life > 0.0 => settings.life * plan.seconds(),
@@ -337,7 +337,7 @@ fn first_life(plan: &Plan, settings: &InitSettings, seeds: &Seeds, i: usize) -> 
 }
 
 /// Root mean square distance to the three nearest seeds of the same moment (Kerbl et al. 2023), clamped.
-fn scales(seeds: &Seeds, plan: &Plan) -> Vec<f64> {
+fn scales(seeds: &Seeds, plan: &TrainContext) -> Vec<f64> {
     let mut order: Vec<usize> = (0..seeds.len()).collect();
     let key = |i: usize| seeds.times[i].unwrap_or(f64::NEG_INFINITY);
     order.sort_by(|&a, &b| key(a).total_cmp(&key(b)).then(a.cmp(&b)));
@@ -368,7 +368,7 @@ mod tests {
     /// What is far is as wide as its neighbours are apart, as seen from the cameras, and not a speck.
     #[test]
     fn first_sizes_are_bounded_by_the_distance_from_the_cameras() {
-        let plan = Plan { extent: 2.0, center: [0.0, 0.0, -1.0], ..Plan::default() };
+        let plan = TrainContext { extent: 2.0, center: [0.0, 0.0, -1.0], ..TrainContext::default() };
         let mut seeds = Seeds::default();
         for at in [1.0, 99.0] {
             (0..5).for_each(|k| seeds.push([0.3 * at * f64::from(k), 0.0, at], [0.5; 3], None));
@@ -383,7 +383,7 @@ mod tests {
     fn a_seed_that_moves_makes_a_gaussian_that_moves() {
         for motion in ["spacetime", "native4d"] {
             let recipe = Recipe::default().with(|r| r.run.motion = MotionName::of(motion));
-            let plan = Plan { extent: 2.0, clip: [0.0, 1.0], times: 11, fps: 10.0, ..recipe.plan() };
+            let plan = TrainContext { extent: 2.0, clip: [0.0, 1.0], times: 11, fps: 10.0, ..recipe.plan() };
             let mut seeds = Seeds { life: Some(0.2), ..Seeds::default() };
             for k in 0..6 {
                 seeds.push([0.1 * k as f64, 0.0, 1.0], [0.5; 3], Some(0.5));

@@ -2,7 +2,7 @@
 
 use super::image::entropy::binary_entropy;
 use super::near::{NEIGHBOURS, Near};
-use super::terms::{KeptLoss, ParamLoss, StepInfo};
+use super::terms::{ParamLoss, ResidentLoss, StepInfo};
 use splat4d::layers::Scene;
 use splat4d::math::Real;
 use splat4d::motion::for_rows;
@@ -51,8 +51,8 @@ impl<F: Real> ParamLoss<F> for MeanOpacity {
         "opacity_reg"
     }
 
-    fn kept(&self) -> Option<KeptLoss> {
-        Some(KeptLoss::Rows(RowWeights { opacity: self.weight, ..RowWeights::default() }))
+    fn kept(&self) -> Option<ResidentLoss> {
+        Some(ResidentLoss::Rows(RowWeights { opacity: self.weight, ..RowWeights::default() }))
     }
 
     fn eval(&self, scene: &Scene<F>, _info: &StepInfo, d: &mut [Grads<F>]) -> f64 {
@@ -79,8 +79,8 @@ impl<F: Real> ParamLoss<F> for OpacityEntropy {
         "lambda_opacity_entropy"
     }
 
-    fn kept(&self) -> Option<KeptLoss> {
-        Some(KeptLoss::Rows(RowWeights { entropy: self.weight, ..RowWeights::default() }))
+    fn kept(&self) -> Option<ResidentLoss> {
+        Some(ResidentLoss::Rows(RowWeights { entropy: self.weight, ..RowWeights::default() }))
     }
 
     fn eval(&self, scene: &Scene<F>, _info: &StepInfo, d: &mut [Grads<F>]) -> f64 {
@@ -106,8 +106,8 @@ impl<F: Real> ParamLoss<F> for MeanScale {
         "scale_reg"
     }
 
-    fn kept(&self) -> Option<KeptLoss> {
-        Some(KeptLoss::Rows(RowWeights { scale: self.weight, ..RowWeights::default() }))
+    fn kept(&self) -> Option<ResidentLoss> {
+        Some(ResidentLoss::Rows(RowWeights { scale: self.weight, ..RowWeights::default() }))
     }
 
     fn eval(&self, scene: &Scene<F>, _info: &StepInfo, d: &mut [Grads<F>]) -> f64 {

@@ -4,7 +4,7 @@
 use crate::Result;
 use splat4d::layers::Scene;
 use splat4d::math::Real;
-use splat4d::render::{KeptTies, RowWeights};
+use splat4d::render::{ResidentTies, RowWeights};
 use splat4d::scene::{Grads, Space, Table, Time};
 
 /// Where in training a loss is asked.
@@ -53,7 +53,7 @@ pub trait ProbeLoss<F: Real>: Send + Sync {
 
 /// A loss on raw parameters that a device can take which keeps them.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum KeptLoss {
+pub enum ResidentLoss {
     /// Means over the rows that are active.
     Rows(RowWeights),
     /// Ties of poses, from [`ParamLoss::ties`].
@@ -67,11 +67,11 @@ pub trait ParamLoss<F: Real>: Send + Sync {
     /// The loss; adds to one `Grads` a layer.
     fn eval(&self, scene: &Scene<F>, info: &StepInfo, d: &mut [Grads<F>]) -> f64;
     /// The same as a device knows it; none: the CPU must take it.
-    fn kept(&self) -> Option<KeptLoss> {
+    fn kept(&self) -> Option<ResidentLoss> {
         None
     }
-    /// The ties of [`KeptLoss::Ties`].
-    fn ties(&self, _scene: &Scene<F>) -> Option<KeptTies> {
+    /// The ties of [`ResidentLoss::Ties`].
+    fn ties(&self, _scene: &Scene<F>) -> Option<ResidentTies> {
         None
     }
     /// Rows were edited: whatever was remembered of rows is stale.

@@ -9,13 +9,13 @@
 
 use super::graph::{Graph, Weigh};
 use super::rigid::{Poses, isometry, rigidity, rotation};
-use super::terms::{KeptLoss, ParamLoss, StepInfo};
+use super::terms::{ParamLoss, ResidentLoss, StepInfo};
 use rayon::prelude::*;
 use splat4d::layers::{Layer, Scene};
 use splat4d::math::Real;
 use splat4d::math::sh::C0;
 use splat4d::motion::tracked::{FOREGROUND, POSE, page_of};
-use splat4d::render::KeptTies;
+use splat4d::render::ResidentTies;
 use splat4d::scene::params::QUAT;
 use splat4d::scene::{GEOMETRY, Grads, Key, SH, Space};
 use std::sync::{Arc, Mutex, MutexGuard};
@@ -243,11 +243,11 @@ impl<F: Real> ParamLoss<F> for Tied<F> {
     }
 
     /// Colours that learn are the CPU's.
-    fn kept(&self) -> Option<KeptLoss> {
-        (self.of.ties.weights.soft_col == 0.0).then_some(KeptLoss::Ties)
+    fn kept(&self) -> Option<ResidentLoss> {
+        (self.of.ties.weights.soft_col == 0.0).then_some(ResidentLoss::Ties)
     }
 
-    fn ties(&self, scene: &Scene<F>) -> Option<KeptTies> {
+    fn ties(&self, scene: &Scene<F>) -> Option<ResidentTies> {
         let layer = &scene.layers[0];
         let before = page_of(&layer.params, self.frame - 1)?;
         let (frame0, Ties { weights: w, floor, unit, .. }) = (self.of.frame0(layer), &self.of.ties);
@@ -256,7 +256,7 @@ impl<F: Real> ParamLoss<F> for Tied<F> {
         let single = |x: F| x.f64() as f32;
         let [first, back] = graph.all_to();
         let stays = share(w.bg, background.len());
-        Some(KeptTies {
+        Some(ResidentTies {
             points: foreground.clone(),
             background: background.clone(),
             neighbours: graph.k(),

@@ -1,6 +1,6 @@
 //! `--motion auto`: looks at the capture, and takes the first program that says why it suits.
 
-use super::{Plan, Program};
+use super::{Method, TrainContext};
 use crate::Result;
 use crate::capture::Agreement;
 use crate::capture::frames::{Frames, Picture};
@@ -16,7 +16,7 @@ const LONG: usize = 600;
 
 /// The motion that a capture shows.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Seen {
+pub struct CaptureStats {
     /// Moments.
     pub times: usize,
     /// Training images a moment.
@@ -37,9 +37,9 @@ pub struct Seen {
     pub predicted: bool,
 }
 
-impl Seen {
+impl CaptureStats {
     /// Looks at the training frames of a capture.
-    pub(crate) fn of(plan: &Plan, frames: &dyn Frames) -> Result<Self> {
+    pub(crate) fn of(plan: &TrainContext, frames: &dyn Frames) -> Result<Self> {
         let looks = plan.times > 1 && plan.fixed_cameras > 0;
         Ok(Self {
             times: plan.times,
@@ -75,11 +75,11 @@ pub(crate) struct Choice {
 
 /// Chooses for the training frames of a capture: the first of the programs that says why it suits.
 pub(crate) fn choose(
-    plan: &Plan,
-    programs: impl IntoIterator<Item = (&'static str, Box<dyn Program>)>,
+    plan: &TrainContext,
+    programs: impl IntoIterator<Item = (&'static str, Box<dyn Method>)>,
     frames: &dyn Frames,
 ) -> Result<Choice> {
-    let seen = Seen::of(plan, frames)?;
+    let seen = CaptureStats::of(plan, frames)?;
     let mut programs = programs.into_iter();
     let choice = programs.find_map(|(motion, program)| Some(Choice { motion, why: program.suits(&seen)? }));
     Ok(choice.expect("one program suits whatever no other does"))
@@ -157,7 +157,7 @@ mod tests {
 
         fn choose(&self, fixed: bool) -> Choice {
             let recipe = Recipe::default().with(|r| r.capture.observe = self.observe);
-            let plan = Plan {
+            let plan = TrainContext {
                 extent: 1.0,
                 center: [0.0; 3],
                 clip: [0.0, 1.0],

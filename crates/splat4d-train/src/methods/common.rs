@@ -2,12 +2,12 @@
 
 use super::Rate;
 use crate::loss::LossSettings;
-use crate::settings::{Choice, settings};
-use crate::upkeep::{
-    Adc, AdcSettings, DensifySettings, FloaterSettings, Floaters, LEAST, Mcmc, McmcSettings, Merge, MergeSettings,
-    MortonOrder, OpacityReset, OpacityResetSettings, Prune, PruneSettings, Relocate, RelocateSettings, SplitSettings,
-    Upkeep,
+use crate::maintenance::{
+    Adc, AdcSettings, DensifySettings, FloaterSettings, Floaters, LEAST, Maintenance, Mcmc, McmcSettings, Merge,
+    MergeSettings, MortonOrder, OpacityReset, OpacityResetSettings, Prune, PruneSettings, Relocate, RelocateSettings,
+    SplitSettings,
 };
+use crate::settings::{Choice, settings};
 use splat4d::scene::LifeKind;
 
 settings! {
@@ -135,7 +135,7 @@ pub struct CommonSettings {
 
 impl CommonSettings {
     /// The maintenance operations that these settings switch on.
-    pub(crate) fn upkeep(&self) -> Vec<Box<dyn Upkeep>> {
+    pub(crate) fn maintenance(&self) -> Vec<Box<dyn Maintenance>> {
         let all = [
             boxed(Adc::of(self.adc, &self.densify)),
             boxed(Mcmc::of(self.mcmc, self.relocate.gradient_share, &self.densify)),
@@ -150,6 +150,6 @@ impl CommonSettings {
     }
 }
 
-fn boxed(operation: Option<impl Upkeep + 'static>) -> Option<Box<dyn Upkeep>> {
-    operation.map(|o| Box::new(o) as Box<dyn Upkeep>)
+fn boxed(operation: Option<impl Maintenance + 'static>) -> Option<Box<dyn Maintenance>> {
+    operation.map(|o| Box::new(o) as Box<dyn Maintenance>)
 }

@@ -4,10 +4,10 @@
 
 pub(crate) mod losses;
 
-use super::auto::Seen;
-use super::{Group, Plan, Program, Rate, Stage, still};
+use super::auto::CaptureStats;
+use super::{Group, Method, Rate, Stage, TrainContext, still};
+use crate::maintenance::{AdaptNodes, NodeSettings};
 use crate::settings::{choices, settings};
-use crate::upkeep::{AdaptNodes, NodeSettings};
 use crate::{Error, Result};
 use losses::{MaskSize, NodeAcceleration, NodeArap, NodeElastic, Sparse};
 use splat4d::motion::Spec;
@@ -108,18 +108,18 @@ settings! {
 
 /// Gaussians skinned to sparse control nodes (Huang et al. 2024, "SC-GS").
 #[derive(Clone, Debug)]
-pub(crate) struct ControlProgram {
+pub(crate) struct ControlMethod {
     pub control: ControlSettings,
     pub nodes: NodeSettings,
 }
 
-impl Program for ControlProgram {
-    fn spec(&self, plan: &Plan) -> Spec {
+impl Method for ControlMethod {
+    fn spec(&self, plan: &TrainContext) -> Spec {
         let (skin, trajectory) = (skin(&self.control), trajectory(plan, &self.control));
         Spec::Control(ControlSpec { seed: plan.seed, clip: plan.clip, skin, trajectory })
     }
 
-    fn check(&self, plan: &Plan) -> Result<()> {
+    fn check(&self, plan: &TrainContext) -> Result<()> {
         if plan.times < 2 {
             return Err(Error::input(
                 "control nodes learn from motion, but all images of the capture have the same time",
@@ -129,22 +129,22 @@ impl Program for ControlProgram {
         Ok(())
     }
 
-    fn one_moment(&self, _plan: &Plan) -> bool {
+    fn one_moment(&self, _plan: &TrainContext) -> bool {
         true
     }
 
-    fn suits(&self, seen: &Seen) -> Option<String> {
+    fn suits(&self, seen: &CaptureStats) -> Option<String> {
         let one = seen.masks && !seen.is_long();
         one.then(|| {
             format!("{} each time, and masks show one object: few nodes move all of it", seen.cameras_in_words())
         })
     }
 
-    fn nodes(&self, _plan: &Plan) -> usize {
+    fn nodes(&self, _plan: &TrainContext) -> usize {
         most_nodes(&self.control, &self.nodes)
     }
 
-    fn stages(&self, plan: &Plan) -> Vec<Stage> {
+    fn stages(&self, plan: &TrainContext) -> Vec<Stage> {
         let mut stage = still::stage("control", plan);
         still::learn_life(&mut stage, plan, self.life(plan));
         add_nodes(&mut stage, plan, &self.control, self.nodes);
@@ -164,7 +164,7 @@ pub(crate) fn skin(control: &ControlSettings) -> SkinSpec {
 }
 
 /// Adds the parts that every model of control nodes shares: groups of the skin, losses on nodes, maintenance.
-pub(crate) fn add_nodes(stage: &mut Stage, plan: &Plan, control: &ControlSettings, nodes: NodeSettings) {
+pub(crate) fn add_nodes(stage: &mut Stage, plan: &TrainContext, control: &ControlSettings, nodes: NodeSettings) {
     let c = &plan.common;
     let positions = c.rates.falling(control.node_lr * plan.extent);
     stage.groups.push(Group::new("node_means", positions));
@@ -191,7 +191,7 @@ pub(crate) fn add_nodes(stage: &mut Stage, plan: &Plan, control: &ControlSetting
     stage.keep(AdaptNodes::of(nodes, &c.densify));
 }
 
-fn trajectory(plan: &Plan, control: &ControlSettings) -> TrajectorySpec {
+fn trajectory(plan: &TrainContext, control: &ControlSettings) -> TrajectorySpec {
     let auto = plan.times.div_ceil(FRAMES_PER_KEY).clamp(1, MOST_KEYS);
     let straight = if control.keys == 0 { auto + 1 } else { control.keys };
     let cubic = if control.keys == 0 { auto + CUBIC_EXTRA } else { control.keys };
@@ -210,7 +210,7 @@ fn trajectory(plan: &Plan, control: &ControlSettings) -> TrajectorySpec {
 }
 
 /// The trajectory's groups.
-fn add_trajectory(stage: &mut Stage, plan: &Plan, control: &ControlSettings) {
+fn add_trajectory(stage: &mut Stage, plan: &TrainContext, control: &ControlSettings) {
     let shifts = Rate { start: control.shift_lr_init * plan.extent, end: control.shift_lr_final * plan.extent };
     let turns = Rate { start: control.turn_lr_init, end: control.turn_lr_final };
     let network = Rate { start: control.network_lr_init, end: control.network_lr_final };

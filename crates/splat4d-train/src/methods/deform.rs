@@ -1,7 +1,7 @@
 //! `deform-mlp`: a static warm-up, then the network learns next to geometry and colour.
 
-use super::auto::Seen;
-use super::{Group, Plan, Program, Rate, Stage, TimeNoise, still};
+use super::auto::CaptureStats;
+use super::{Group, Method, Rate, Stage, TimeNoise, TrainContext, still};
 use crate::settings::{choices, settings};
 use crate::{Error, Result};
 use splat4d::motion::Spec;
@@ -82,24 +82,24 @@ settings! {
 
 /// A canonical cloud that a perceptron or a hash grid deforms (Yang et al. 2024, "Deformable 3D Gaussians").
 #[derive(Clone, Debug)]
-pub(crate) struct DeformProgram {
+pub(crate) struct DeformMethod {
     pub deform: DeformSettings,
 }
 
-impl Program for DeformProgram {
-    fn spec(&self, plan: &Plan) -> Spec {
+impl Method for DeformMethod {
+    fn spec(&self, plan: &TrainContext) -> Spec {
         Spec::DeformMlp(spec(plan, &self.deform))
     }
 
-    fn check(&self, plan: &Plan) -> Result<()> {
+    fn check(&self, plan: &TrainContext) -> Result<()> {
         check(plan, &self.deform)
     }
 
-    fn one_moment(&self, _plan: &Plan) -> bool {
+    fn one_moment(&self, _plan: &TrainContext) -> bool {
         true
     }
 
-    fn suits(&self, seen: &Seen) -> Option<String> {
+    fn suits(&self, seen: &CaptureStats) -> Option<String> {
         let times = if seen.is_long() { format!("each of {} times", seen.times) } else { "each time".to_owned() };
         Some(format!(
             "{} {times}: one set of Gaussians, deformed by a network, uses all times together",
@@ -107,7 +107,7 @@ impl Program for DeformProgram {
         ))
     }
 
-    fn stages(&self, plan: &Plan) -> Vec<Stage> {
+    fn stages(&self, plan: &TrainContext) -> Vec<Stage> {
         let deform = &self.deform;
         let warmup = (deform.warmup * plan.iterations as f64) as usize;
         let mut out = Vec::new();
@@ -130,7 +130,7 @@ impl Program for DeformProgram {
     }
 }
 
-fn check(plan: &Plan, deform: &DeformSettings) -> Result<()> {
+fn check(plan: &TrainContext, deform: &DeformSettings) -> Result<()> {
     if plan.times < 2 {
         return Err(Error::input("all images of the capture have the same time: there is nothing to deform")
             .remedy("Train it with --motion still"));
@@ -141,7 +141,7 @@ fn check(plan: &Plan, deform: &DeformSettings) -> Result<()> {
     })
 }
 
-fn spec(plan: &Plan, deform: &DeformSettings) -> DeformSpec {
+fn spec(plan: &TrainContext, deform: &DeformSettings) -> DeformSpec {
     let encoded = |x_levels| Input::Encoded { x_levels, t_levels: deform.t_levels, time_net: deform.time_net };
     let trunk = match deform.trunk {
         // Grids follow more motion: by a small network a ball before a wall is lost, and a hand-held take has 1.9 dB less
@@ -159,9 +159,9 @@ fn spec(plan: &Plan, deform: &DeformSettings) -> DeformSpec {
     DeformSpec { seed: plan.seed, clip: plan.clip, input, width, layers, skip, rigid: deform.rigid }
 }
 
-impl DeformProgram {
+impl DeformMethod {
     /// Steps `from .. to` of the recipe's one schedule as a stage of its own.
-    fn stage(&self, plan: &Plan, from: usize, to: usize) -> Stage {
+    fn stage(&self, plan: &TrainContext, from: usize, to: usize) -> Stage {
         let mut stage = still::stage("deform-mlp", plan);
         still::learn_life(&mut stage, plan, self.life(plan));
         canonical(&mut stage);
@@ -200,7 +200,7 @@ fn set_learns(spec: &DeformSpec, p: &mut Params<f32>, learns: bool) -> Result<()
 }
 
 /// The groups of networks and grids.
-fn networks(stage: &mut Stage, plan: &Plan, deform: &DeformSettings) {
+fn networks(stage: &mut Stage, plan: &TrainContext, deform: &DeformSettings) {
     let rate = Rate { start: deform.lr_init, end: deform.lr_final };
     let warm_up = WARM_UP.min(plan.iterations / WARM_UP_SHARE);
     let made = Deform::new(spec(plan, deform), &mut Params::<f32>::new(0, 1, &[]));

@@ -5,12 +5,12 @@
 //! the filter is taken off around them. At the end the filter is disabled and the network kept, unless the recipe says
 //! otherwise: the filter has then taught the model to move steadily, and playing costs no more than without.
 
-use super::{Beginning, Group, Hook, Plan, Program, Stage};
+use super::{Group, Hook, InitialMotion, Method, Stage, TrainContext};
 use crate::Result;
 use crate::loss::TransportSettings;
 use crate::loss::transport::{Align, Transport, TransportConfig};
+use crate::maintenance::Once;
 use crate::settings::{Choice, settings};
-use crate::upkeep::Once;
 use splat4d::layers::{Layer, Scene};
 use splat4d::motion::filtered::{Filtered, FilteredSpec, Fusion, GAINS, MAX_BASELINE, MAX_HISTORY, Predictor};
 use splat4d::motion::{Motion, Spec, build};
@@ -57,26 +57,22 @@ impl Choice for Predictor {
 }
 
 /// The program with a filter and transport losses around it; as it is where both are off.
-pub(crate) fn wrap(
-    inner: Box<dyn Program>,
-    filter: &FilterSettings,
-    transport: &TransportSettings,
-) -> Box<dyn Program> {
+pub(crate) fn wrap(inner: Box<dyn Method>, filter: &FilterSettings, transport: &TransportSettings) -> Box<dyn Method> {
     if filter.fusion == Fusion::Off && transport.metric.is_none() {
         return inner;
     }
-    Box::new(FilteredProgram { inner, filter: filter.clone(), transport: transport.clone() })
+    Box::new(FilteredMethod { inner, filter: filter.clone(), transport: transport.clone() })
 }
 
 /// See the module's documentation.
-pub(crate) struct FilteredProgram {
-    inner: Box<dyn Program>,
+pub(crate) struct FilteredMethod {
+    inner: Box<dyn Method>,
     filter: FilterSettings,
     transport: TransportSettings,
 }
 
-impl Program for FilteredProgram {
-    fn spec(&self, plan: &Plan) -> Spec {
+impl Method for FilteredMethod {
+    fn spec(&self, plan: &TrainContext) -> Spec {
         let filter = &self.filter;
         let inner = self.inner.spec(plan);
         if filter.fusion == Fusion::Off {
@@ -93,7 +89,7 @@ impl Program for FilteredProgram {
         })
     }
 
-    fn build(&self, plan: &Plan, params: &mut Params) -> Result<Arc<dyn Motion>> {
+    fn build(&self, plan: &TrainContext, params: &mut Params) -> Result<Arc<dyn Motion>> {
         let inner = self.inner.build(plan, params)?;
         match self.spec(plan) {
             Spec::Filtered(spec) => Ok(Arc::new(Filtered::around(inner, spec, params)?)),
@@ -101,11 +97,11 @@ impl Program for FilteredProgram {
         }
     }
 
-    fn life(&self, plan: &Plan) -> LifeKind {
+    fn life(&self, plan: &TrainContext) -> LifeKind {
         self.inner.life(plan)
     }
 
-    fn check(&self, plan: &Plan) -> Result<()> {
+    fn check(&self, plan: &TrainContext) -> Result<()> {
         let filter = &self.filter;
         let off_early = filter.until < 1.0;
         if filter.fusion != Fusion::Off && off_early && (filter.until <= filter.start || filter.keep) {
@@ -115,11 +111,11 @@ impl Program for FilteredProgram {
         self.inner.check(plan)
     }
 
-    fn one_moment(&self, plan: &Plan) -> bool {
+    fn one_moment(&self, plan: &TrainContext) -> bool {
         self.inner.one_moment(plan)
     }
 
-    fn first(&self, plan: &Plan) -> Plan {
+    fn first(&self, plan: &TrainContext) -> TrainContext {
         self.inner.first(plan)
     }
 
@@ -127,23 +123,23 @@ impl Program for FilteredProgram {
         self.inner.has_features()
     }
 
-    fn nodes(&self, plan: &Plan) -> usize {
+    fn nodes(&self, plan: &TrainContext) -> usize {
         self.inner.nodes(plan)
     }
 
-    fn growth_bytes(&self, plan: &Plan, rows: usize) -> u64 {
+    fn growth_bytes(&self, plan: &TrainContext, rows: usize) -> u64 {
         self.inner.growth_bytes(plan, rows)
     }
 
-    fn init(&self, plan: &Plan, beginnings: &[Beginning], params: &mut Params) {
+    fn init(&self, plan: &TrainContext, beginnings: &[InitialMotion], params: &mut Params) {
         self.inner.init(plan, beginnings, params);
     }
 
-    fn tuning(&self, plan: &Plan) -> Stage {
+    fn tuning(&self, plan: &TrainContext) -> Stage {
         self.inner.tuning(plan)
     }
 
-    fn stages(&self, plan: &Plan) -> Vec<Stage> {
+    fn stages(&self, plan: &TrainContext) -> Vec<Stage> {
         let filter = &self.filter;
         let mut stages = self.inner.stages(plan);
         if let Some(settings) = self.transport(plan) {
@@ -195,9 +191,9 @@ fn switch(stages: &mut [Stage], share: f64, fusion: Fusion) {
     }
 }
 
-impl FilteredProgram {
+impl FilteredMethod {
     /// The transport loss, where the settings switch it on.
-    fn transport(&self, plan: &Plan) -> Option<TransportConfig> {
+    fn transport(&self, plan: &TrainContext) -> Option<TransportConfig> {
         let transport = &self.transport;
         Some(TransportConfig {
             metric: transport.metric?,

@@ -5,7 +5,7 @@
 //! boxes, so the rates of planes and networks have no unit; the cloud's positions keep theirs.
 //! Source: Wu et al. 2024 ("4DGaussians") §4 and the released configurations.
 
-use super::{Group, Hook, Plan, Program, Rate, Stage, still};
+use super::{Group, Hook, Method, Rate, Stage, TrainContext, still};
 use crate::loss::planes::{PlaneWeights, SmoothPlanes};
 use crate::settings::settings;
 use crate::{Error, Result};
@@ -69,7 +69,7 @@ settings! {
 
 /// A canonical cloud that six feature planes deform (Wu et al. 2024, "4DGaussians").
 #[derive(Clone, Debug)]
-pub(crate) struct HexplaneProgram {
+pub(crate) struct HexplaneMethod {
     pub hexplane: HexplaneSettings,
 }
 
@@ -86,20 +86,20 @@ const FLATTEST: f64 = 0.1;
 /// One of so many steps has a coarse stage's place if the recipe leaves it open.
 const COARSE_PART: usize = 10;
 
-impl Program for HexplaneProgram {
-    fn spec(&self, plan: &Plan) -> Spec {
+impl Method for HexplaneMethod {
+    fn spec(&self, plan: &TrainContext) -> Spec {
         Spec::Hexplane(self.spec_of(plan))
     }
 
-    fn one_moment(&self, _plan: &Plan) -> bool {
+    fn one_moment(&self, _plan: &TrainContext) -> bool {
         true
     }
 
-    fn check(&self, plan: &Plan) -> Result<()> {
+    fn check(&self, plan: &TrainContext) -> Result<()> {
         self.planes(plan).check()
     }
 
-    fn stages(&self, plan: &Plan) -> Vec<Stage> {
+    fn stages(&self, plan: &TrainContext) -> Vec<Stage> {
         let coarse = self.coarse_steps(plan.iterations).min(plan.iterations);
         let mut stages = Vec::new();
         if coarse > 0 {
@@ -124,8 +124,8 @@ impl Program for HexplaneProgram {
     }
 }
 
-impl HexplaneProgram {
-    fn planes(&self, plan: &Plan) -> PlaneShape {
+impl HexplaneMethod {
+    fn planes(&self, plan: &TrainContext) -> PlaneShape {
         let time_resolution = match self.hexplane.time_resolution {
             0 => plan.times.div_ceil(FRAMES_PER_STEP).max(LEAST_STEPS),
             n => n,
@@ -138,7 +138,7 @@ impl HexplaneProgram {
         }
     }
 
-    fn spec_of(&self, plan: &Plan) -> HexplaneSpec {
+    fn spec_of(&self, plan: &TrainContext) -> HexplaneSpec {
         HexplaneSpec {
             seed: plan.seed,
             low: [-plan.extent; 3],
@@ -177,7 +177,7 @@ impl HexplaneProgram {
     }
 
     /// Everything in one stage, with so many levels; the others are parts of it.
-    fn whole(&self, plan: &Plan, levels: usize) -> Stage {
+    fn whole(&self, plan: &TrainContext, levels: usize) -> Stage {
         let c = &plan.common;
         let mut stage = still::stage("hexplane", plan);
         still::learn_life(&mut stage, plan, self.life(plan));

@@ -1,4 +1,4 @@
-//! How motion models are learned: one [`Program`] per model, which makes the list of [`Stage`]s that the trainer runs.
+//! How motion models are learned: one [`Method`] per model, which makes the list of [`Stage`]s that the trainer runs.
 //!
 //! `splat4d::motion::x` holds a model's mathematics, `methods::x` its stages, rates, losses and what it needs of a capture.
 
@@ -33,11 +33,11 @@ use crate::Result;
 use crate::event::Progress;
 use crate::loss::image::ImageTerm;
 use crate::loss::terms::{Codec, ParamLoss, ProbeLoss};
+use crate::maintenance::split::STILL_COLUMNS;
+use crate::maintenance::{Maintenance, Split};
 use crate::optim::Noise;
 use crate::sampler::Sampler;
-use crate::upkeep::split::STILL_COLUMNS;
-use crate::upkeep::{Split, Upkeep};
-use auto::Seen;
+use auto::CaptureStats;
 use splat4d::layers::Scene;
 use splat4d::motion::{Capabilities, Motion, Phase, Spec, build};
 use splat4d::scene::{LifeKind, Params};
@@ -45,7 +45,7 @@ use std::sync::Arc;
 
 /// The capture and the wishes of the user, as far as a program may know them.
 #[derive(Clone, Debug, Default)]
-pub struct Plan {
+pub struct TrainContext {
     /// Settings that every motion model is trained with, resolved.
     pub common: CommonSettings,
     /// Seed of the run.
@@ -76,7 +76,7 @@ pub struct Plan {
     pub masks: bool,
 }
 
-impl Plan {
+impl TrainContext {
     /// Seconds of the clip, its last frame's duration included: the unit in which recipes state time.
     pub(crate) fn seconds(&self) -> f64 {
         self.clip[1] - self.clip[0] + 1.0 / self.fps
@@ -183,8 +183,8 @@ pub struct Stage {
     pub probes: Vec<Box<dyn ProbeLoss<f32>>>,
     /// Losses on raw parameters.
     pub params: Vec<Box<dyn ParamLoss<f32>>>,
-    /// Maintenance between steps, in any order: it runs in that of [`Order`](crate::upkeep::Order).
-    pub upkeep: Vec<Box<dyn Upkeep>>,
+    /// Maintenance between steps, in any order: it runs in that of [`RunOrder`](crate::maintenance::RunOrder).
+    pub maintenance: Vec<Box<dyn Maintenance>>,
     /// Noise on positions after every step; none: positions only learn.
     pub noise: Option<Noise>,
     /// Steps before each further SH degree; 0: all at once.
@@ -222,7 +222,7 @@ impl Stage {
             groups: Vec::new(),
             probes: Vec::new(),
             params: Vec::new(),
-            upkeep: Vec::new(),
+            maintenance: Vec::new(),
             noise: None,
             sh_interval: 0,
             sh_from: 0,
@@ -239,8 +239,8 @@ impl Stage {
     }
 
     /// Adds an operation of maintenance.
-    pub fn keep(&mut self, operation: impl Upkeep + 'static) {
-        self.upkeep.push(Box::new(operation));
+    pub fn keep(&mut self, operation: impl Maintenance + 'static) {
+        self.maintenance.push(Box::new(operation));
     }
 
     /// The steps `from..to` as a stage of its own: rates, densification, degrees of SH and images at half size are
@@ -253,7 +253,7 @@ impl Stage {
         for group in &mut self.groups {
             group.rate = Rate { start: group.rate.at(start), end: group.rate.at(end) };
         }
-        for schedule in self.upkeep.iter_mut().filter_map(|u| u.densification()) {
+        for schedule in self.maintenance.iter_mut().filter_map(|u| u.densification()) {
             *schedule = schedule.part(from, to);
         }
         self.noise = self.noise.and_then(|n| n.part(from, to));
@@ -277,7 +277,7 @@ impl Stage {
 
 /// How a Gaussian begins, as far as its seed says it.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Beginning {
+pub struct InitialMotion {
     /// Centre and width of its life, seconds.
     pub life: (f64, f64),
     /// At the centre of its life, scene units a second.
@@ -285,42 +285,42 @@ pub struct Beginning {
 }
 
 /// How one motion model is learnt.
-pub trait Program: Send + Sync {
+pub trait Method: Send + Sync {
     /// The model that training starts with.
-    fn spec(&self, plan: &Plan) -> Spec;
+    fn spec(&self, plan: &TrainContext) -> Spec;
     /// Makes it, and in `params` its tables: how a model from outside the library comes to be.
-    fn build(&self, plan: &Plan, params: &mut Params) -> Result<Arc<dyn Motion>> {
+    fn build(&self, plan: &TrainContext, params: &mut Params) -> Result<Arc<dyn Motion>> {
         build(&self.spec(plan), params)
     }
     /// The life its Gaussians have: the recipe's. Where it leaves the choice to the model, those of a cloud that lasts
     /// ([`one_moment`](Self::one_moment)) may come and go before fixed cameras, which see that a place is empty before something
     /// comes there (docs/models.md); a camera that moves sees every place at few moments, and lives gain nothing. Others, and
     /// those whose future is to be predicted, are there for ever.
-    fn life(&self, plan: &Plan) -> LifeKind {
+    fn life(&self, plan: &TrainContext) -> LifeKind {
         let lasting = self.one_moment(plan) && plan.fixed_cameras > 0 && !plan.predicted;
         plan.common.life.kind.unwrap_or(if lasting { LifeKind::Interval } else { LifeKind::Infinite })
     }
     /// The plan of the initial points: the whole clip, or what of it is learnt first.
-    fn first(&self, plan: &Plan) -> Plan {
+    fn first(&self, plan: &TrainContext) -> TrainContext {
         plan.clone()
     }
     /// Fills what the model's own tables start with, row by row.
-    fn init(&self, _plan: &Plan, _beginnings: &[Beginning], _params: &mut Params) {}
+    fn init(&self, _plan: &TrainContext, _beginnings: &[InitialMotion], _params: &mut Params) {}
     /// Says before training, and not after an hour, that the model cannot work on a capture.
-    fn check(&self, _plan: &Plan) -> Result<()> {
+    fn check(&self, _plan: &TrainContext) -> Result<()> {
         Ok(())
     }
     /// Whether all Gaussians live through the whole clip, so that training should start from one moment's cloud and not
     /// from the clouds of many moments together.
-    fn one_moment(&self, _plan: &Plan) -> bool {
+    fn one_moment(&self, _plan: &TrainContext) -> bool {
         false
     }
     /// Properties of the model.
-    fn capabilities(&self, plan: &Plan) -> Capabilities {
+    fn capabilities(&self, plan: &TrainContext) -> Capabilities {
         self.spec(plan).capabilities().unwrap_or_default()
     }
     /// The reason for which `auto` takes it for such a capture; none: it is taken where it is asked for.
-    fn suits(&self, _seen: &Seen) -> Option<String> {
+    fn suits(&self, _seen: &CaptureStats) -> Option<String> {
         None
     }
     /// Whether its Gaussians can have features for a pixel head.
@@ -328,24 +328,24 @@ pub trait Program: Send + Sync {
         false
     }
     /// Most nodes that training will have.
-    fn nodes(&self, _plan: &Plan) -> usize {
+    fn nodes(&self, _plan: &TrainContext) -> usize {
         0
     }
     /// Bytes that stages add to the tables of the model that training starts with.
-    fn growth_bytes(&self, _plan: &Plan, _rows: usize) -> u64 {
+    fn growth_bytes(&self, _plan: &TrainContext, _rows: usize) -> u64 {
         0
     }
     /// The stages.
-    fn stages(&self, plan: &Plan) -> Vec<Stage>;
+    fn stages(&self, plan: &TrainContext) -> Vec<Stage>;
     /// The stage that tunes a trained scene further on all frames alike.
-    fn tuning(&self, plan: &Plan) -> Stage {
+    fn tuning(&self, plan: &TrainContext) -> Stage {
         self.stages(plan).pop().expect("a program has a stage")
     }
 }
 
 /// The stages of a program: with a static split, still Gaussians move into a layer of their own
 /// after that share of the last stage.
-pub(crate) fn stages(program: &dyn Program, plan: &Plan) -> Vec<Stage> {
+pub(crate) fn stages(program: &dyn Method, plan: &TrainContext) -> Vec<Stage> {
     let mut stages = program.stages(plan);
     if let Some(last) = stages.last_mut()
         && program.capabilities(plan).moves
@@ -365,10 +365,10 @@ fn share_groups(stage: &mut Stage) {
 
 /// A stage that tunes a trained scene on all frames alike: the plan's losses and rates, and nothing that adds, moves or
 /// replaces Gaussians.
-pub(crate) fn tuning(program: &dyn Program, plan: &Plan) -> Stage {
+pub(crate) fn tuning(program: &dyn Method, plan: &TrainContext) -> Stage {
     let mut stage = program.tuning(plan);
     share_groups(&mut stage);
-    stage.upkeep.retain(|u| u.in_tuning());
+    stage.maintenance.retain(|u| u.in_tuning());
     stage.noise = None;
     (stage.sh_interval, stage.half_size_steps) = (0, 0);
     (stage.start, stage.end) = (None, None);

@@ -3,7 +3,7 @@
 //! Rates follow those of `spacetime`, since the two are charts of the same Gaussians: a step of both quaternions changes
 //! the velocity by twice its size in extents a clip, which is the unit of the rotation (`Native4dSpec::speed`).
 
-use super::{Beginning, Group, Plan, Program, Rate, Stage, still};
+use super::{Group, InitialMotion, Method, Rate, Stage, TrainContext, still};
 use crate::loss::scene::LivingOpacity;
 use crate::settings::{Choice, settings};
 use crate::{Error, Result};
@@ -34,12 +34,12 @@ settings! {
 
 /// Gaussians of space and time, sliced at t (Yang et al. 2024, "Real-time 4DGS").
 #[derive(Clone, Debug)]
-pub(crate) struct Native4dProgram {
+pub(crate) struct Native4dMethod {
     pub native4d: Native4dSettings,
 }
 
-impl Program for Native4dProgram {
-    fn spec(&self, plan: &Plan) -> Spec {
+impl Method for Native4dMethod {
+    fn spec(&self, plan: &TrainContext) -> Spec {
         let c = &plan.common;
         Spec::Native4d(Native4dSpec {
             speed: plan.extent / plan.seconds(),
@@ -52,11 +52,11 @@ impl Program for Native4dProgram {
     }
 
     /// The life is in the model.
-    fn life(&self, _plan: &Plan) -> LifeKind {
+    fn life(&self, _plan: &TrainContext) -> LifeKind {
         LifeKind::Infinite
     }
 
-    fn init(&self, plan: &Plan, beginnings: &[Beginning], params: &mut Params) {
+    fn init(&self, plan: &TrainContext, beginnings: &[InitialMotion], params: &mut Params) {
         let Spec::Native4d(spec) = self.spec(plan) else { unreachable!("its own spec") };
         let key = params.find(TABLE).expect("the model has made its table");
         for (row, begin) in beginnings.iter().enumerate() {
@@ -68,7 +68,7 @@ impl Program for Native4dProgram {
         }
     }
 
-    fn check(&self, plan: &Plan) -> Result<()> {
+    fn check(&self, plan: &TrainContext) -> Result<()> {
         if matches!(plan.common.life.kind, None | Some(LifeKind::Infinite)) {
             return Ok(());
         }
@@ -79,7 +79,7 @@ impl Program for Native4dProgram {
         .remedy("Leave life at auto, or train spacetime with it"))
     }
 
-    fn stages(&self, plan: &Plan) -> Vec<Stage> {
+    fn stages(&self, plan: &TrainContext) -> Vec<Stage> {
         let c = &plan.common;
         let mut stage = still::stage("native4d", plan);
         let turning = Rate { start: self.native4d.rotation_lr_init, end: self.native4d.rotation_lr_final };

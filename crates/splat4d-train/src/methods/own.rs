@@ -2,7 +2,7 @@
 //! `deform-mlp` is, and the list of such models by name.
 
 use super::deform::{WARM_UP, WARM_UP_SHARE, canonical};
-use super::{Group, Plan, Program, Rate, Stage, still};
+use super::{Group, Method, Rate, Stage, TrainContext, still};
 use crate::{Error, Result};
 use splat4d::motion::{MakeMotion, Motion, Phase, Spec, is_registered, register as register_motion};
 use splat4d::scene::Params;
@@ -56,21 +56,21 @@ pub(crate) fn name(name: &str) -> Option<&'static str> {
 }
 
 /// The program of a model from outside.
-pub(crate) fn program(name: &str) -> Option<Box<dyn Program>> {
+pub(crate) fn program(name: &str) -> Option<Box<dyn Method>> {
     let own = OWN.read().unwrap_or_else(PoisonError::into_inner).get(name).cloned()?;
     assert!(is_registered(name), "a model that training knows is known to readers");
-    Some(Box::new(OwnProgram(own)))
+    Some(Box::new(OwnMethod(own)))
 }
 
-struct OwnProgram(Arc<OwnMotion>);
+struct OwnMethod(Arc<OwnMotion>);
 
-impl OwnProgram {
-    fn warmup(&self, plan: &Plan) -> usize {
+impl OwnMethod {
+    fn warmup(&self, plan: &TrainContext) -> usize {
         (self.0.warmup * plan.iterations as f64) as usize
     }
 
     /// Steps `from .. to` of the recipe's one schedule as a stage of its own.
-    fn stage(&self, plan: &Plan, from: usize, to: usize) -> Stage {
+    fn stage(&self, plan: &TrainContext, from: usize, to: usize) -> Stage {
         let mut stage = still::stage(&self.0.name, plan);
         still::learn_life(&mut stage, plan, self.life(plan));
         canonical(&mut stage);
@@ -78,16 +78,16 @@ impl OwnProgram {
     }
 }
 
-impl Program for OwnProgram {
-    fn spec(&self, _plan: &Plan) -> Spec {
+impl Method for OwnMethod {
+    fn spec(&self, _plan: &TrainContext) -> Spec {
         Spec::Custom(self.0.name.clone())
     }
 
-    fn build(&self, _plan: &Plan, params: &mut Params) -> Result<Arc<dyn Motion>> {
+    fn build(&self, _plan: &TrainContext, params: &mut Params) -> Result<Arc<dyn Motion>> {
         (self.0.make)(params)
     }
 
-    fn check(&self, plan: &Plan) -> Result<()> {
+    fn check(&self, plan: &TrainContext) -> Result<()> {
         if plan.times < 2 {
             return Err(Error::input("all images of the capture have the same time: there is nothing to move")
                 .remedy("Train it with the motion model `still`"));
@@ -95,11 +95,11 @@ impl Program for OwnProgram {
         Ok(())
     }
 
-    fn one_moment(&self, _plan: &Plan) -> bool {
+    fn one_moment(&self, _plan: &TrainContext) -> bool {
         true
     }
 
-    fn stages(&self, plan: &Plan) -> Vec<Stage> {
+    fn stages(&self, plan: &TrainContext) -> Vec<Stage> {
         let (all, warmup) = (plan.iterations, self.warmup(plan));
         let mut stages = Vec::new();
         if warmup > 0 {

@@ -1,12 +1,12 @@
 //! `spacetime`: one stage; velocities, lives, rotation rates and, where the recipe has them, features and their head learn
 //! next to geometry and colour.
 
-use super::auto::Seen;
+use super::auto::CaptureStats;
 use super::still;
-use super::{Beginning, Group, Plan, Program, Rate, Stage};
+use super::{Group, InitialMotion, Method, Rate, Stage, TrainContext};
 use crate::loss::scene::{LivingOpacity, VelocitySmoothness};
+use crate::maintenance::{Guided, GuidedSettings};
 use crate::settings::{choices, settings};
-use crate::upkeep::{Guided, GuidedSettings};
 use splat4d::motion::spacetime::{FeatureSpec, TIME_FEATURES, VELOCITIES, VIEW_FEATURES};
 use splat4d::motion::{SpacetimeSpec, Spec};
 use splat4d::scene::head::{HEAD_IN, HEAD_OUT};
@@ -63,13 +63,13 @@ impl SpacetimeSettings {
 
 /// Explicit kinematics (STG, FreeTimeGS).
 #[derive(Clone, Debug)]
-pub(crate) struct SpacetimeProgram {
+pub(crate) struct SpacetimeMethod {
     pub spacetime: SpacetimeSettings,
     pub guided: GuidedSettings,
 }
 
-impl Program for SpacetimeProgram {
-    fn spec(&self, plan: &Plan) -> Spec {
+impl Method for SpacetimeMethod {
+    fn spec(&self, plan: &TrainContext) -> Spec {
         Spec::Spacetime(SpacetimeSpec {
             order: self.spacetime.order,
             rotation: self.spacetime.rotation_rate,
@@ -79,11 +79,11 @@ impl Program for SpacetimeProgram {
         })
     }
 
-    fn life(&self, plan: &Plan) -> LifeKind {
+    fn life(&self, plan: &TrainContext) -> LifeKind {
         plan.common.life.kind.unwrap_or(LifeKind::GaussHalf)
     }
 
-    fn init(&self, _plan: &Plan, beginnings: &[Beginning], params: &mut Params) {
+    fn init(&self, _plan: &TrainContext, beginnings: &[InitialMotion], params: &mut Params) {
         let Some(key) = params.find(VELOCITIES) else { return };
         if params[key].width() > 0 {
             beginnings.iter().enumerate().for_each(|(row, b)| params[key].write(row, 0, b.velocity.map(|v| v as f32)));
@@ -94,7 +94,7 @@ impl Program for SpacetimeProgram {
         true
     }
 
-    fn suits(&self, seen: &Seen) -> Option<String> {
+    fn suits(&self, seen: &CaptureStats) -> Option<String> {
         if seen.depth && !seen.masks && !seen.predicted {
             let cameras = seen.cameras_in_words();
             return Some(format!(
@@ -109,7 +109,7 @@ impl Program for SpacetimeProgram {
         })
     }
 
-    fn stages(&self, plan: &Plan) -> Vec<Stage> {
+    fn stages(&self, plan: &TrainContext) -> Vec<Stage> {
         let c = &plan.common;
         let clip = plan.seconds();
         // Velocities are there to compare (`VelocitySmoothness`), which costs no further instant.

@@ -2,9 +2,9 @@
 //! shares; before it,
 //! if the recipe says so, a still warm-up, after which nodes are placed again on what became of the cloud.
 
-use super::{ControlSettings, Group, Hook, Plan, Program, Rate, Stage, control, still};
+use super::{ControlSettings, Group, Hook, Method, Rate, Stage, TrainContext, control, still};
+use crate::maintenance::NodeSettings;
 use crate::settings::{Choice, settings};
-use crate::upkeep::NodeSettings;
 use crate::{Error, Result};
 use splat4d::layers::Layer;
 use splat4d::math::knn::mean_square_distance;
@@ -60,7 +60,7 @@ impl Choice for Equivariance {
 
 /// Control nodes driven by a diagonal state-space model.
 #[derive(Clone, Debug)]
-pub(crate) struct SsmProgram {
+pub(crate) struct SsmMethod {
     pub ssm: SsmSettings,
     pub control: ControlSettings,
     pub nodes: NodeSettings,
@@ -73,8 +73,8 @@ const TICKS: std::ops::RangeInclusive<usize> = 16..=96;
 /// Gaussians less opaque than this hold no node: what is about to die says nothing of the shape.
 const SOLID_LOGIT: f32 = -2.2;
 
-impl Program for SsmProgram {
-    fn spec(&self, plan: &Plan) -> Spec {
+impl Method for SsmMethod {
+    fn spec(&self, plan: &TrainContext) -> Spec {
         let ticks = if self.ssm.ticks > 0 { self.ssm.ticks } else { plan.times.div_ceil(TIMES_PER_TICK) };
         Spec::Ssm(SsmSpec {
             seed: plan.seed,
@@ -93,7 +93,7 @@ impl Program for SsmProgram {
         })
     }
 
-    fn check(&self, plan: &Plan) -> Result<()> {
+    fn check(&self, plan: &TrainContext) -> Result<()> {
         if plan.times < 2 {
             return Err(Error::input(
                 "a state-space model learns from motion, but all images of the capture have the same time",
@@ -103,15 +103,15 @@ impl Program for SsmProgram {
         Ok(())
     }
 
-    fn one_moment(&self, _plan: &Plan) -> bool {
+    fn one_moment(&self, _plan: &TrainContext) -> bool {
         true
     }
 
-    fn nodes(&self, _plan: &Plan) -> usize {
+    fn nodes(&self, _plan: &TrainContext) -> usize {
         control::most_nodes(&self.control, &self.nodes)
     }
 
-    fn stages(&self, plan: &Plan) -> Vec<Stage> {
+    fn stages(&self, plan: &TrainContext) -> Vec<Stage> {
         let warm = (self.ssm.warm_up * plan.iterations as f64) as usize;
         let mut stages = Vec::new();
         if warm > 0 {
@@ -132,7 +132,7 @@ impl Program for SsmProgram {
 }
 
 /// The network's groups.
-fn groups(spec: Spec, plan: &Plan, ssm: &SsmSettings) -> Vec<Group> {
+fn groups(spec: Spec, plan: &TrainContext, ssm: &SsmSettings) -> Vec<Group> {
     let maps = Rate { start: ssm.lr_init, end: ssm.lr_final };
     let mut groups = vec![Group::new("node_embeddings", plan.common.rates.falling(ssm.embedding_lr))];
     // A model of an empty layer has the same columns as any other.

@@ -1,14 +1,14 @@
 //! `still`: one stage, every group of static 3DGS. Also the base that other programs add to.
 
-use super::auto::Seen;
-use super::{CommonSettings, Group, Plan, Program, Rate, Stage};
+use super::auto::CaptureStats;
+use super::{CommonSettings, Group, Method, Rate, Stage, TrainContext};
 use crate::capture::Agreement;
 use crate::loss::LossSettings;
 use crate::loss::neighbourhood::{MotionWeights, Neighbourhood};
 use crate::loss::scene::{MeanOpacity, MeanScale, OpacityEntropy};
 use crate::loss::terms::{ParamLoss, ProbeLoss};
+use crate::maintenance::Strategy;
 use crate::optim::{MCMC_EXTENT, Noise};
-use crate::upkeep::Strategy;
 use splat4d::motion::Spec;
 use splat4d::scene::LifeKind;
 
@@ -23,18 +23,18 @@ const MOVING: f64 = 2e-4;
 
 /// Static 3D Gaussian Splatting.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct StillProgram;
+pub(crate) struct StillMethod;
 
-impl Program for StillProgram {
-    fn spec(&self, _plan: &Plan) -> Spec {
+impl Method for StillMethod {
+    fn spec(&self, _plan: &TrainContext) -> Spec {
         Spec::Still
     }
 
-    fn life(&self, _plan: &Plan) -> LifeKind {
+    fn life(&self, _plan: &TrainContext) -> LifeKind {
         LifeKind::Infinite
     }
 
-    fn suits(&self, seen: &Seen) -> Option<String> {
+    fn suits(&self, seen: &CaptureStats) -> Option<String> {
         if seen.times <= 1 {
             return Some("all images have the same time".into());
         }
@@ -49,7 +49,7 @@ impl Program for StillProgram {
         Some(format!("cameras are fixed and only {percent:.3} % of their pixels change"))
     }
 
-    fn stages(&self, plan: &Plan) -> Vec<Stage> {
+    fn stages(&self, plan: &TrainContext) -> Vec<Stage> {
         vec![stage("still", plan)]
     }
 }
@@ -74,7 +74,7 @@ pub(crate) fn groups(c: &CommonSettings, extent: f64) -> Vec<Group> {
 }
 
 /// Lets a stage learn its Gaussians' lives: birth and death, for any model.
-pub(crate) fn learn_life(stage: &mut Stage, plan: &Plan, life: LifeKind) {
+pub(crate) fn learn_life(stage: &mut Stage, plan: &TrainContext, life: LifeKind) {
     let c = &plan.common;
     if life != LifeKind::Infinite {
         stage.groups.push(Group::new("life_centers", c.rates.falling(c.life.center_lr * plan.seconds())));
@@ -102,7 +102,7 @@ fn motion_weights(loss: &LossSettings) -> MotionWeights {
 }
 
 /// A stage with the maintenance and the regularisers that every motion model has.
-pub fn stage(name: &str, plan: &Plan) -> Stage {
+pub fn stage(name: &str, plan: &TrainContext) -> Stage {
     let c = &plan.common;
     let mut params: Vec<Box<dyn ParamLoss<f32>>> = Vec::new();
     // These two belong to MCMC: they make room; under ADC they only dim.
@@ -128,7 +128,7 @@ pub fn stage(name: &str, plan: &Plan) -> Stage {
         groups: groups(c, plan.extent),
         probes,
         params,
-        upkeep: c.upkeep(),
+        maintenance: c.maintenance(),
         noise: c.densify.is_mcmc().then(|| Noise::new(c.mcmc.noise_lr, c.densify.until, plan.extent)),
         sh_interval: c.appearance.sh_degree_interval,
         half_size_steps: (plan.half_size_until * plan.iterations as f64) as usize,

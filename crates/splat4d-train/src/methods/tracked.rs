@@ -4,8 +4,8 @@
 //! Source: Luiten et al. 2024 (Dynamic 3D Gaussians). Ours: who is foreground is learnt from frame 0's masks and not given;
 //! lengths are in shares of the rig, so that the weights hold in any unit; the neighbours' weights do not know the unit.
 
-use super::auto::Seen;
-use super::{Group, Hook, Plan, Program, Rate, Stage, still};
+use super::auto::CaptureStats;
+use super::{Group, Hook, Method, Rate, Stage, TrainContext, still};
 use crate::loss::graph::{LEAST_MEAN_WEIGHT, Weigh};
 use crate::loss::image::ImageTerm;
 use crate::loss::image::segmentation::Segmentation;
@@ -74,22 +74,22 @@ settings! {
 
 /// Positions and rotations of the same Gaussians at every frame (Luiten et al. 2024, "Dynamic 3D Gaussians").
 #[derive(Clone, Debug)]
-pub(crate) struct TrackedProgram {
+pub(crate) struct TrackedMethod {
     pub tracked: TrackedSettings,
 }
 
-impl Program for TrackedProgram {
-    fn spec(&self, plan: &Plan) -> Spec {
+impl Method for TrackedMethod {
+    fn spec(&self, plan: &TrainContext) -> Spec {
         let first = plan.moments.first().map_or(plan.clip[0], |m| m.0);
         Spec::Tracked(TrackedSpec { times: vec![first], foreground: segments(plan, &self.tracked) })
     }
 
-    fn first(&self, plan: &Plan) -> Plan {
+    fn first(&self, plan: &TrainContext) -> TrainContext {
         let t = plan.moments[0];
-        Plan { clip: [t.0; 2], times: 1, moments: vec![t], ..plan.clone() }
+        TrainContext { clip: [t.0; 2], times: 1, moments: vec![t], ..plan.clone() }
     }
 
-    fn check(&self, plan: &Plan) -> Result<()> {
+    fn check(&self, plan: &TrainContext) -> Result<()> {
         let least = self.capabilities(plan).fixed_cameras;
         let fewest = plan.moments.iter().min_by_key(|m| m.1).copied().unwrap_or_default();
         if fewest.1 < least {
@@ -109,14 +109,14 @@ impl Program for TrackedProgram {
         Ok(())
     }
 
-    fn suits(&self, seen: &Seen) -> Option<String> {
+    fn suits(&self, seen: &CaptureStats) -> Option<String> {
         (seen.predicted && seen.fewest >= LEAST_CAMERAS && !seen.is_long()).then(|| {
             let cameras = seen.cameras_in_words();
             format!("{cameras} each time, and prediction needs persistent Gaussians that can be tracked")
         })
     }
 
-    fn stages(&self, plan: &Plan) -> Vec<Stage> {
+    fn stages(&self, plan: &TrainContext) -> Vec<Stage> {
         let tracked = &self.tracked;
         let frames = plan.moments.len();
         let first = first_steps(plan.iterations, tracked.first_share, frames);
@@ -148,13 +148,13 @@ impl Program for TrackedProgram {
     }
 
     /// The result itself: a page a frame.
-    fn growth_bytes(&self, plan: &Plan, rows: usize) -> u64 {
+    fn growth_bytes(&self, plan: &TrainContext, rows: usize) -> u64 {
         let pages = plan.moments.len().saturating_sub(1);
         (rows * pages * POSE * size_of::<f32>()) as u64
     }
 
     /// Every frame's page next to what all frames share; who is foreground is settled.
-    fn tuning(&self, plan: &Plan) -> Stage {
+    fn tuning(&self, plan: &TrainContext) -> Stage {
         let tracked = &self.tracked;
         let mut stage = still::stage("tracked", plan);
         let positions = Rate { start: tracked.lr_init * plan.extent, end: tracked.lr_final * plan.extent };
@@ -167,12 +167,12 @@ impl Program for TrackedProgram {
 }
 
 /// Whether Gaussians learn who is foreground.
-fn segments(plan: &Plan, tracked: &TrackedSettings) -> bool {
+fn segments(plan: &TrainContext, tracked: &TrackedSettings) -> bool {
     plan.masks && tracked.seg > 0.0
 }
 
 /// Masks against the foreground logit, at a share of the recipe's weight.
-fn segmentation(plan: &Plan, tracked: &TrackedSettings, share: f64) -> Vec<Box<dyn ImageTerm>> {
+fn segmentation(plan: &TrainContext, tracked: &TrackedSettings, share: f64) -> Vec<Box<dyn ImageTerm>> {
     let (weight, dssim) = (share * tracked.seg, plan.common.loss.dssim);
     let term = || -> Box<dyn ImageTerm> { Box::new(Segmentation::new(FOREGROUND, weight, dssim)) };
     segments(plan, tracked).then(term).into_iter().collect()
@@ -183,7 +183,7 @@ fn first_steps(iterations: usize, share: f64, frames: usize) -> usize {
     if frames <= 1 { iterations } else { ((iterations as f64 * share.min(1.0)) as usize).max(1) }
 }
 
-fn ties(plan: &Plan, tracked: &TrackedSettings) -> Ties {
+fn ties(plan: &TrainContext, tracked: &TrackedSettings) -> Ties {
     Ties {
         neighbours: tracked.neighbours,
         weigh: if tracked.beta > 0.0 { Weigh::Beta(tracked.beta) } else { Weigh::Median(1.0) },
@@ -200,12 +200,12 @@ fn ties(plan: &Plan, tracked: &TrackedSettings) -> Ties {
     }
 }
 
-impl TrackedProgram {
+impl TrackedMethod {
     /// Frame 0 is a still scene; what is scheduled over all steps happens in this stage's.
-    fn first_stage(&self, plan: &Plan, steps: usize) -> Stage {
+    fn first_stage(&self, plan: &TrainContext, steps: usize) -> Stage {
         let share = steps as f64 / plan.iterations as f64;
         let part = |steps: &mut usize| *steps = ((*steps as f64 * share) as usize).max(1);
-        let mut first = Plan { iterations: steps, ..plan.clone() };
+        let mut first = TrainContext { iterations: steps, ..plan.clone() };
         part(&mut first.common.appearance.sh_degree_interval);
         part(&mut first.common.densify.interval);
         part(&mut first.common.densify.from);
@@ -223,7 +223,7 @@ impl TrackedProgram {
 }
 
 /// Adds frame k where everything goes on as it went.
-fn next_frame(plan: &Plan, k: usize, velocity_cap: f64, tracking: &Tracking<f32>) -> Hook {
+fn next_frame(plan: &TrainContext, k: usize, velocity_cap: f64, tracking: &Tracking<f32>) -> Hook {
     let (t, cap) = (plan.moments[k].0, velocity_cap * plan.extent);
     let tracking = tracking.clone();
     Box::new(move |scene, progress| {

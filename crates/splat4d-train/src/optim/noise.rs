@@ -4,7 +4,7 @@
 use splat4d::layers::{Layer, Scene};
 use splat4d::math::{Real, Rng, sym3};
 use splat4d::motion::for_rows;
-use splat4d::render::KeptNoise;
+use splat4d::render::ResidentNoise;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, Grads, Rows, Space};
 
@@ -39,9 +39,9 @@ impl Noise {
     }
 
     /// The same as a device knows it that keeps a layer's tables; none: there is nothing to shake. `rng` is the layer's.
-    pub(crate) fn kept(&self, rate: f64, min_opacity: f64, rng: Rng) -> Option<KeptNoise> {
+    pub(crate) fn kept(&self, rate: f64, min_opacity: f64, rng: Rng) -> Option<ResidentNoise> {
         let (strength, limit) = (rate * self.strength, limit(min_opacity));
-        (strength != 0.0).then_some(KeptNoise { strength, dead: min_opacity, slope: NOISE_SLOPE, limit, rng })
+        (strength != 0.0).then_some(ResidentNoise { strength, dead: min_opacity, slope: NOISE_SLOPE, limit, rng })
     }
 
     /// Shakes the rows that are active in `d`; `rate`: that of a layer's positions, where they learn. `rng` is the step's.
@@ -56,7 +56,7 @@ impl Noise {
         for (index, (layer, d)) in scene.layers.iter_mut().zip(d).enumerate() {
             let Some(rate) = rate(index) else { continue };
             let active = d.active(Space::Gaussians);
-            shake(layer, active, rate * self.strength, min_opacity, rng.fork(index as u64));
+            add_noise(layer, active, rate * self.strength, min_opacity, rng.fork(index as u64));
         }
     }
 }
@@ -68,7 +68,7 @@ fn limit(min_opacity: f64) -> f32 {
 }
 
 /// Adds the noise to the means of the active rows: Σ·ε·σ(−100(o − o_dead))·`strength`, ε ~ N(0, I).
-fn shake(layer: &mut Layer<f32>, active: &[bool], strength: f64, min_opacity: f64, rng: Rng) {
+fn add_noise(layer: &mut Layer<f32>, active: &[bool], strength: f64, min_opacity: f64, rng: Rng) {
     if strength == 0.0 {
         return;
     }
@@ -99,7 +99,7 @@ fn shake(layer: &mut Layer<f32>, active: &[bool], strength: f64, min_opacity: f6
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::upkeep::tests::scene;
+    use crate::maintenance::tests::scene;
 
     #[test]
     fn noise_spares_the_opaque_and_the_resting() {
@@ -107,7 +107,7 @@ mod tests {
         (0..20).for_each(|r| s.layers[0].params[GEOMETRY].set(r, OPACITY, if r < 10 { -5.5 } else { 2.0 }));
         let before = s.layers[0].params[GEOMETRY].clone();
         let active: Vec<bool> = (0..20).map(|r| r % 2 == 0).collect();
-        shake(&mut s.layers[0], &active, 1.0, 0.005, Rng::new(0, "noise", 0));
+        add_noise(&mut s.layers[0], &active, 1.0, 0.005, Rng::new(0, "noise", 0));
         for r in 0..20 {
             let moved = s.layers[0].params[GEOMETRY].get(r, 0) != before.get(r, 0);
             assert_eq!(moved, r < 10 && r % 2 == 0, "row {r}");

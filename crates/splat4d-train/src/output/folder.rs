@@ -57,7 +57,7 @@ pub struct Request<'a> {
 
 /// What there is of a command in its folder.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Found {
+pub enum FolderContent {
     /// Nothing: it begins.
     Nothing,
     /// What the same command left when it ended early.
@@ -90,7 +90,7 @@ impl OutputFolder {
     /// Errors: it equals, contains or lies inside what is read; another process has it; it holds what would mix with the output
     /// and is not to be replaced, or cannot be because there is no record that splat4d wrote it; it cannot be written. Nothing
     /// is changed then.
-    pub fn begin(path: &Path, request: &Request<'_>) -> Result<(Self, Found)> {
+    pub fn begin(path: &Path, request: &Request<'_>) -> Result<(Self, FolderContent)> {
         check_apart(path, request.inputs)?;
         if path.exists() && !path.is_dir() {
             return Err(Error::input("is a file").at(path.display()).remedy("Give the name of a folder."));
@@ -116,8 +116,8 @@ impl OutputFolder {
             let _ = std::fs::remove_file(path.join(STATE).join(list::FILE));
         }
         let list = List::keep(path)?;
-        let found = if let Plan::Continue = plan { Found::Unfinished } else { Found::Nothing };
-        let begun = AtomicBool::new(found == Found::Unfinished);
+        let found = if let Plan::Continue = plan { FolderContent::Unfinished } else { FolderContent::Nothing };
+        let begun = AtomicBool::new(found == FolderContent::Unfinished);
         let folder = Self { path: path.to_owned(), list, begun, made: !before, owner: Some(owner) };
         if let Plan::Replace = plan {
             // Workers on parts of it have their own locks.
@@ -130,7 +130,7 @@ impl OutputFolder {
             folder.set_aside(request.mixes)?;
         }
         let asked = path.join(STATE).join(ASKED);
-        if let (Mixes::Anything, Found::Nothing) = (request.mixes, found) {
+        if let (Mixes::Anything, FolderContent::Nothing) = (request.mixes, found) {
             write_atomically(&asked, request.asked.as_bytes())?;
         }
         if let Mixes::Frames { .. } = request.mixes {

@@ -19,7 +19,7 @@ mod tests;
 mod write;
 
 pub use date::rfc3339;
-pub use folder::{Found, Mixes, OutputFolder, Request};
+pub use folder::{FolderContent, Mixes, OutputFolder, Request};
 pub use list::{note, written};
 pub use owner::{Owner, Standing, check_free};
 pub use place::{Input, check_apart, check_file};

@@ -33,7 +33,7 @@ fn write_all(folder: &Path, files: &[(&str, &str)]) {
 /// A run as this version writes it.
 fn run(folder: &Path, text: &str) {
     let (out, found) = OutputFolder::begin(folder, &request("first", false)).unwrap();
-    assert_eq!(found, Found::Nothing);
+    assert_eq!(found, FolderContent::Nothing);
     write_all(
         folder,
         &[("recipe.toml", text), ("checkpoints/00000000.safetensors", text), ("test/ours_1/gt/0.png", text)],
@@ -228,7 +228,7 @@ fn the_same_command_continues_and_another_does_not() {
     let error = begin("two").unwrap_err().to_string();
     assert!(error.contains("unfinished run") && error.contains("--resume"), "{error}");
     let (out, found) = begin("one").unwrap();
-    assert_eq!(found, Found::Unfinished);
+    assert_eq!(found, FolderContent::Unfinished);
     out.clear().unwrap();
     assert!(tree(&folder).is_empty() && OutputFolder::asked(&folder).as_deref() == Some("one"));
     write_all(&folder, &[("recipe.toml", "")]);

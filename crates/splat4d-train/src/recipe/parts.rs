@@ -2,33 +2,34 @@
 
 use super::Recipe;
 use crate::init::{self, InitSettings};
+use crate::maintenance::{AdcSettings, DENSE, FINEST};
 use crate::methods::{
-    CommonSettings, Plan, Program, control, deform, filtered, hexplane, native4d, own, spacetime, ssm, still, tracked,
+    CommonSettings, Method, TrainContext, control, deform, filtered, hexplane, native4d, own, spacetime, ssm, still,
+    tracked,
 };
-use crate::upkeep::{AdcSettings, DENSE, FINEST};
 use crate::{Error, Result};
 use splat4d::motion::{BUILT_IN, MODELS};
 
 /// Makes a program with the settings of a recipe.
-type Make = fn(&Recipe) -> Box<dyn Program>;
+type Make = fn(&Recipe) -> Box<dyn Method>;
 
 /// The programs by the names of their models: a method is its file and an entry here. `auto` asks them in this order.
 pub(crate) const PROGRAMS: [(&str, Make); 8] = [
-    ("still", |_| Box::new(still::StillProgram)),
-    ("tracked", |r| Box::new(tracked::TrackedProgram { tracked: r.tracked.clone() })),
-    ("spacetime", |r| Box::new(spacetime::SpacetimeProgram { spacetime: r.spacetime.clone(), guided: r.guided })),
-    ("control", |r| Box::new(control::ControlProgram { control: r.control.clone(), nodes: r.nodes })),
-    ("deform-mlp", |r| Box::new(deform::DeformProgram { deform: r.deform.clone() })),
-    ("hexplane", |r| Box::new(hexplane::HexplaneProgram { hexplane: r.hexplane.clone() })),
-    ("native4d", |r| Box::new(native4d::Native4dProgram { native4d: r.native4d.clone() })),
-    ("ssm", |r| Box::new(ssm::SsmProgram { ssm: r.ssm.clone(), control: r.control.clone(), nodes: r.nodes })),
+    ("still", |_| Box::new(still::StillMethod)),
+    ("tracked", |r| Box::new(tracked::TrackedMethod { tracked: r.tracked.clone() })),
+    ("spacetime", |r| Box::new(spacetime::SpacetimeMethod { spacetime: r.spacetime.clone(), guided: r.guided })),
+    ("control", |r| Box::new(control::ControlMethod { control: r.control.clone(), nodes: r.nodes })),
+    ("deform-mlp", |r| Box::new(deform::DeformMethod { deform: r.deform.clone() })),
+    ("hexplane", |r| Box::new(hexplane::HexplaneMethod { hexplane: r.hexplane.clone() })),
+    ("native4d", |r| Box::new(native4d::Native4dMethod { native4d: r.native4d.clone() })),
+    ("ssm", |r| Box::new(ssm::SsmMethod { ssm: r.ssm.clone(), control: r.control.clone(), nodes: r.nodes })),
 ];
 
 impl Recipe {
     /// The program of the recipe's motion model, with the losses over time and the filter that the recipe switches on.
     ///
     /// Errors: `auto` has not chosen yet; features for a model that has none.
-    pub fn program(&self) -> Result<Box<dyn Program>> {
+    pub fn program(&self) -> Result<Box<dyn Method>> {
         let program = self.program_of(self.run.motion.as_str())?;
         if self.spacetime.has_features() && !program.has_features() {
             return Err(Error::input(format!("motion `{}` has no features", self.run.motion))
@@ -39,7 +40,7 @@ impl Recipe {
 
     /// The program of a built-in motion model with the recipe's settings, or of one from outside
     /// ([`OwnMotion`](crate::methods::OwnMotion)), without a filter.
-    pub(crate) fn program_of(&self, motion: &str) -> Result<Box<dyn Program>> {
+    pub(crate) fn program_of(&self, motion: &str) -> Result<Box<dyn Method>> {
         if let Some(own) = own::program(motion) {
             return Ok(own);
         }
@@ -55,7 +56,7 @@ impl Recipe {
     }
 
     /// All programs with the recipe's settings, in the order in which `auto` asks them.
-    pub(crate) fn programs(&self) -> impl Iterator<Item = (&'static str, Box<dyn Program>)> + '_ {
+    pub(crate) fn programs(&self) -> impl Iterator<Item = (&'static str, Box<dyn Method>)> + '_ {
         PROGRAMS.into_iter().map(|(name, make)| (name, make(self)))
     }
 
@@ -78,10 +79,10 @@ impl Recipe {
     }
 
     /// The recipe's part of a plan, resolved; the capture's part (extent, clip, times, cameras) is still empty.
-    pub fn plan(&self) -> Plan {
+    pub fn plan(&self) -> TrainContext {
         let r = self.resolve();
         let percent_dense = r.percent_dense();
-        Plan {
+        TrainContext {
             seed: r.run.seed,
             iterations: r.run.iterations,
             batch_size: r.run.batch_size,
@@ -102,7 +103,7 @@ impl Recipe {
                 merge: r.merge,
                 split: r.split,
             },
-            ..Plan::default()
+            ..TrainContext::default()
         }
     }
 }

@@ -1,7 +1,7 @@
 //! The settings of a run as a whole.
 
 use crate::settings::{Value, among, settings};
-use crate::step::replans::Replans;
+use crate::step::replans::ScheduleChanges;
 use splat4d::motion::MODELS;
 
 settings! {
@@ -16,7 +16,7 @@ settings! {
         iterations: usize = 7000 => at_least(1);
         /// Changes of the run's length, [step, total steps]: from that step on, the rest of the schedule of
         /// `iterations` steps is spread over the remaining steps. `--minutes` writes them.
-        replans: Replans = Replans::default();
+        replans: ScheduleChanges = ScheduleChanges::default();
         /// Views per step.
         batch_size: usize = 1 => at_least(1);
         /// Share of the iterations, from the first, that use images at half size.

@@ -1,6 +1,6 @@
 use super::flat::FLAT;
 use super::*;
-use crate::step::replans::Replan;
+use crate::step::replans::ScheduleChange;
 
 /// A recipe from before there were tables: all defaults, in order.
 const FLAT_DEFAULTS: &str = include_str!("tests/flat-defaults.toml");
@@ -35,7 +35,7 @@ fn flat_recipes_are_unchanged_byte_for_byte() {
 
 #[test]
 fn names_are_distinct_and_all_are_known() {
-    let mut keys: Vec<String> = Recipe::knobs().iter().map(|k| k.key()).collect();
+    let mut keys: Vec<String> = Recipe::settings().iter().map(|k| k.key()).collect();
     let count = keys.len();
     keys.extend(FLAT.iter().map(|(flat, _)| (*flat).to_owned()));
     keys.sort_unstable();
@@ -89,24 +89,24 @@ fn resolve_sets_everything_and_every_setting_is_documented() {
     let r = Recipe::default().with(|r| r.run.iterations = 1000).resolve();
     assert_eq!((r.densify.from, r.densify.until, r.run.checkpoint_interval), (50, 750, 100));
     assert_eq!(r.resolve(), r);
-    assert!(Recipe::knobs().iter().all(|k| k.doc.len() > 8), "{:?}", Recipe::knobs());
+    assert!(Recipe::settings().iter().all(|k| k.doc.len() > 8), "{:?}", Recipe::settings());
 }
 
 #[test]
 fn words_come_back_and_wrong_ones_get_a_suggestion() {
-    for knob in Recipe::knobs() {
-        for word in &knob.choices {
+    for setting in Recipe::settings() {
+        for word in &setting.choices {
             let mut r = Recipe::default();
-            r.set(&format!("{}={word}", knob.key())).unwrap();
-            assert_eq!(r.get(&knob.key()).unwrap().as_str(), Some(*word), "{}", knob.key());
+            r.set(&format!("{}={word}", setting.key())).unwrap();
+            assert_eq!(r.get(&setting.key()).unwrap().as_str(), Some(*word), "{}", setting.key());
             assert_eq!(Recipe::from_toml(&r.to_toml()).unwrap(), r);
         }
-        if let Some(first) = knob.choices.first() {
-            let error = Recipe::of(&[&format!("{}={first}x", knob.key())]).unwrap_err().to_string();
+        if let Some(first) = setting.choices.first() {
+            let error = Recipe::of(&[&format!("{}={first}x", setting.key())]).unwrap_err().to_string();
             assert!(error.contains(&format!("did you mean `{first}`")), "{error}");
         }
     }
-    assert_eq!(Recipe::knobs().iter().filter(|k| !k.choices.is_empty()).count(), 20);
+    assert_eq!(Recipe::settings().iter().filter(|k| !k.choices.is_empty()).count(), 20);
     for (set, back) in [("init=my/points.ply", "my/points.ply"), ("init=hull", "hull")] {
         assert_eq!(Recipe::of(&[set]).unwrap().get("init.source").unwrap().as_str(), Some(back));
     }
@@ -125,7 +125,7 @@ fn conditions_name_settings_and_defaults_have_effect() {
     let recipe = Recipe::default();
     for (name, table) in recipe.tables() {
         let mut keys = table.when().keys();
-        keys.extend(table.knobs(name).iter().flat_map(|k| k.rule.when.keys()));
+        keys.extend(table.settings(name).iter().flat_map(|k| k.rule.when.keys()));
         for key in keys {
             assert!(recipe.get(key).is_some(), "[{name}] depends on {key}, which is no knob");
         }
@@ -167,7 +167,7 @@ fn what_followed_from_the_length_follows_from_another_one_and_what_was_chosen_st
     let saved = Recipe::of(&["densify_until_iter=777", "run.replans=[[5,90],[40,60]]"]).unwrap().resolve();
     let read = Recipe::from_toml(&saved.to_toml()).unwrap();
     assert_eq!(read, saved);
-    assert_eq!(read.run.replans.rows(), [Replan { at: 5, total: 90 }, Replan { at: 40, total: 60 }]);
+    assert_eq!(read.run.replans.rows(), [ScheduleChange { at: 5, total: 90 }, ScheduleChange { at: 40, total: 60 }]);
     let again = read.unresolved().with(|r| r.run.iterations = 3000).resolve();
     assert_eq!(again, Recipe::of(&["densify_until_iter=777", "iterations=3000"]).unwrap().resolve());
     for wrong in ["3", "[3]", "[[3]]", "[[3, 3]]", "[[3, 9], [3, 8]]", "[[3, 9], [2, 8]]", "[[-1, 9]]"] {

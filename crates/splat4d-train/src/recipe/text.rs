@@ -2,7 +2,7 @@
 
 use super::Recipe;
 use super::flat::FLAT;
-use crate::settings::{Knob, When, is_off, nearest};
+use crate::settings::{Setting, When, is_off, nearest};
 use crate::{Error, Result};
 
 impl Recipe {
@@ -34,8 +34,8 @@ impl Recipe {
                 text.push('\n');
             }
             text += &format!("[{name}]\n");
-            for knob in table.knobs(name) {
-                text += &line(knob.field, &table.get(knob.field).expect("a setting has a value"));
+            for setting in table.settings(name) {
+                text += &line(setting.field, &table.get(setting.field).expect("a setting has a value"));
             }
         }
         text
@@ -64,8 +64,8 @@ impl Recipe {
     }
 
     /// Every setting, table by table.
-    pub fn knobs() -> Vec<Knob> {
-        Self::default().tables().into_iter().flat_map(|(name, table)| table.knobs(name)).collect()
+    pub fn settings() -> Vec<Setting> {
+        Self::default().tables().into_iter().flat_map(|(name, table)| table.settings(name)).collect()
     }
 
     /// The subject of a table.
@@ -95,7 +95,7 @@ impl Recipe {
         let defaults = Self::default();
         let follows = Self::default().with(|r| r.run.iterations = self.run.iterations).resolve();
         let mut out = Vec::new();
-        for key in Self::knobs().iter().map(Knob::key) {
+        for key in Self::settings().iter().map(Setting::key) {
             let value = self.get(&key).expect("it is a setting");
             let follows = key != "run.iterations" && follows.get(&key).as_ref() == Some(&value);
             if defaults.get(&key).as_ref() != Some(&value) && !follows {
@@ -106,18 +106,18 @@ impl Recipe {
     }
 
     /// Settings that were chosen and do nothing in this recipe.
-    pub fn without_effect(&self) -> Vec<Idle> {
+    pub fn without_effect(&self) -> Vec<UnusedSetting> {
         let get = |key: &str| self.get(key).expect("conditions name settings");
         let chosen: Vec<String> = self.choices().into_iter().map(|(key, _)| key).collect();
         let mut out = Vec::new();
         for (name, table) in self.tables() {
-            for knob in table.knobs(name).iter().filter(|knob| chosen.contains(&knob.key())) {
-                let both = [if knob.rule.switch { When::Always } else { table.when() }, knob.rule.when];
+            for setting in table.settings(name).iter().filter(|setting| chosen.contains(&setting.key())) {
+                let both = [if setting.rule.switch { When::Always } else { table.when() }, setting.rule.when];
                 let missing: Vec<String> =
                     both.into_iter().filter(|when| !when.holds(&get)).map(|when| when.to_string()).collect();
                 if !missing.is_empty() {
-                    let (key, off) = (knob.key(), is_off(&get(&knob.key())));
-                    out.push(Idle { key, off, needs: missing.join(" and ") });
+                    let (key, off) = (setting.key(), is_off(&get(&setting.key())));
+                    out.push(UnusedSetting { key, off, needs: missing.join(" and ") });
                 }
             }
         }
@@ -127,7 +127,7 @@ impl Recipe {
     /// Errors: one of these settings, by either of its names, does nothing in this recipe. Where it says that
     /// something is not
     /// to be, training warns.
-    pub fn refuse_idle<'a>(&self, set: impl Iterator<Item = &'a str>) -> Result<()> {
+    pub fn refuse_unused<'a>(&self, set: impl Iterator<Item = &'a str>) -> Result<()> {
         let set: Vec<&str> = set.map(|name| Self::key_of(name.trim())).collect();
         match self.without_effect().into_iter().find(|idle| !idle.off && set.contains(&idle.key.as_str())) {
             Some(idle) => Err(Error::input(idle.to_string()).remedy("Set what it needs as well, or leave it out")),
@@ -158,7 +158,7 @@ impl Recipe {
         let mut text: String =
             FLAT.iter().map(|(flat, key)| line(flat, &self.get(key).expect("FLAT names settings"))).collect();
         let defaults = Self::default();
-        for key in Self::knobs().iter().map(Knob::key).filter(|key| FLAT.iter().all(|(_, k)| k != key)) {
+        for key in Self::settings().iter().map(Setting::key).filter(|key| FLAT.iter().all(|(_, k)| k != key)) {
             if self.get(&key) != defaults.get(&key) {
                 text += &line(&format!("\"{key}\""), &self.get(&key).expect("it is a setting"));
             }
@@ -190,7 +190,7 @@ impl Recipe {
 
 /// A setting that was chosen and has no effect.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Idle {
+pub struct UnusedSetting {
     /// `table.field`.
     pub key: String,
     /// Whether it says that something is not to be, which it is not anyhow.
@@ -199,7 +199,7 @@ pub struct Idle {
     pub needs: String,
 }
 
-impl std::fmt::Display for Idle {
+impl std::fmt::Display for UnusedSetting {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "`{}` has no effect in this recipe: it needs {}", self.key, self.needs)
     }
@@ -217,7 +217,7 @@ fn wrong(name: &str, value: &toml::Value, need: &str) -> Error {
 }
 
 fn unknown(name: &str) -> Error {
-    let keys: Vec<String> = Recipe::knobs().iter().map(Knob::key).collect();
+    let keys: Vec<String> = Recipe::settings().iter().map(Setting::key).collect();
     let known: Vec<&str> = FLAT.iter().map(|(flat, _)| *flat).chain(keys.iter().map(String::as_str)).collect();
     let near = nearest(name, &known);
     Error::input(format!("unknown setting `{name}`"))

@@ -6,7 +6,7 @@
 
 use super::minutes::Timing;
 use crate::methods::Stage;
-use crate::step::replans::Replan;
+use crate::step::replans::ScheduleChange;
 use crate::step::trainer::{Position, Trainer};
 use serde::{Deserialize, Serialize};
 
@@ -76,7 +76,7 @@ impl<'a> Place<'a> {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Replanned {
     /// The row.
-    pub row: Replan,
+    pub row: ScheduleChange,
     /// The seconds at which the command would have ended without it.
     pub end: f64,
     /// The seconds at which it will end with it, where that is too late all the same.
@@ -101,7 +101,7 @@ pub(super) struct Planner {
 
 impl Planner {
     /// Begins at so many seconds of the command, behind these plans.
-    pub(super) fn new(budget: Budget, now: f64, replans: &[Replan]) -> Self {
+    pub(super) fn new(budget: Budget, now: f64, replans: &[ScheduleChange]) -> Self {
         let last = replans.last().map_or(0, |row| row.at);
         // A part that begins late in a command is looked at as often as one that begins at once.
         let interval = (60.0 * budget.minutes - now).max(0.0) / LOOKS;
@@ -149,7 +149,11 @@ impl Planner {
         }
         self.last = at;
         let then = now + step * steps as f64 + finish;
-        Some(Replanned { row: Replan { at, total: at + steps }, end, late: Some(then).filter(|t| *t > LATE * all) })
+        Some(Replanned {
+            row: ScheduleChange { at, total: at + steps },
+            end,
+            late: Some(then).filter(|t| *t > LATE * all),
+        })
     }
 }
 
@@ -157,9 +161,9 @@ impl Planner {
 mod tests {
     use super::super::minutes::tests::timing;
     use super::*;
+    use crate::maintenance;
     use crate::recipe::Recipe;
     use crate::step::pace::Pace;
-    use crate::upkeep;
     use splat4d::math::Rng;
 
     /// Steps, Gaussians and seconds of a synthetic machine.
@@ -170,7 +174,7 @@ mod tests {
     const FINISH: f64 = 200.0;
 
     /// A run on a machine with a clock of its own: seconds in all, and the plans.
-    fn drive(slow: &dyn Fn(f64, usize) -> f64) -> (f64, f64, Vec<Replan>) {
+    fn drive(slow: &dyn Fn(f64, usize) -> f64) -> (f64, f64, Vec<ScheduleChange>) {
         let r = Recipe::default()
             .with(|r| {
                 r.run.iterations = STEPS;
@@ -178,7 +182,8 @@ mod tests {
             })
             .resolve();
         let half_size_steps = STEPS * 2 / 5;
-        let stages = [Stage { upkeep: r.plan().common.upkeep(), half_size_steps, ..Stage::new("all", STEPS) }];
+        let stages =
+            [Stage { maintenance: r.plan().common.maintenance(), half_size_steps, ..Stage::new("all", STEPS) }];
         let timing = timing([START, CAP], [0.004, 0.012], [0.009, 0.025]);
         // What was planned is what fits.
         let planned = timing.rest(&stages, [0, 0], START, CAP) + FINISH * timing.last(&stages, CAP);
@@ -198,8 +203,8 @@ mod tests {
             taken += 1;
             let passed = pace.done_after(taken);
             for step in place + 1..=passed {
-                let at = upkeep::At { step, steps: STEPS };
-                count = stages[0].upkeep.iter().fold(count, |n, u| u.grown(&at, n, CAP as f64));
+                let at = maintenance::At { step, steps: STEPS };
+                count = stages[0].maintenance.iter().fold(count, |n, u| u.grown(&at, n, CAP as f64));
             }
             let progress = Position {
                 iteration: taken,

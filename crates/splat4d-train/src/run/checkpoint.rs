@@ -5,9 +5,9 @@
 //! The file is a scene file with more arrays (`moments.L.TABLE`, `stats.L`, `exposure…`), so that every reader of scenes
 //! opens it too.
 
-use crate::learner::{Learner, Stats};
 use crate::optim::Moments;
 use crate::step::trainer::{Position, Trainer};
+use crate::train_state::{Stats, TrainState};
 use crate::{Error, ErrorKind, Result};
 use serde_json::{Value, json};
 use splat4d::format::safetensors::{self, SafeTensors, Tensor};
@@ -51,20 +51,20 @@ pub fn write(trainer: &Trainer<'_>, identity: &Identity, state: &RunState) -> Re
             arrays.push((name, vec![table.rows(), table.width()], table.column_to_rows(0, table.width())));
         }
     };
-    for (l, (layer, moments)) in trainer.scene().layers.iter().zip(trainer.learner.moments()).enumerate() {
+    for (l, (layer, moments)) in trainer.scene().layers.iter().zip(trainer.train_state.moments()).enumerate() {
         for key in layer.params.keys() {
             // Moments of a page that does not learn have no rows, and are not in the file.
             if moments.table(key).rows() == layer.params[key].rows() {
                 push(moments_name(l, &layer.params, key), moments.table(key));
             }
         }
-        push(format!("stats.{l}"), &trainer.learner.stats().tables[l]);
+        push(format!("stats.{l}"), &trainer.train_state.stats().tables[l]);
     }
-    if let Some(e) = &trainer.learner.exposure {
+    if let Some(e) = &trainer.train_state.exposure {
         push("exposure".into(), &e.params[e.key()]);
         push("exposure.moments".into(), e.moments.table(e.key()));
     }
-    for (name, table) in trainer.learner.corrections.iter().flat_map(|c| c.tables()) {
+    for (name, table) in trainer.train_state.corrections.iter().flat_map(|c| c.tables()) {
         push(name.into(), table);
     }
     let mut memories: Vec<(String, Vec<u32>)> = trainer
@@ -74,8 +74,8 @@ pub fn write(trainer: &Trainer<'_>, identity: &Identity, state: &RunState) -> Re
         .flat_map(|(s, stage)| {
             let params = stage.params.iter().enumerate().map(move |(k, l)| (format!("memory.{s}.{k}"), l.state()));
             let probes = stage.probes.iter().enumerate().map(move |(k, l)| (probe_name(s, k), l.state()));
-            let upkeep = stage.upkeep.iter().map(move |u| (upkeep_name(s, u.name()), u.state()));
-            params.chain(probes).chain(upkeep)
+            let maintenance = stage.maintenance.iter().map(move |u| (maintenance_name(s, u.name()), u.state()));
+            params.chain(probes).chain(maintenance)
         })
         .filter(|(_, state)| !state.is_empty())
         .collect();
@@ -146,12 +146,12 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
         moments.push(m);
         load(&file, &format!("stats.{l}"), &mut stats.tables[l])?;
     }
-    if let Some(e) = &mut trainer.learner.exposure {
+    if let Some(e) = &mut trainer.train_state.exposure {
         let key = e.key();
         load(&file, "exposure", &mut e.params[key])?;
         load(&file, "exposure.moments", e.moments.table_mut(key))?;
     }
-    for (name, table) in trainer.learner.corrections.iter_mut().flat_map(|c| c.tables_mut()) {
+    for (name, table) in trainer.train_state.corrections.iter_mut().flat_map(|c| c.tables_mut()) {
         load(&file, name, table)?;
     }
     for (s, stage) in trainer.stages.iter_mut().enumerate() {
@@ -165,8 +165,9 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
             let state = file.get(&probe_name(s, k)).map_or_else(|| Ok(Vec::new()), |t| t.as_u32())?;
             loss.restore(&state);
         }
-        for operation in &mut stage.upkeep {
-            let state = file.get(&upkeep_name(s, operation.name())).map_or_else(|| Ok(Vec::new()), |t| t.as_u32())?;
+        for operation in &mut stage.maintenance {
+            let state =
+                file.get(&maintenance_name(s, operation.name())).map_or_else(|| Ok(Vec::new()), |t| t.as_u32())?;
             operation.restore(&state);
         }
         if let Some(codec) = &stage.codec {
@@ -201,10 +202,10 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
     if !fits {
         return Err(damaged("it stands beyond the recipe's last step".into()));
     }
-    let mut learner = Learner::resumed(scene, moments, stats);
-    learner.exposure = trainer.learner.exposure.take();
-    learner.corrections = trainer.learner.corrections.take();
-    trainer.restore(learner, progress);
+    let mut train_state = TrainState::resumed(scene, moments, stats);
+    train_state.exposure = trainer.train_state.exposure.take();
+    train_state.corrections = trainer.train_state.corrections.take();
+    trainer.restore(train_state, progress);
     Ok(RunState {
         seconds: number(&meta["seconds"], "seconds")?,
         smooth: [number(&meta["smooth"][0], "smooth")?, number(&meta["smooth"][1], "smooth")?],
@@ -222,7 +223,7 @@ fn probe_name(stage: usize, loss: usize) -> String {
 }
 
 /// The array that holds what a stage's operation of maintenance remembers.
-fn upkeep_name(stage: usize, operation: &str) -> String {
+fn maintenance_name(stage: usize, operation: &str) -> String {
     format!("upkeep.{stage}.{operation}")
 }
 

@@ -2,8 +2,8 @@
 
 use super::checkpoint::write_atomically;
 use crate::capture::Capture;
-use crate::learner::{moved, zoomed};
 use crate::step::trainer::Trainer;
+use crate::train_state::{moved, zoomed};
 use crate::{Error, Result};
 use serde_json::Value;
 use splat4d::scene::Time;
@@ -14,7 +14,7 @@ pub const FILE: &str = "refined.json";
 
 /// Writes what the trainer has learnt of cameras, if that is anything.
 pub(super) fn write(run: &Path, trainer: &Trainer<'_>, capture: &Capture) -> Result<()> {
-    let Some(corrections) = &trainer.learner.corrections else { return Ok(()) };
+    let Some(corrections) = &trainer.train_state.corrections else { return Ok(()) };
     let name = |i: usize| {
         let frame = &capture.frames[capture.train[i]];
         let camera = &capture.cameras[frame.camera];

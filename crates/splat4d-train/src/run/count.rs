@@ -9,9 +9,9 @@ use super::open::OpenCapture;
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};
 use crate::event::Event;
+use crate::maintenance::LEAST;
 use crate::methods::still;
 use crate::recipe::Recipe;
-use crate::upkeep::LEAST;
 use std::collections::BTreeSet;
 
 /// Pixels of distinct views for one Gaussian. Source: published recipes give a real room 0.2 to 1.2 million Gaussians for

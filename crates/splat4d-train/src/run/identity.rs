@@ -3,7 +3,7 @@
 use super::checkpoint::Identity;
 use crate::capture::Capture;
 use crate::recipe::Recipe;
-use crate::step::replans::Replans;
+use crate::step::replans::ScheduleChanges;
 
 /// The mark of a run: its capture, its recipe and, where there is more to say, `text`.
 pub(super) fn identity(capture: &Capture, recipe: &Recipe, text: &str) -> Identity {
@@ -18,7 +18,7 @@ pub(super) fn recipe_print(recipe: &Recipe, text: &str) -> String {
         r.run.memory_limit = 0;
         r.run.checkpoint_interval = 0;
         // Checkpoints hold what they followed of it.
-        r.run.replans = Replans::default();
+        r.run.replans = ScheduleChanges::default();
     });
     hash(&(neutral.flat_toml() + text))
 }

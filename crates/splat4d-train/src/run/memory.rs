@@ -3,7 +3,7 @@
 
 use crate::Result;
 use crate::capture::Capture;
-use crate::methods::{Plan, Program};
+use crate::methods::{Method, TrainContext};
 use crate::recipe::Recipe;
 use splat4d::math::Rng;
 use splat4d::motion::Motion;
@@ -59,7 +59,7 @@ pub fn memory_estimate(capture: &Capture, recipe: &Recipe) -> u64 {
 }
 
 /// Bytes of a model's tables in training, and of what a step with it needs, at `rows` Gaussians.
-fn model(recipe: &Recipe, plan: &Plan, rows: usize) -> Result<u64> {
+fn model(recipe: &Recipe, plan: &TrainContext, rows: usize) -> Result<u64> {
     let program = recipe.program()?;
     let few = Few::new(program.as_ref(), plan, rows)?;
     let tables = few.tables(rows);
@@ -77,7 +77,7 @@ struct Few {
 }
 
 impl Few {
-    fn new(program: &dyn Program, plan: &Plan, rows: usize) -> Result<Self> {
+    fn new(program: &dyn Method, plan: &TrainContext, rows: usize) -> Result<Self> {
         let nodes = program.nodes(plan).min(rows);
         let (few, coefficients) = (FEW.max(nodes), (plan.common.appearance.sh_degree + 1).pow(2));
         let mut params = Params::<f32>::new(few, coefficients, program.life(plan).columns());
@@ -153,7 +153,7 @@ mod tests {
             let trainer = opened.trainer(&r, &plan, opened.initial_scene(&r, &plan).unwrap()).unwrap();
             let p = &trainer.scene().layers[0].params;
             let values: usize = p.keys().map(|k| size_of_val(p[k].data())).sum();
-            let counted = values + splat4d::scene::Grads::new(p).bytes() + trainer.learner.moments()[0].bytes();
+            let counted = values + splat4d::scene::Grads::new(p).bytes() + trainer.train_state.moments()[0].bytes();
             let rows = trainer.scene().len();
             let few = Few::new(r.program().unwrap().as_ref(), &plan, rows).unwrap();
             let estimated = few.tables(rows) as f64;

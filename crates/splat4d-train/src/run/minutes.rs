@@ -5,11 +5,11 @@
 use super::clock::Stopwatch;
 use super::open::OpenCapture;
 use crate::event::{Event, Progress};
+use crate::maintenance::{At, Every};
 use crate::methods::{Stage, stages};
 use crate::recipe::Recipe;
 use crate::step::engine::Blame;
 use crate::step::trainer::{Fault, Trainer};
-use crate::upkeep::{At, Every};
 use crate::{Error, ErrorKind, Result};
 use serde::{Deserialize, Serialize};
 
@@ -122,7 +122,7 @@ impl Timing {
             for i in if number == from[0] { from[1] } else { 0 }..stage.iterations {
                 total += steps.at(stage, i, count);
                 let at = At { step: i + 1, steps: stage.iterations };
-                count = stage.upkeep.iter().fold(count, |n, u| u.grown(&at, n, cap as f64));
+                count = stage.maintenance.iter().fold(count, |n, u| u.grown(&at, n, cap as f64));
             }
         }
         total
@@ -168,7 +168,7 @@ impl Probe<'_> {
     /// Lets all stages densify at other steps.
     fn densify(&mut self, steps: Every) {
         for stage in &mut self.trainer.stages {
-            stage.upkeep.iter_mut().filter_map(|u| u.densification()).for_each(|s| *s = steps);
+            stage.maintenance.iter_mut().filter_map(|u| u.densification()).for_each(|s| *s = steps);
         }
     }
 
@@ -276,7 +276,7 @@ pub(super) mod tests {
                 r.densify.max_cap = 2000;
             })
             .resolve();
-        let mut stage = Stage { upkeep: r.plan().common.upkeep(), ..Stage::new("all", 1000) };
+        let mut stage = Stage { maintenance: r.plan().common.maintenance(), ..Stage::new("all", 1000) };
         let cost = |stages: &[Stage], t: Timing| t.rest(stages, [0, 0], 1000, r.densify.max_cap);
         let flat = cost(std::slice::from_ref(&stage), timing([1000, 1000], [0.01; 2], [0.01; 2]));
         assert!((flat - 10.0).abs() < 1e-9);

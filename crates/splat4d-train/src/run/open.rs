@@ -6,14 +6,14 @@ use crate::capture::frames::{Frames, Picture};
 use crate::capture::{Capture, CaptureOptions, FlowSource, ImageStore, Lenses, frames};
 use crate::event::Event;
 use crate::init::{self, Seeds, Source};
-use crate::learner::{Corrections, Exposure, Origin, RefineSettings, Scale};
 use crate::loss::image::terms;
-use crate::methods::{Plan, Program, Stage, auto, stages};
+use crate::maintenance::Limits;
+use crate::methods::{Method, Stage, TrainContext, auto, stages};
 use crate::recipe::{MotionName, Recipe};
 use crate::step::emphasis::Emphasis;
 use crate::step::loss::TrainLoss;
 use crate::step::trainer::{Settings, TrainedOn, Trainer};
-use crate::upkeep::Limits;
+use crate::train_state::{Corrections, Exposure, Origin, RefineSettings, Scale};
 use crate::{Error, Result};
 use splat4d::device::{self, Device};
 use splat4d::layers::Scene;
@@ -128,7 +128,7 @@ pub fn training_frames(capture: Arc<Capture>, recipe: &Recipe) -> Result<Arc<Dat
 }
 
 /// The programs' plan for a capture and a recipe. Panics: the capture has no training frames.
-pub fn plan(capture: &Capture, recipe: &Recipe) -> Plan {
+pub fn plan(capture: &Capture, recipe: &Recipe) -> TrainContext {
     let mut times: Vec<f64> = capture.train.iter().map(|&i| capture.frames[i].time.0).collect();
     times.sort_by(f64::total_cmp);
     times.dedup();
@@ -145,7 +145,7 @@ pub fn plan(capture: &Capture, recipe: &Recipe) -> Plan {
     let moments = times.iter().map(|&t| (t, views(t))).collect();
     // Cameras that all stand in one place say nothing of the scene's size.
     let (center, radius) = capture.center_and_radius();
-    Plan {
+    TrainContext {
         extent: if radius > SINGLE_PLACE { radius } else { 1.0 },
         center,
         clip,
@@ -182,7 +182,7 @@ pub(crate) fn learnable(recipe: &Recipe) -> RefineSettings {
 }
 
 /// The scale of a plan's capture.
-pub(crate) fn scale(plan: &Plan) -> Scale {
+pub(crate) fn scale(plan: &TrainContext) -> Scale {
     Scale { extent: plan.extent, frame: if plan.fps > 0.0 { 1.0 / plan.fps } else { 1.0 } }
 }
 
@@ -201,7 +201,7 @@ impl OpenCapture {
         Self { device, ..self }
     }
 
-    pub(crate) fn plan(&self, recipe: &Recipe) -> Plan {
+    pub(crate) fn plan(&self, recipe: &Recipe) -> TrainContext {
         plan(&self.capture, recipe)
     }
 
@@ -229,7 +229,7 @@ impl OpenCapture {
         }
     }
 
-    pub(crate) fn initial_scene(&self, recipe: &Recipe, plan: &Plan) -> Result<Scene<f32>> {
+    pub(crate) fn initial_scene(&self, recipe: &Recipe, plan: &TrainContext) -> Result<Scene<f32>> {
         let seeds = self.seeds(recipe, plan)?;
         self.scene(recipe, plan, recipe.program()?.as_ref(), &seeds, self.background()?)
     }
@@ -238,8 +238,8 @@ impl OpenCapture {
     pub(super) fn scene(
         &self,
         recipe: &Recipe,
-        plan: &Plan,
-        program: &dyn Program,
+        plan: &TrainContext,
+        program: &dyn Method,
         seeds: &Seeds,
         background: [f32; 3],
     ) -> Result<Scene<f32>> {
@@ -248,7 +248,7 @@ impl OpenCapture {
     }
 
     /// Where the first Gaussians of a plan are.
-    pub(super) fn seeds(&self, recipe: &Recipe, plan: &Plan) -> Result<Seeds> {
+    pub(super) fn seeds(&self, recipe: &Recipe, plan: &TrainContext) -> Result<Seeds> {
         let program = recipe.program()?;
         let moving = program.capabilities(plan).moves && plan.times > 1;
         let points = if let Source::File(path) = &recipe.init.source {
@@ -266,7 +266,7 @@ impl OpenCapture {
     }
 
     /// What is to be learnt of cameras, where the recipe wants it.
-    fn corrections(&self, recipe: &Recipe, plan: &Plan) -> Option<Corrections> {
+    fn corrections(&self, recipe: &Recipe, plan: &TrainContext) -> Option<Corrections> {
         let settings = learnable(recipe);
         if !settings.poses && !settings.focal && !settings.times {
             return None;
@@ -279,7 +279,7 @@ impl OpenCapture {
         Some(Corrections::new(&settings, scale(plan), &frames, self.capture.cameras.len(), true))
     }
 
-    pub(crate) fn trainer(&self, recipe: &Recipe, plan: &Plan, scene: Scene<f32>) -> Result<Trainer<'static>> {
+    pub(crate) fn trainer(&self, recipe: &Recipe, plan: &TrainContext, scene: Scene<f32>) -> Result<Trainer<'static>> {
         let program = recipe.program()?;
         let mut trainer = self.trainer_of(recipe, plan, scene, stages(program.as_ref(), plan));
         trainer.replan(recipe.run.replans.rows());
@@ -293,7 +293,7 @@ impl OpenCapture {
     pub(crate) fn trainer_of(
         &self,
         recipe: &Recipe,
-        plan: &Plan,
+        plan: &TrainContext,
         scene: Scene<f32>,
         stages: Vec<Stage>,
     ) -> Trainer<'static> {
@@ -325,8 +325,8 @@ impl OpenCapture {
         let drawing = device::open_to_train(self.device, config);
         let mut trainer = Trainer::new(scene, stages, self.frames.clone(), drawing.backend, loss, settings);
         trainer.device = TrainedOn { name: drawing.name, why: drawing.why, missed: drawing.fell_back };
-        trainer.learner.exposure = exposure;
-        trainer.learner.corrections = self.corrections(recipe, plan);
+        trainer.train_state.exposure = exposure;
+        trainer.train_state.corrections = self.corrections(recipe, plan);
         trainer
     }
 }

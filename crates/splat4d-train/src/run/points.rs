@@ -8,7 +8,7 @@ use crate::Result;
 use crate::capture::{Capture, PointCloud, read_points};
 use crate::event::{Event, Progress};
 use crate::init::{self, Source};
-use crate::methods::Plan;
+use crate::methods::TrainContext;
 use crate::recipe::Recipe;
 use crate::vision;
 use splat4d::scene::Camera;
@@ -114,7 +114,7 @@ fn uncovered(camera: &Camera, points: &[[f64; 3]]) -> f64 {
 }
 
 /// The moments at which moving points are wanted.
-fn moments(recipe: &Recipe, plan: &Plan) -> Result<Vec<f64>> {
+fn moments(recipe: &Recipe, plan: &TrainContext) -> Result<Vec<f64>> {
     let program = recipe.program()?;
     let mut settings = recipe.init.clone();
     if !program.capabilities(plan).moves || plan.times < 2 {

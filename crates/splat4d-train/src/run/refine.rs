@@ -12,10 +12,10 @@ use super::memory::memory_estimate;
 use super::open::OpenCapture;
 use super::session::{Outcome, Session, TrainOptions};
 use crate::event::Event;
-use crate::learner::Exposure;
 use crate::methods::Stage;
 use crate::recipe::Recipe;
-use crate::step::replans::Replans;
+use crate::step::replans::ScheduleChanges;
+use crate::train_state::Exposure;
 use crate::{Error, Result};
 use splat4d::layers::Scene;
 use std::path::Path;
@@ -72,7 +72,7 @@ pub(crate) fn refine(
     let total: usize = job.stages.iter().map(|s| s.iterations).sum();
     let begun = !checkpoint::list(run).is_empty();
     // What a run that was begun followed; not what was followed by the run that the scene comes from.
-    let replans = if begun { followed(run)? } else { Replans::default() };
+    let replans = if begun { followed(run)? } else { ScheduleChanges::default() };
     let recipe = job
         .recipe
         .with(|r| {
@@ -99,7 +99,7 @@ pub(crate) fn refine(
     let mut trainer = opened.trainer_of(&recipe, &plan, job.scene, job.stages);
     trainer.replan(recipe.run.replans.rows());
     if job.exposure.is_some() {
-        trainer.learner.exposure = job.exposure;
+        trainer.train_state.exposure = job.exposure;
     }
     let state = if begun {
         let state = session.restore(&mut trainer, listen)?;
@@ -112,11 +112,11 @@ pub(crate) fn refine(
         session.begin(&trainer, listen)?
     };
     let outcome = session.drive(&mut trainer, state, listen)?;
-    Ok(Refined { outcome, scene: trainer.learner.into_scene() })
+    Ok(Refined { outcome, scene: trainer.train_state.into_scene() })
 }
 
 /// The changes of plan that a run in a folder has followed. Errors: its recipe cannot be read.
-fn followed(run: &Path) -> Result<Replans> {
+fn followed(run: &Path) -> Result<ScheduleChanges> {
     let file = run.join("recipe.toml");
     Ok(Recipe::from_toml(&read_text(&file)?).map_err(|e| e.at(file.display()))?.run.replans)
 }

@@ -246,7 +246,7 @@ impl Session<'_> {
             gaussians: trainer.scene().len(),
             memory_estimate: self.estimate,
         });
-        self.tell_device(trainer, listen);
+        self.report_device(trainer, listen);
         let mut metrics = Metrics::open(self.run, first, iterations);
         let mut totals = Totals::default();
         let shown = trainer.scene().without_head("the player");
@@ -376,7 +376,7 @@ impl Session<'_> {
     }
 
     /// Says on what it trains, where that was asked for or is not what it was before.
-    fn tell_device(&self, trainer: &Trainer<'_>, listen: &mut dyn FnMut(&Event)) {
+    fn report_device(&self, trainer: &Trainer<'_>, listen: &mut dyn FnMut(&Event)) {
         let device = &trainer.device;
         // Runs of before there were other devices name none.
         let info = read_info(self.run).unwrap_or_default();

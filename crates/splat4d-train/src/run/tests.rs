@@ -578,7 +578,7 @@ fn exposure_is_learned_for_rigs_and_for_one_camera_only_if_set() {
         let opened = OpenCapture::new(Arc::new(capture), &recipe).unwrap();
         let plan = opened.plan(&recipe);
         let scene = opened.initial_scene(&recipe, &plan).unwrap();
-        opened.trainer(&recipe, &plan, scene).unwrap().learner.exposure.is_some()
+        opened.trainer(&recipe, &plan, scene).unwrap().train_state.exposure.is_some()
     };
     let moment = ["exposure=true", "max_frames=1"];
     assert!(exposed(true, &moment) && exposed(false, &["exposure=true"]) && !exposed(false, &moment));

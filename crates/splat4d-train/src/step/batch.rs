@@ -4,7 +4,7 @@ use super::chain::View;
 use super::emphasis::Emphasis;
 use crate::Result;
 use crate::capture::frames::{Depth, Flow, FlowTruth, Frames, Picture};
-use crate::learner::Corrections;
+use crate::train_state::Corrections;
 use splat4d::math::Rng;
 use splat4d::scene::{Camera, Planes, Time};
 

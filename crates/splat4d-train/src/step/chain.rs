@@ -5,11 +5,11 @@
 
 use super::channels::{Channels, Source};
 use crate::Result;
-pub(crate) use crate::learner::Observation;
-use crate::learner::StepGrads;
 use crate::loss::image::{Channel, PictureGrads, Shown};
 pub(crate) use crate::loss::image::{ImageTerm, View};
 pub(crate) use crate::loss::terms::{ParamLoss, Probe, ProbeLoss, StepInfo};
+pub(crate) use crate::train_state::Observation;
+use crate::train_state::StepGrads;
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::Real;
 use splat4d::render::{Backend, Image, RenderGrads, Shot, Target};
@@ -99,7 +99,7 @@ struct Work<'a, F: Real> {
 
 impl<F: Real> Work<'_, F> {
     /// Adds the image loss of one view.
-    fn tell_loss(&mut self, value: f64) {
+    fn record_loss(&mut self, value: f64) {
         self.report.loss += value;
         self.report.view_losses.push(value);
     }
@@ -121,8 +121,8 @@ impl<F: Real> Chain<F> {
         let mut work = Work { backend, image: &mut *losses.image, d, observe, report: StepReport::default() };
         let mut clock = Clock::now();
         let probes: Vec<Vec<Probe>> = losses.probes.iter().map(|l| l.probes(scene, info)).collect();
-        self.ask(step, work.image, &probes);
-        self.evaluation.answer(&scene.layers);
+        self.request(step, work.image, &probes);
+        self.evaluation.evaluate(&scene.layers);
         self.evaluation.activate(work.d);
         work.report.timings.motion = lap(&mut clock);
         for view in views {
@@ -145,7 +145,7 @@ impl<F: Real> Chain<F> {
     }
 
     /// Collects the questions: what views see is what is alive, probes add their rows, channels other times.
-    fn ask(&mut self, step: &Step<'_, F>, image: &dyn ImageTerm<F>, probes: &[Vec<Probe>]) {
+    fn request(&mut self, step: &Step<'_, F>, image: &dyn ImageTerm<F>, probes: &[Vec<Probe>]) {
         self.evaluation.begin();
         for view in step.views {
             for (index, layer) in step.scene.layers.iter().enumerate() {
@@ -155,7 +155,7 @@ impl<F: Real> Chain<F> {
         for probe in probes.iter().flatten() {
             for &t in &probe.times {
                 let rows = probe.rows.as_deref().map_or(Rows::All, Rows::Some);
-                self.evaluation.ask(probe.layer, probe.of, rows, t);
+                self.evaluation.request(probe.layer, probe.of, rows, t);
             }
         }
         for view in step.views {
@@ -203,7 +203,7 @@ impl<F: Real> Chain<F> {
         }
         work.report.timings.render += if compared { lap(&mut clock) } else { Duration::ZERO };
         self.picture.deliver(scene, work);
-        self.picture.tell(&self.evaluation, &asked, work);
+        self.picture.report_visibility(&self.evaluation, &asked, work);
         drop(splats);
         for (&i, part) in asked.iter().zip(&mut self.picture.d_splats.parts) {
             self.evaluation.add_gradient(i, &mut part.out, &mut part.color, &mut part.weights);
@@ -266,7 +266,7 @@ impl<F: Real> Compared<F> {
     fn compare(&mut self, info: &StepInfo, view: &View<'_, F>, drawn: &[(Channel, usize)], work: &mut Work<'_, F>) {
         self.d_image.begin(&self.image);
         let value = work.image.eval(info, view, &Shown::new(&self.image, drawn), &mut self.d_image);
-        work.tell_loss(value);
+        work.record_loss(value);
     }
 
     /// Drawing, the image loss and the backend's VJP, all on its device. Returns whether it could.
@@ -282,7 +282,7 @@ impl<F: Real> Compared<F> {
             return Ok(false);
         };
         let value = work.image.compared(view, &comparison);
-        work.tell_loss(value);
+        work.record_loss(value);
         Ok(true)
     }
 
@@ -304,7 +304,7 @@ impl<F: Real> Compared<F> {
     }
 
     /// Passes to the observer what the view saw of every layer.
-    fn tell(&self, evaluation: &Evaluation<F>, asked: &[usize], work: &mut Work<'_, F>) {
+    fn report_visibility(&self, evaluation: &Evaluation<F>, asked: &[usize], work: &mut Work<'_, F>) {
         let mut first = 0;
         for (layer, &i) in asked.iter().enumerate() {
             let tape = evaluation.tape(i);

@@ -8,7 +8,7 @@
 
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};
-use crate::learner::{Corrections, Exposure, SearchDue};
+use crate::train_state::{Corrections, Exposure, SearchDue};
 use rayon::prelude::*;
 use splat4d::device;
 use splat4d::layers::{Evaluation, Scene};

@@ -4,10 +4,10 @@
 use super::chain::{Chain, ImageTerm, Losses, Step, StepInfo, StepReport, View};
 use super::loss::TrainLoss;
 use crate::Result;
-use crate::learner::{Learner, Parts};
+use crate::maintenance::Change;
 use crate::methods::Stage;
 use crate::optim::Floor;
-use crate::upkeep::Change;
+use crate::train_state::{Parts, TrainState};
 use splat4d::device;
 use splat4d::layers::Scene;
 use splat4d::math::Rng;
@@ -90,20 +90,20 @@ pub struct Fault(pub String, pub Blame, pub Option<Vec<usize>>);
 pub trait Engine: Send {
     /// One step: evaluate, draw, compare, back, Adam, noise. A device may still be at it afterwards. Inner error: it, or one before it,
     /// was spoilt. Errors: those of what draws.
-    fn step(&mut self, learner: &mut Learner, plan: &mut StepPlan<'_>) -> Result<Result<Stepped, Fault>>;
+    fn step(&mut self, train_state: &mut TrainState, plan: &mut StepPlan<'_>) -> Result<Result<Stepped, Fault>>;
 
     /// The learner was changed in other ways than by a step (it was settled before), or another stage begins: what is remembered
     /// of it is stale.
-    fn changed(&mut self, learner: &Learner);
+    fn changed(&mut self, train_state: &TrainState);
 
     /// Waits for the steps that a device is still at: what they measured. Errors: one was spoilt.
-    fn catch_up(&mut self, _learner: &Learner) -> Result<Vec<Measured>, Fault> {
+    fn catch_up(&mut self, _learner: &TrainState) -> Result<Vec<Measured>, Fault> {
         Ok(Vec::new())
     }
 
     /// The same, and brings the learner up to date, where its numbers are kept elsewhere: asked before anybody looks at them. Errors:
     /// they are lost.
-    fn settle(&mut self, _learner: &mut Learner) -> Result<Vec<Measured>, Fault> {
+    fn settle(&mut self, _learner: &mut TrainState) -> Result<Vec<Measured>, Fault> {
         Ok(Vec::new())
     }
 
@@ -156,8 +156,8 @@ pub(super) fn exposure_rate(plan: &StepPlan<'_>) -> f64 {
 }
 
 /// Adam on the cameras' exposures.
-fn learn_exposure(learner: &mut Learner, plan: &StepPlan<'_>) {
-    if let Some(exposure) = learner.parts_mut().exposure {
+fn learn_exposure(train_state: &mut TrainState, plan: &StepPlan<'_>) {
+    if let Some(exposure) = train_state.parts_mut().exposure {
         match plan.stage.freeze_exposure {
             true => exposure.rest(),
             false => {
@@ -228,8 +228,8 @@ impl<'a> CpuEngine<'a> {
     }
 
     /// Evaluate, draw, compare, and all the backward pass: fills the gradients.
-    fn evaluate(&mut self, learner: &mut Learner, plan: &mut StepPlan<'_>, out: &mut Stepped) -> Result<()> {
-        let Parts { scene, stats, exposure, .. } = learner.parts_mut();
+    fn evaluate(&mut self, train_state: &mut TrainState, plan: &mut StepPlan<'_>, out: &mut Stepped) -> Result<()> {
+        let Parts { scene, stats, exposure, .. } = train_state.parts_mut();
         let scene = if plan.stage.codec.is_some() { &self.shown } else { &*scene };
         let Stage { pictures, probes, params, .. } = &mut *plan.stage;
         let mut image = plan.loss.of_step(pictures, exposure);
@@ -249,7 +249,7 @@ impl<'a> CpuEngine<'a> {
     }
 
     /// Adam on every group of the stage. Returns what was not finite.
-    fn adam(&mut self, learner: &mut Learner, plan: &StepPlan<'_>) -> Vec<(usize, Key)> {
+    fn adam(&mut self, train_state: &mut TrainState, plan: &StepPlan<'_>) -> Vec<(usize, Key)> {
         let (stage, scale, progress) = (&*plan.stage, plan.rate_scale, plan.info.progress);
         let mut bad = Vec::new();
         if let Some(codec) = &stage.codec
@@ -257,8 +257,8 @@ impl<'a> CpuEngine<'a> {
         {
             bad.push((0, SH));
         }
-        rates_of(learner.scene(), plan, &mut self.rates);
-        let Parts { scene, moments, .. } = learner.parts_mut();
+        rates_of(train_state.scene(), plan, &mut self.rates);
+        let Parts { scene, moments, .. } = train_state.parts_mut();
         for (index, layer) in scene.layers.iter_mut().enumerate() {
             let floor = stage.min_log_life.filter(|_| layer.params[LIFE].width() > LOG_WIDTH);
             let floor = floor.map(|least| Floor { key: LIFE, column: LOG_WIDTH, least });
@@ -266,7 +266,7 @@ impl<'a> CpuEngine<'a> {
             let keys = moments[index].step(&mut layer.params, d, rates, floor.as_slice());
             bad.extend(keys.into_iter().map(|k| (index, k)));
         }
-        learn_exposure(learner, plan);
+        learn_exposure(train_state, plan);
         bad
     }
 
@@ -284,10 +284,10 @@ impl<'a> CpuEngine<'a> {
     }
 
     /// Noise on positions, where the stage has it.
-    fn shake(&self, learner: &mut Learner, plan: &StepPlan<'_>) {
+    fn add_noise(&self, train_state: &mut TrainState, plan: &StepPlan<'_>) {
         let Some(noise) = plan.stage.noise else { return };
         let (rate, rng) = (|layer: usize| noise_rate(plan, layer), noise_stream(plan));
-        noise.add(learner.parts_mut().scene, &self.grads, rate, plan.min_opacity, rng);
+        noise.add(train_state.parts_mut().scene, &self.grads, rate, plan.min_opacity, rng);
     }
 }
 
@@ -297,30 +297,30 @@ fn compares(backend: &dyn Backend) -> bool {
 }
 
 impl Engine for CpuEngine<'_> {
-    fn step(&mut self, learner: &mut Learner, plan: &mut StepPlan<'_>) -> Result<Result<Stepped, Fault>> {
+    fn step(&mut self, train_state: &mut TrainState, plan: &mut StepPlan<'_>) -> Result<Result<Stepped, Fault>> {
         let mut out = Stepped::default();
         let clock = Clock::now();
-        self.show(learner.scene(), plan);
+        self.show(train_state.scene(), plan);
         out.other = clock.elapsed();
-        self.evaluate(learner, plan, &mut out)?;
+        self.evaluate(train_state, plan, &mut out)?;
         let clock = Clock::now();
-        let bad = self.adam(learner, plan);
+        let bad = self.adam(train_state, plan);
         out.adam = clock.elapsed();
-        if let Err(fault) = self.sound(learner.scene(), &out.report, &bad) {
+        if let Err(fault) = self.sound(train_state.scene(), &out.report, &bad) {
             return Ok(Err(fault));
         }
         let clock = Clock::now();
-        self.shake(learner, plan);
-        for (d, layer) in self.grads.iter_mut().zip(&learner.scene().layers) {
+        self.add_noise(train_state, plan);
+        for (d, layer) in self.grads.iter_mut().zip(&train_state.scene().layers) {
             d.clear(&layer.params);
         }
         out.other += clock.elapsed();
         Ok(Ok(out))
     }
 
-    fn changed(&mut self, learner: &Learner) {
+    fn changed(&mut self, train_state: &TrainState) {
         self.stale = true;
-        self.grads = learner.scene().layers.iter().map(|l| Grads::new(&l.params)).collect();
+        self.grads = train_state.scene().layers.iter().map(|l| Grads::new(&l.params)).collect();
     }
 
     fn antialias(&self) -> Antialias {

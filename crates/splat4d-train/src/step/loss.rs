@@ -1,9 +1,9 @@
 //! The trainer's image loss: a list of terms, on images as their cameras expose them.
 
-use crate::learner::Exposure;
 use crate::loss::image::{ImageTerm, Needs, PictureGrads, Shown, View};
 use crate::loss::photometric::Photometric;
 use crate::loss::terms::StepInfo;
+use crate::train_state::Exposure;
 use splat4d::render::{Comparison, Target};
 use splat4d::scene::Planes;
 

@@ -8,19 +8,19 @@
 //! are more, some steps stay where they are. So nothing of the past changes its meaning, a rate goes on from where it
 //! was, densifications neither get lost nor are repeated, and the same changes of plan give the same bits.
 
-use super::replans::Replan;
+use super::replans::ScheduleChange;
 
 /// How many steps of the schedule are behind a run after so many steps of its own: a pure function of the changes of plan.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Pace {
     /// Steps of the schedule.
     schedule: usize,
-    rows: Vec<(Replan, usize)>,
+    rows: Vec<(ScheduleChange, usize)>,
 }
 
 impl Pace {
     /// The pace of a run whose schedule has so many steps.
-    pub(crate) fn new(schedule: usize, replans: &[Replan]) -> Self {
+    pub(crate) fn new(schedule: usize, replans: &[ScheduleChange]) -> Self {
         let mut pace = Self { schedule, rows: Vec::new() };
         for row in replans {
             let left = pace.left_after(row.at);
@@ -62,8 +62,8 @@ impl Pace {
 mod tests {
     use super::*;
 
-    fn row(at: usize, total: usize) -> Replan {
-        Replan { at, total }
+    fn row(at: usize, total: usize) -> ScheduleChange {
+        ScheduleChange { at, total }
     }
 
     #[test]

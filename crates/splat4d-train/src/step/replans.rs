@@ -4,7 +4,7 @@ use crate::settings::Value;
 
 /// A change of a run's length while it goes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Replan {
+pub struct ScheduleChange {
     /// Steps that had been taken.
     pub at: usize,
     /// Steps of the run in all, from then on.
@@ -13,29 +13,29 @@ pub struct Replan {
 
 /// Changes of a run's length, in the order in which they were made.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Replans(Vec<Replan>);
+pub struct ScheduleChanges(Vec<ScheduleChange>);
 
 /// The form of the setting, to stand behind "It must be".
 const FORM: &str = "a list of [step, steps in all], steps ascending and below the steps in all, such as [[700, 4200]]";
 
-impl Replans {
+impl ScheduleChanges {
     /// The changes.
-    pub fn rows(&self) -> &[Replan] {
+    pub fn rows(&self) -> &[ScheduleChange] {
         &self.0
     }
 
     /// Adds one. Panics: it is not behind the last, or leaves no step to take.
-    pub(crate) fn push(&mut self, row: Replan) {
+    pub(crate) fn push(&mut self, row: ScheduleChange) {
         assert!(self.may_follow(row), "a run is planned again at increasing steps, and has a step left then");
         self.0.push(row);
     }
 
-    fn may_follow(&self, row: Replan) -> bool {
+    fn may_follow(&self, row: ScheduleChange) -> bool {
         row.at < row.total && self.0.last().is_none_or(|last| last.at < row.at)
     }
 }
 
-impl Value for Replans {
+impl Value for ScheduleChanges {
     fn to_toml(&self) -> toml::Value {
         toml::Value::Array(self.0.iter().map(|r| vec![r.at, r.total].to_toml()).collect())
     }
@@ -46,7 +46,7 @@ impl Value for Replans {
             let &[at, total] = Vec::<usize>::from_toml(row).map_err(|_| FORM)?.as_slice() else {
                 return Err(FORM.into());
             };
-            let row = Replan { at, total };
+            let row = ScheduleChange { at, total };
             if !out.may_follow(row) {
                 return Err(FORM.into());
             }

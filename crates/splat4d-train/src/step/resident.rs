@@ -6,15 +6,15 @@ use super::engine::{
     Blame, CpuEngine, Engine, Fault, Measured, Rates, StepPlan, Stepped, exposure_rate, noise_rate, noise_stream,
     rates_of,
 };
-use crate::learner::{Learner, Parts};
-use crate::loss::terms::KeptLoss;
+use crate::loss::terms::ResidentLoss;
 use crate::optim::corrections;
+use crate::train_state::{Parts, TrainState};
 use crate::{ErrorKind, Result};
-use splat4d::device::KeptMotion;
+use splat4d::device::ResidentMotion;
 use splat4d::layers::{ALPHA_MIN, ALWAYS};
 use splat4d::render::{
-    Antialias, Backend, KEPT, KeptCameras, KeptLayer, KeptNoise, KeptRule, KeptStep, KeptStepped, KeptTable, KeptTies,
-    KeptView, Moves, RowWeights, Target,
+    Antialias, Backend, KEPT, Moves, ResidentCameras, ResidentLayer, ResidentNoise, ResidentRule, ResidentStep,
+    ResidentStepped, ResidentTable, ResidentTies, ResidentView, RowWeights, Target,
 };
 use splat4d::scene::life::LOG_WIDTH;
 use splat4d::scene::{Key, LIFE, LifeKind};
@@ -25,7 +25,7 @@ use std::time::Instant as Clock;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Newest {
     /// The learner: what a device keeps is stale.
-    Learner,
+    TrainState,
     /// Both have the same.
     Both,
     /// The device: the learner is to be settled before it is looked at.
@@ -52,7 +52,7 @@ pub(crate) struct DeviceEngine<'a> {
     /// See [`rates_of`].
     rates: Rates,
     /// Tables that are kept, by layer.
-    known: Vec<KeptMotion>,
+    known: Vec<ResidentMotion>,
     under_way: VecDeque<UnderWay>,
     /// What steps measured that are done, not told yet.
     ready: Vec<Measured>,
@@ -64,7 +64,7 @@ impl<'a> DeviceEngine<'a> {
         let (cpu, rates) = (CpuEngine::new(backend), Rates::default());
         Self {
             cpu,
-            newest: Newest::Learner,
+            newest: Newest::TrainState,
             given_up: false,
             told: false,
             rates,
@@ -75,7 +75,7 @@ impl<'a> DeviceEngine<'a> {
     }
 
     /// Reports once why the CPU keeps the tables of a device that could.
-    fn tell(&mut self, why: &str, notices: &mut Vec<String>) {
+    fn report(&mut self, why: &str, notices: &mut Vec<String>) {
         if !std::mem::replace(&mut self.told, true) {
             notices.push(format!("the CPU keeps the tables and steps: {why}"));
         }
@@ -84,16 +84,16 @@ impl<'a> DeviceEngine<'a> {
     /// The step with the CPU's engine, on the learner's numbers.
     fn step_on_cpu(
         &mut self,
-        learner: &mut Learner,
+        train_state: &mut TrainState,
         plan: &mut StepPlan<'_>,
         notices: Vec<String>,
     ) -> Result<Result<Stepped, Fault>> {
-        let before = match self.settle(learner) {
+        let before = match self.settle(train_state) {
             Ok(measured) => measured,
             Err(fault) => return Ok(Err(fault)),
         };
-        self.newest = Newest::Learner;
-        let stepped = self.cpu.step(learner, plan)?;
+        self.newest = Newest::TrainState;
+        let stepped = self.cpu.step(train_state, plan)?;
         Ok(stepped.map(|s| Stepped {
             notices: notices.into_iter().chain(s.notices).collect(),
             measured: before.into_iter().chain(s.measured).collect(),
@@ -102,19 +102,20 @@ impl<'a> DeviceEngine<'a> {
     }
 
     /// Hands the tables over, if what is kept is stale.
-    fn keep(&mut self, learner: &Learner, plan: &StepPlan<'_>) -> Result<()> {
-        if self.newest != Newest::Learner {
+    fn keep(&mut self, train_state: &TrainState, plan: &StepPlan<'_>) -> Result<()> {
+        if self.newest != Newest::TrainState {
             return Ok(());
         }
-        let scene = learner.scene();
+        let scene = train_state.scene();
         let ties = plan.stage.params.iter().find_map(|loss| loss.ties(scene));
-        let of_layer = |(i, known): (usize, &KeptMotion)| kept(learner, i, known, ties.as_ref().filter(|_| i == 0));
-        let layers: Vec<KeptLayer<'_>> = self.known.iter().enumerate().map(of_layer).collect();
+        let of_layer =
+            |(i, known): (usize, &ResidentMotion)| kept(train_state, i, known, ties.as_ref().filter(|_| i == 0));
+        let layers: Vec<ResidentLayer<'_>> = self.known.iter().enumerate().map(of_layer).collect();
         let resident = self.cpu.backend().resident().expect("only such a device keeps tables");
-        let cameras = learner.exposure.as_ref().map(|exposure| {
+        let cameras = train_state.exposure.as_ref().map(|exposure| {
             let (params, moments) = (&exposure.params[exposure.key()], exposure.moments.table(exposure.key()));
-            let table = KeptTable { width: params.width(), params: params.data(), moments: moments.data() };
-            KeptCameras { count: params.rows(), table, held: exposure.trained() }
+            let table = ResidentTable { width: params.width(), params: params.data(), moments: moments.data() };
+            ResidentCameras { count: params.rows(), table, held: exposure.trained() }
         });
         resident.keep(&layers, cameras.as_ref(), &corrections::<f32>())?;
         self.newest = Newest::Both;
@@ -122,7 +123,7 @@ impl<'a> DeviceEngine<'a> {
     }
 
     /// Remembers what steps measured that are done. Errors: one was spoilt.
-    fn take_in(&mut self, learner: &Learner, done: Vec<KeptStepped>) -> std::result::Result<(), Fault> {
+    fn take_in(&mut self, train_state: &TrainState, done: Vec<ResidentStepped>) -> std::result::Result<(), Fault> {
         for stepped in done {
             let UnderWay { iteration, dssim, frames } =
                 self.under_way.pop_front().expect("what is done was begun before");
@@ -135,7 +136,7 @@ impl<'a> DeviceEngine<'a> {
             }
             let wrong = match stepped.bad {
                 Some([layer, table, row]) => {
-                    let params = &learner.scene().layers[layer].params;
+                    let params = &train_state.scene().layers[layer].params;
                     let column = self.known[layer].keys[table].map_or("?", |key| params.column_name(key, 0));
                     Some(format!("the table of `{column}` is not finite at Gaussian {row} of layer {layer}"))
                 }
@@ -158,31 +159,40 @@ impl<'a> DeviceEngine<'a> {
 }
 
 /// A layer as a device takes it over.
-fn kept<'a>(learner: &'a Learner, index: usize, known: &KeptMotion, ties: Option<&'a KeptTies>) -> KeptLayer<'a> {
-    let layer = &learner.scene().layers[index];
+fn kept<'a>(
+    train_state: &'a TrainState,
+    index: usize,
+    known: &ResidentMotion,
+    ties: Option<&'a ResidentTies>,
+) -> ResidentLayer<'a> {
+    let layer = &train_state.scene().layers[index];
     let table = |key: Option<Key>| {
-        key.map_or(KeptTable::default(), |key| {
-            let (params, moments) = (&layer.params[key], learner.moments()[index].table(key));
-            KeptTable { width: params.width(), params: params.data(), moments: moments.data() }
+        key.map_or(ResidentTable::default(), |key| {
+            let (params, moments) = (&layer.params[key], train_state.moments()[index].table(key));
+            ResidentTable { width: params.width(), params: params.data(), moments: moments.data() }
         })
     };
-    KeptLayer {
+    ResidentLayer {
         rows: layer.params.len(),
         moves: known.moves,
         life: layer.life,
         tables: known.keys.map(table),
-        stats: learner.stats().tables[index].data(),
+        stats: train_state.stats().tables[index].data(),
         ties,
     }
 }
 
 /// What a device knows of all layers for a step, or why the step is the CPU's.
-fn known(learner: &Learner, plan: &StepPlan<'_>, rates: &Rates) -> std::result::Result<Vec<KeptMotion>, String> {
-    let (stage, scene) = (&*plan.stage, learner.scene());
+fn known(
+    train_state: &TrainState,
+    plan: &StepPlan<'_>,
+    rates: &Rates,
+) -> std::result::Result<Vec<ResidentMotion>, String> {
+    let (stage, scene) = (&*plan.stage, train_state.scene());
     let of_stage = [
         (!stage.probes.is_empty(), "losses look at several times"),
         (stage.codec.is_some(), "scenes are shown as their file will be read"),
-        (learner.corrections.is_some(), "cameras learn"),
+        (train_state.corrections.is_some(), "cameras learn"),
         (scene.head_keys().is_some(), "a pixel head learns"),
     ];
     if let Some((_, why)) = of_stage.iter().find(|(is, _)| *is) {
@@ -190,7 +200,7 @@ fn known(learner: &Learner, plan: &StepPlan<'_>, rates: &Rates) -> std::result::
     }
     let mut all = Vec::new();
     for (layer, rates) in scene.layers.iter().zip(rates) {
-        let Some(known) = KeptMotion::new(layer, &plan.info.times) else {
+        let Some(known) = ResidentMotion::new(layer, &plan.info.times) else {
             return Err(format!("the GPU does not know the motion model `{}`", layer.motion.spec().name()));
         };
         let plain = layer.masks.is_none() && layer.span == ALWAYS && layer.cross_fade == [0.0; 2];
@@ -205,9 +215,9 @@ fn known(learner: &Learner, plan: &StepPlan<'_>, rates: &Rates) -> std::result::
     }
     // Ties go by the poses of a frame, of Gaussians that are all there.
     let posed = all.iter().zip(&scene.layers).all(|(k, l)| k.moves == Moves::Posed && l.life == LifeKind::Infinite);
-    let knows = |kept: Option<KeptLoss>| match kept {
-        Some(KeptLoss::Rows(_)) => true,
-        Some(KeptLoss::Ties) => posed && all.len() == 1,
+    let knows = |kept: Option<ResidentLoss>| match kept {
+        Some(ResidentLoss::Rows(_)) => true,
+        Some(ResidentLoss::Ties) => posed && all.len() == 1,
         None => false,
     };
     match stage.params.iter().find(|loss| !knows(loss.kept())) {
@@ -219,7 +229,7 @@ fn known(learner: &Learner, plan: &StepPlan<'_>, rates: &Rates) -> std::result::
 /// The losses on rows of a stage.
 fn row_weights(plan: &StepPlan<'_>) -> RowWeights {
     plan.stage.params.iter().fold(RowWeights::default(), |sum, loss| match loss.kept() {
-        Some(KeptLoss::Rows(w)) => RowWeights {
+        Some(ResidentLoss::Rows(w)) => RowWeights {
             opacity: sum.opacity + w.opacity,
             entropy: sum.entropy + w.entropy,
             scale: sum.scale + w.scale,
@@ -229,35 +239,40 @@ fn row_weights(plan: &StepPlan<'_>) -> RowWeights {
 }
 
 /// The noise on the positions of a layer after a step.
-fn noise(plan: &StepPlan<'_>, layer: usize) -> Option<KeptNoise> {
+fn noise(plan: &StepPlan<'_>, layer: usize) -> Option<ResidentNoise> {
     let rate = noise_rate(plan, layer)?;
     plan.stage.noise?.kept(rate, plan.min_opacity, noise_stream(plan).fork(layer as u64))
 }
 
 /// By layer and table, how it learns.
-fn rules(learner: &Learner, plan: &StepPlan<'_>, rates: &Rates, known: &[KeptMotion]) -> Vec<[Option<KeptRule>; KEPT]> {
-    let of_layer = |(index, known): (usize, &KeptMotion)| {
-        let (layer, rates) = (&learner.scene().layers[index], &rates[index]);
+fn rules(
+    train_state: &TrainState,
+    plan: &StepPlan<'_>,
+    rates: &Rates,
+    known: &[ResidentMotion],
+) -> Vec<[Option<ResidentRule>; KEPT]> {
+    let of_layer = |(index, known): (usize, &ResidentMotion)| {
+        let (layer, rates) = (&train_state.scene().layers[index], &rates[index]);
         known.keys.map(|key| {
             let key = key.filter(|&k| layer.params.info(k).trainable && layer.params[k].width() > 0)?;
             let rates = rates.get(key.0 as usize)?.clone().filter(|r| r.iter().any(|r| *r != 0.0))?;
             let floor = plan.stage.min_log_life.filter(|_| key == LIFE).map(|least| (LOG_WIDTH, least));
-            Some(KeptRule { rates, floor })
+            Some(ResidentRule { rates, floor })
         })
     };
     known.iter().enumerate().map(of_layer).collect()
 }
 
 impl Engine for DeviceEngine<'_> {
-    fn step(&mut self, learner: &mut Learner, plan: &mut StepPlan<'_>) -> Result<Result<Stepped, Fault>> {
+    fn step(&mut self, train_state: &mut TrainState, plan: &mut StepPlan<'_>) -> Result<Result<Stepped, Fault>> {
         let mut notices = Vec::new();
         if self.given_up || self.cpu.backend().resident().is_none() {
-            return self.step_on_cpu(learner, plan, notices);
+            return self.step_on_cpu(train_state, plan, notices);
         }
-        rates_of(learner.scene(), plan, &mut self.rates);
-        let known = known(learner, plan, &self.rates);
+        rates_of(train_state.scene(), plan, &mut self.rates);
+        let known = known(train_state, plan, &self.rates);
         let targets: Option<Vec<Target<'_>>> = {
-            let exposure = learner.parts_mut().exposure;
+            let exposure = train_state.parts_mut().exposure;
             let image = plan.loss.of_step(&mut plan.stage.pictures, exposure);
             plan.views.iter().map(|view| image.target(view)).collect()
         };
@@ -266,34 +281,34 @@ impl Engine for DeviceEngine<'_> {
             (known, _) => {
                 // Of losses on images the CPU's engine tells.
                 if let Err(why) = known {
-                    self.tell(&why, &mut notices);
+                    self.report(&why, &mut notices);
                 }
-                return self.step_on_cpu(learner, plan, notices);
+                return self.step_on_cpu(train_state, plan, notices);
             }
         };
         if known != self.known {
-            match self.settle(learner) {
+            match self.settle(train_state) {
                 Ok(measured) => self.ready = measured,
                 Err(fault) => return Ok(Err(fault)),
             }
-            (self.newest, self.known) = (Newest::Learner, known);
+            (self.newest, self.known) = (Newest::TrainState, known);
         }
         let clock = Clock::now();
-        if let Err(error) = self.keep(learner, plan) {
+        if let Err(error) = self.keep(train_state, plan) {
             // It may well go on drawing.
             self.given_up = true;
-            self.tell(&error.cause(), &mut notices);
-            return self.step_on_cpu(learner, plan, notices);
+            self.report(&error.cause(), &mut notices);
+            return self.step_on_cpu(train_state, plan, notices);
         }
-        let views: Vec<KeptView<'_>> = plan
+        let views: Vec<ResidentView<'_>> = plan
             .views
             .iter()
             .zip(targets)
-            .map(|(v, target)| KeptView { camera: v.camera, t: v.t, background: v.background, target, rig: v.rig })
+            .map(|(v, target)| ResidentView { camera: v.camera, t: v.t, background: v.background, target, rig: v.rig })
             .collect();
-        let rules = rules(learner, plan, &self.rates, &self.known);
+        let rules = rules(train_state, plan, &self.rates, &self.known);
         let noise: Vec<_> = (0..rules.len()).map(|layer| noise(plan, layer)).collect();
-        let step = KeptStep {
+        let step = ResidentStep {
             views: &views,
             sh_degree: plan.sh_degree,
             alpha_min: ALPHA_MIN,
@@ -306,22 +321,22 @@ impl Engine for DeviceEngine<'_> {
         let done = match resident.step(&step) {
             Ok(Some(done)) => done,
             // An image too large for one piece: the CPU's engine draws it in several.
-            Ok(None) => return self.step_on_cpu(learner, plan, notices),
+            Ok(None) => return self.step_on_cpu(train_state, plan, notices),
             Err(error) => {
                 if self.newest != Newest::Both {
                     return Ok(Err(self.gone(&error.cause())));
                 }
                 // Nothing is lost: the learner is as it was before this step.
                 self.given_up = true;
-                self.newest = Newest::Learner;
+                self.newest = Newest::TrainState;
                 if error.kind() == ErrorKind::Memory {
                     // Drawing needs less of it.
-                    self.tell(&error.cause(), &mut notices);
+                    self.report(&error.cause(), &mut notices);
                 } else {
                     self.cpu.leave_device();
                     notices.push(format!("training goes on on the CPU: {}", error.cause()));
                 }
-                return self.step_on_cpu(learner, plan, notices);
+                return self.step_on_cpu(train_state, plan, notices);
             }
         };
         self.newest = Newest::Device;
@@ -330,7 +345,7 @@ impl Engine for DeviceEngine<'_> {
             dssim: views.iter().map(|v| v.target.dssim).collect(),
             frames: plan.views.iter().map(|v| v.frame).collect(),
         });
-        if let Err(fault) = self.take_in(learner, done) {
+        if let Err(fault) = self.take_in(train_state, done) {
             return Ok(Err(fault));
         }
         let measured = std::mem::take(&mut self.ready);
@@ -339,17 +354,17 @@ impl Engine for DeviceEngine<'_> {
         Ok(Ok(out))
     }
 
-    fn changed(&mut self, learner: &Learner) {
-        self.newest = Newest::Learner;
+    fn changed(&mut self, train_state: &TrainState) {
+        self.newest = Newest::TrainState;
         self.under_way.clear();
         self.ready.clear();
-        self.cpu.changed(learner);
+        self.cpu.changed(train_state);
     }
 
-    fn catch_up(&mut self, learner: &Learner) -> std::result::Result<Vec<Measured>, Fault> {
+    fn catch_up(&mut self, train_state: &TrainState) -> std::result::Result<Vec<Measured>, Fault> {
         if !self.under_way.is_empty() {
             match self.cpu.backend().resident().map(|resident| resident.finish()) {
-                Some(Ok(done)) => self.take_in(learner, done)?,
+                Some(Ok(done)) => self.take_in(train_state, done)?,
                 Some(Err(error)) => return Err(self.gone(&error.cause())),
                 None => return Err(self.gone("it is no longer there")),
             }
@@ -357,12 +372,12 @@ impl Engine for DeviceEngine<'_> {
         Ok(std::mem::take(&mut self.ready))
     }
 
-    fn settle(&mut self, learner: &mut Learner) -> std::result::Result<Vec<Measured>, Fault> {
-        let measured = self.catch_up(learner)?;
+    fn settle(&mut self, train_state: &mut TrainState) -> std::result::Result<Vec<Measured>, Fault> {
+        let measured = self.catch_up(train_state)?;
         if self.newest != Newest::Device {
             return Ok(measured);
         }
-        let Parts { scene, moments, stats, exposure } = learner.parts_mut();
+        let Parts { scene, moments, stats, exposure } = train_state.parts_mut();
         let fetched = match self.cpu.backend().resident() {
             None => Err("it is no longer there".to_owned()),
             Some(resident) => {
@@ -388,7 +403,7 @@ impl Engine for DeviceEngine<'_> {
             exposure.take_over(&cameras);
         }
         // Whoever looks may change something, statistics too.
-        self.newest = Newest::Learner;
+        self.newest = Newest::TrainState;
         Ok(measured)
     }
 

@@ -8,15 +8,15 @@ use super::engine::{Blame, Engine, StepPlan};
 pub use super::engine::{Fault, Measured, Stepped};
 use super::loss::TrainLoss;
 use super::pace::Pace;
-use super::replans::Replan;
+use super::replans::ScheduleChange;
 use super::resident::DeviceEngine;
 use crate::capture::frames::Frames;
 use crate::event::Progress;
-use crate::learner::{Learner, Touched};
 use crate::loss::terms::Codec;
+use crate::maintenance::{At, Change, Context, Limits, Maintenance};
 use crate::methods::{Group, Hook, Stage};
 use crate::sampler::{Draw, Timeline};
-use crate::upkeep::{At, Change, Context, Limits, Upkeep};
+use crate::train_state::{Touched, TrainState};
 use crate::{Error, ErrorKind, Result};
 use splat4d::layers::Scene;
 use splat4d::math::Rng;
@@ -75,7 +75,7 @@ pub(crate) struct TrainedOn {
 /// The state of a run.
 pub struct Trainer<'a> {
     /// The scene that learns, with its optimiser.
-    pub learner: Learner,
+    pub train_state: TrainState,
     /// The stages, in order.
     pub stages: Vec<Stage>,
     /// How far.
@@ -109,12 +109,12 @@ impl<'a> Trainer<'a> {
         assert!(!stages.is_empty(), "a program has at least one stage");
         let unframed = scene.layers.iter().all(|l| l.frame.is_identity());
         assert!(unframed, "training moves rows in the layers' own axes, which must be the world's");
-        stages.iter_mut().for_each(|s| s.upkeep.sort_by_key(|u| u.order()));
+        stages.iter_mut().for_each(|s| s.maintenance.sort_by_key(|u| u.order()));
         let timeline = Timeline::new(frames.as_ref());
         let name = backend.name().to_owned();
         let device = TrainedOn { why: format!("training on {name}"), name, missed: false };
         let mut trainer = Self {
-            learner: Learner::new(scene),
+            train_state: TrainState::new(scene),
             stages,
             progress: Position { rate_scale: 1.0, ..Position::default() },
             loss,
@@ -134,7 +134,7 @@ impl<'a> Trainer<'a> {
     /// Takes steps with another engine from now on.
     pub fn set_engine(&mut self, engine: impl Engine + 'a) {
         self.engine = Box::new(engine);
-        self.engine.changed(&self.learner);
+        self.engine.changed(&self.train_state);
     }
 
     /// Lets some pixels weigh more from now on.
@@ -159,7 +159,7 @@ impl<'a> Trainer<'a> {
     }
 
     /// Goes through the schedule at the pace of these changes of plan: all that were ever made.
-    pub(crate) fn replan(&mut self, replans: &[Replan]) {
+    pub(crate) fn replan(&mut self, replans: &[ScheduleChange]) {
         self.pace = (!replans.is_empty()).then(|| Pace::new(self.schedule(), replans));
     }
 
@@ -194,24 +194,24 @@ impl<'a> Trainer<'a> {
 
     /// The scene that learns.
     pub fn scene(&self) -> &Scene<f32> {
-        self.learner.scene()
+        self.train_state.scene()
     }
 
     /// Takes over a checkpoint's state. The scene and all tables must belong together.
-    pub(crate) fn restore(&mut self, learner: Learner, progress: Position) {
-        (self.learner, self.progress, self.entered) = (learner, progress, progress.rests);
+    pub(crate) fn restore(&mut self, train_state: TrainState, progress: Position) {
+        (self.train_state, self.progress, self.entered) = (train_state, progress, progress.rests);
         self.spread();
     }
 
     /// Notifies those that keep data of the learner of what was done to it, steps apart: the one place where that is
     /// known.
     fn spread(&mut self) {
-        let touched = self.learner.take_touched();
+        let touched = self.train_state.take_touched();
         if let (Touched::Rows, Some(stage)) = (touched, self.stages.get(self.progress.stage)) {
             stage.on_edit();
         }
         if touched != Touched::Nothing {
-            self.engine.changed(&self.learner);
+            self.engine.changed(&self.train_state);
         }
     }
 
@@ -219,7 +219,7 @@ impl<'a> Trainer<'a> {
     fn run_hook(&mut self, hook: impl Fn(&Stage) -> Option<&Hook>, progress: &mut Progress<'_>) -> Result<()> {
         let stage = &self.stages[self.progress.stage];
         if let Some(hook) = hook(stage) {
-            self.learner
+            self.train_state
                 .rebuild(&|layer, column| learns(&stage.groups, layer, column), |scene| hook(scene, progress))?;
             self.spread();
         }
@@ -234,7 +234,7 @@ impl<'a> Trainer<'a> {
                 self.run_hook(|s| s.start.as_ref(), progress)?;
                 self.set_phase();
                 // Of another stage's codec nothing is kept.
-                self.engine.changed(&self.learner);
+                self.engine.changed(&self.train_state);
             }
             if self.stages[self.progress.stage].iterations == 0 {
                 self.leave_stage(progress)?;
@@ -250,7 +250,7 @@ impl<'a> Trainer<'a> {
     /// Puts the models of all layers into the stage's phase.
     fn set_phase(&mut self) {
         let Some(phase) = self.stages[self.progress.stage].phase else { return };
-        for layer in &mut self.learner.scene_mut().layers {
+        for layer in &mut self.train_state.scene_mut().layers {
             if let Some(motion) = layer.motion.with_phase(&phase) {
                 layer.motion = motion;
             }
@@ -331,18 +331,18 @@ impl<'a> Trainer<'a> {
     /// end of every stage. Returns what steps measured that were not done yet. Errors: its numbers are lost, and the run must go back
     /// to a checkpoint.
     pub fn settle(&mut self) -> std::result::Result<Vec<Measured>, Fault> {
-        self.engine.settle(&mut self.learner).map_err(|fault| self.named(fault))
+        self.engine.settle(&mut self.train_state).map_err(|fault| self.named(fault))
     }
 
     /// Waits for the steps that a device is still at, and leaves the learner with it. Returns and errors: as of
     /// [`settle`](Self::settle).
     pub fn catch_up(&mut self) -> std::result::Result<Vec<Measured>, Fault> {
-        self.engine.catch_up(&self.learner).map_err(|fault| self.named(fault))
+        self.engine.catch_up(&self.train_state).map_err(|fault| self.named(fault))
     }
 
     /// Goes on from what the learner holds, whatever a device that failed had in addition.
     pub(crate) fn go_on(&mut self) {
-        self.engine.changed(&self.learner);
+        self.engine.changed(&self.train_state);
     }
 
     /// Milliseconds of the stages of the last view that is done, where a device that takes whole steps reports them.
@@ -365,14 +365,14 @@ impl<'a> Trainer<'a> {
     fn looked_at_after(&self, mut passed: RangeInclusive<usize>) -> bool {
         let stage = &self.stages[self.progress.stage];
         let last = *passed.end() == stage.iterations;
-        last || passed.any(|step| stage.upkeep.iter().any(|u| u.due(&At { step, steps: stage.iterations })))
+        last || passed.any(|step| stage.maintenance.iter().any(|u| u.due(&At { step, steps: stage.iterations })))
     }
 
     /// Loads the images of this step; the next one's are read meanwhile.
     fn load(&mut self) -> Result<()> {
         let (Position { taken, stage_step: place, .. }, next) = (self.progress, self.next_place());
         let stage = &self.stages[self.progress.stage];
-        let corrections = self.learner.corrections.as_ref();
+        let corrections = self.train_state.corrections.as_ref();
         self.batch.load(
             self.frames.as_ref(),
             self.draw_frames(taken, place),
@@ -414,7 +414,7 @@ impl<'a> Trainer<'a> {
             exposure_lr,
             min_opacity: limits.min_opacity,
         };
-        self.engine.step(&mut self.learner, &mut plan)
+        self.engine.step(&mut self.train_state, &mut plan)
     }
 
     /// Corrects cameras by what the step's views say, and searches their clocks where that is due.
@@ -422,25 +422,25 @@ impl<'a> Trainer<'a> {
         let Position { stage, stage_step, rate_scale, .. } = self.progress;
         let before: usize = self.stages[..stage].iter().map(|s| s.iterations).sum();
         let progress = (before + stage_step) as f64 / self.schedule().max(1) as f64;
-        if let Some(corrections) = &mut self.learner.corrections {
+        if let Some(corrections) = &mut self.train_state.corrections {
             let report = &stepped.report;
             corrections.step(self.batch.seen(), &report.grads(), progress, rate_scale);
         }
         let after = (before + self.next_place()) as f64 / self.schedule().max(1) as f64;
-        let Some(corrections) = &self.learner.corrections else { return Ok(()) };
+        let Some(corrections) = &self.train_state.corrections else { return Ok(()) };
         if let Some(due) = corrections.search_due(progress, after) {
             let (frames, antialias) = (self.frames.as_ref(), self.engine.antialias());
-            let look = Look { frames, corrections, exposure: self.learner.exposure.as_ref(), antialias };
-            let shifts = look.shifts(self.learner.scene(), due)?;
-            self.learner.corrections.iter_mut().for_each(|c| c.shift(&shifts));
+            let look = Look { frames, corrections, exposure: self.train_state.exposure.as_ref(), antialias };
+            let shifts = look.shifts(self.train_state.scene(), due)?;
+            self.train_state.corrections.iter_mut().for_each(|c| c.shift(&shifts));
         }
         Ok(())
     }
 
     /// Runs the operations of `which` that are due after any of these steps of the stage's schedule, once each and where
     /// they are due last, and notifies losses of what they did.
-    fn keep_up(&mut self, passed: RangeInclusive<usize>, which: impl Fn(&dyn Upkeep) -> bool) -> Result<Change> {
-        let Stage { upkeep, groups, iterations, .. } = &mut self.stages[self.progress.stage];
+    fn keep_up(&mut self, passed: RangeInclusive<usize>, which: impl Fn(&dyn Maintenance) -> bool) -> Result<Change> {
+        let Stage { maintenance, groups, iterations, .. } = &mut self.stages[self.progress.stage];
         let at = |step| At { step, steps: *iterations };
         let context = Context {
             at: at(*passed.end()),
@@ -452,9 +452,9 @@ impl<'a> Trainer<'a> {
             learns: &|layer, column| learns(groups, layer, column),
         };
         let mut change = Change::default();
-        for operation in upkeep.iter_mut().filter(|u| which(u.as_ref())) {
+        for operation in maintenance.iter_mut().filter(|u| which(u.as_ref())) {
             if let Some(at) = passed.clone().rev().map(at).find(|at| operation.due(at)) {
-                change += operation.run(&mut self.learner, &Context { at, ..context })?;
+                change += operation.run(&mut self.train_state, &Context { at, ..context })?;
             }
         }
         self.spread();

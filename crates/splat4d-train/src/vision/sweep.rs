@@ -194,7 +194,7 @@ impl<'a> Reference<'a> {
         let seen: Vec<([f64; 3], f64)> = known.iter().filter_map(|&x| Some((x, sees(view, x)?))).collect();
         let center = view.camera.center();
         let mut scores: Vec<(f64, usize)> = if seen.len() >= ENOUGH {
-            let worth = |b: usize| {
+            let importance = |b: usize| {
                 let other = views[b].camera.center();
                 let one = |(x, _): &([f64; 3], f64)| match sees(&views[b], *x) {
                     Some(_) => angle_worth(angle_at(*x, center, other).to_degrees()),
@@ -202,7 +202,7 @@ impl<'a> Reference<'a> {
                 };
                 seen.iter().map(one).sum::<f64>()
             };
-            (0..views.len()).filter(|&b| b != a).map(|b| (worth(b), b)).filter(|s| s.0 > 0.0).collect()
+            (0..views.len()).filter(|&b| b != a).map(|b| (importance(b), b)).filter(|s| s.0 > 0.0).collect()
         } else {
             let cameras: Vec<_> = views.iter().map(|v| &v.camera).collect();
             let near = super::matching::pairs(&cameras);

@@ -42,11 +42,11 @@ fn a_scene_and_the_file_of_it_are_measured_alike() {
     let mut bytes = Vec::new();
     playback::write(&draft, &playback::WriteConfig::default(), &mut bytes).unwrap();
     let length = bytes.len() as u64;
-    let looks = looks(&views(5), scene.clip, [40, 40]);
+    let measured_views = measured_views(&views(5), scene.clip, [40, 40]);
     let subject = |what| Subject { what, antialias: Antialias::Off };
     let subjects = [subject(What::Scene(&scene)), subject(What::File(bytes.into()))];
     let mut heard = Vec::new();
-    let sides = in_turns(&subjects, &looks, &mut |done, total| heard.push((done, total))).unwrap();
+    let sides = in_turns(&subjects, &measured_views, &mut |done, total| heard.push((done, total))).unwrap();
     assert!(heard.windows(2).all(|w| w[0].0 + 1 == w[1].0) && heard.last().is_some_and(|(d, t)| d == t), "{heard:?}");
     let [scene_side, file] = &sides[..] else { panic!("two sides") };
     assert_eq!((scene_side.gaussians, file.bytes), (400, length));
@@ -63,13 +63,13 @@ fn a_scene_and_the_file_of_it_are_measured_alike() {
     assert!((scene_side.pairs / file.pairs - 1.0).abs() < 0.1, "{sides:?}");
     let text = serde_json::to_string(&sides).unwrap();
     assert_eq!(serde_json::from_str::<Vec<Side>>(&text).unwrap().len(), 2);
-    assert!(in_turns(&[subject(What::File(Arc::from(*b"SPL4D")))], &looks, &mut |_, _| ()).is_err());
+    assert!(in_turns(&[subject(What::File(Arc::from(*b"SPL4D")))], &measured_views, &mut |_, _| ()).is_err());
 }
 
 #[test]
 fn looks_go_round_the_rig_and_through_the_clip() {
     for cameras in [1, 2, 3, 20, 23, 100] {
-        let all = looks(&views(cameras), [1.0, 3.0], [80, 40]);
+        let all = measured_views(&views(cameras), [1.0, 3.0], [80, 40]);
         assert!(all.windows(2).all(|w| w[0].time.0 < w[1].time.0));
         assert!(all[0].time.0 > 1.0 && all[LOOKS - 1].time.0 < 3.0);
         let places: BTreeSet<[u64; 3]> = all.iter().map(|l| l.camera.center().map(f64::to_bits)).collect();

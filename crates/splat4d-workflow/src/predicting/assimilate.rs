@@ -53,10 +53,10 @@ pub(super) fn run(
     console.clear();
     let scene = predicted(&work.scene, &work.observed, &ahead, work.clock)?;
     let cases: Vec<Case> = views.cases(work, &scene)?;
-    let mut worth = scores(&format!("{}, assimilated", of.model.name()), &cases, baselines, work.horizon);
-    worth.track_error = views.track_errors(work, &ahead);
-    worth.node_error = work.oracle()?.map(|oracle| node_errors(&ahead, &work.follow(&oracle)));
-    Ok(worth)
+    let mut model_scores = scores(&format!("{}, assimilated", of.model.name()), &cases, baselines, work.horizon);
+    model_scores.track_error = views.track_errors(work, &ahead);
+    model_scores.node_error = work.oracle()?.map(|oracle| node_errors(&ahead, &work.follow(&oracle)));
+    Ok(model_scores)
 }
 
 /// The images that training cameras take of one frame of the future, at the time that the filter asks at.

@@ -183,7 +183,7 @@ impl Views {
                 let frame = &work.capture.frames[shot.frame];
                 painter.draw(&frame.view, frame.time.0);
                 let truth = work.store.load(shot.frame)?.to_picture().color;
-                film.frame(&beside(&color_rgb(&truth), &color_rgb(&painter.image.color)))?;
+                film.frame(&side_by_side(&color_rgb(&truth), &color_rgb(&painter.image.color)))?;
             }
             film.finish()?;
             console.clear();
@@ -200,7 +200,7 @@ fn changed(now: &Planes<f32>, before: &Planes<f32>) -> Vec<bool> {
 }
 
 /// Two images of one size side by side.
-fn beside(left: &Rgb, right: &Rgb) -> Rgb {
+fn side_by_side(left: &Rgb, right: &Rgb) -> Rgb {
     let rows = left.data.chunks_exact(3 * left.width).zip(right.data.chunks_exact(3 * right.width));
     let data = rows.flat_map(|(l, r)| [l, r].concat()).collect();
     Rgb { width: left.width + right.width, height: left.height, data }

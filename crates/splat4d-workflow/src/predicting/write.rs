@@ -1,6 +1,6 @@
 //! The files of a prediction, but for its page.
 
-use super::{Forecast, Told, Work};
+use super::{Forecast, Summary, Work};
 use crate::baking::{Baking, bake_into};
 use crate::events::Listener;
 use crate::source::Source;
@@ -15,7 +15,7 @@ use std::path::Path;
 pub(super) fn all(
     work: &Work,
     folder: &Path,
-    told: &Told,
+    told: &Summary,
     forecasts: &[Forecast],
     best: &Forecast,
     console: &dyn Listener,

@@ -290,7 +290,7 @@ fn both_pictures(out: &mut String, run: &Run, told: &Compressed) {
 
 fn settings(out: &mut String, settings: &Value) {
     let Some(map) = settings.as_object().filter(|m| !m.is_empty()) else { return };
-    let text: String = map.iter().map(|(knob, value)| format!("{knob} = {value}\n")).collect();
+    let text: String = map.iter().map(|(setting, value)| format!("{setting} = {value}\n")).collect();
     let _ = writeln!(
         out,
         "<details><summary>all settings of the compression</summary><pre>{}</pre></details>",

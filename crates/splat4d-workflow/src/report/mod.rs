@@ -12,7 +12,7 @@ mod refined;
 mod rig_map;
 
 use crate::files::{self, grouped, human_bytes, human_seconds};
-use crate::run_folder::{Beside, Metrics, Run, ViewScore, beside};
+use crate::run_folder::{Baseline, Metrics, Run, ViewScore, baselines};
 use chart::{Series, bars, escape, lines, short};
 pub use refined::refined_in_words;
 use serde_json::Value;
@@ -270,8 +270,8 @@ fn scores(out: &mut String, run: &Run) {
     let label = |views: &[&ViewScore]| {
         let all: Vec<f64> = views.iter().filter_map(|v| v.corrected).collect();
         let corrected = all.iter().sum::<f64>() / all.len() as f64;
-        let beside = if all.is_empty() { String::new() } else { format!(" ({corrected:.2})") };
-        format!("{:.2} dB{beside}", mean(views))
+        let baselines = if all.is_empty() { String::new() } else { format!(" ({corrected:.2})") };
+        format!("{:.2} dB{baselines}", mean(views))
     };
     let mut rows: Vec<(String, f64, String)> =
         cameras.iter().map(|(name, views)| (name.clone(), mean(views), label(views))).collect();
@@ -338,9 +338,9 @@ fn lives(out: &mut String, run: &Run) {
 
 /// What the figures hold for, and what else was measured: other views, another background.
 fn conditions(out: &mut String, run: &Run) {
-    let own = run.results.as_ref().map(|scores| Beside { name: "", step: run.iteration().unwrap_or(0), scores });
+    let own = run.results.as_ref().map(|scores| Baseline { name: "", step: run.iteration().unwrap_or(0), scores });
     let mut rows = String::new();
-    for entry in own.into_iter().chain(beside(&run.all_results)) {
+    for entry in own.into_iter().chain(baselines(&run.all_results)) {
         // Runs of older versions do not say.
         let Some(told) = entry.scores.get("conditions") else { continue };
         let text = |key: &str| told.get(key).and_then(Value::as_str).unwrap_or_default().to_owned();

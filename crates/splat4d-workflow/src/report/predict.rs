@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 /// The content of `predict.json`.
 #[derive(Debug, Serialize)]
-pub struct Told {
+pub struct Summary {
     #[serde(serialize_with = "splat4d_train::path_text::lossy")]
     pub run: PathBuf,
     /// The last observed second.
@@ -68,13 +68,13 @@ pub struct ModelScores {
 }
 
 /// Writes the page and returns its path. `films`: camera and file.
-pub fn write(folder: &Path, run: &str, told: &Told, films: &[(String, PathBuf)]) -> Result<PathBuf> {
+pub fn write(folder: &Path, run: &str, told: &Summary, films: &[(String, PathBuf)]) -> Result<PathBuf> {
     let path = folder.join("report.html");
     files::write(&path, page(run, told, films).as_bytes())?;
     Ok(path)
 }
 
-fn page(run: &str, told: &Told, films: &[(String, PathBuf)]) -> String {
+fn page(run: &str, told: &Summary, films: &[(String, PathBuf)]) -> String {
     let mut body = String::new();
     let words = format!(
         "{} frames observed, {} predicted, {} of them with images · {} nodes on {} moving Gaussians · the exported \

@@ -2,11 +2,11 @@
 
 use super::fit::{Fitter, Piece, Subject, seen};
 use super::life::Lives;
-use super::lookout::Lookout;
 use super::rank::rank;
 use super::rate::{PRICES, Rate, Sums, price};
 use super::repeat::Rounds;
 use super::sample::{self, Framed, Row, Samples};
+use super::sampling::Lookout;
 use super::straight::{Line, learnt};
 use super::tally::{Tally, bounded, cut, in_order, page, quantiles, sh_degree};
 use super::tree::{Span, Tree};
@@ -103,7 +103,7 @@ pub struct Bakery<'a> {
     scene: &'a Scene<f32>,
     options: &'a Options,
     tree: Tree,
-    lookout: Lookout,
+    sampling: Lookout,
     weights: Option<Weights>,
     /// By layer and run, where they are kept.
     kept: Vec<Vec<Samples>>,
@@ -163,8 +163,8 @@ impl<'a> Bakery<'a> {
         let tree = Tree::new(scene.clip, scene.fps, options.looks, options.segment, usize::MAX)?;
         let cameras: Vec<_> =
             options.cameras.iter().chain(options.path.iter().map(|(_, camera)| camera)).cloned().collect();
-        let lookout = Lookout::new(&cameras, &means(scene));
-        let mut bakery = Self { scene, options, tree, lookout, weights: None, kept: Vec::new() };
+        let sampling = Lookout::new(&cameras, &means(scene));
+        let mut bakery = Self { scene, options, tree, sampling, weights: None, kept: Vec::new() };
         bakery.tree = bakery.tree_of(options.looks)?;
         Ok(bakery)
     }
@@ -235,7 +235,7 @@ impl<'a> Bakery<'a> {
         };
         let fitter = Fitter {
             tree: &self.tree,
-            lookout: &self.lookout,
+            sampling: &self.sampling,
             tolerance: tolerance.unwrap_or(TOLERANCE),
             accepted: tolerance.unwrap_or(f64::INFINITY),
         };
@@ -244,7 +244,7 @@ impl<'a> Bakery<'a> {
         let mut pages = Vec::new();
         for (index, layer) in self.layers().iter().enumerate() {
             if self.is_kept(layer) {
-                pages.extend(page(layer, &self.lookout, &mut tally)?);
+                pages.extend(page(layer, &self.sampling, &mut tally)?);
                 progress(tally.done, total);
                 continue;
             }
@@ -276,7 +276,7 @@ impl<'a> Bakery<'a> {
             bounded(one.saturating_mul(options.repeat))?;
             let length = tree.border(tree.frames()) - clip[0];
             let rounds = Rounds { first: clip[0], length, count: options.repeat };
-            nodes = rounds.spread(nodes, &self.lookout, options.tolerance);
+            nodes = rounds.spread(nodes, &self.sampling, options.tolerance);
             clip[1] += length * (options.repeat - 1) as f64;
         }
         let report = Report {
@@ -354,7 +354,7 @@ impl<'a> Bakery<'a> {
     ) -> Option<Sums<'s>> {
         let weights = self.weights.as_ref().expect("weights are measured before anything else");
         Sums::new(tree, samples, row, curved.lives.envelope(row.id), |look| {
-            weights.of(layer, row.id, look, &self.lookout)
+            weights.of(layer, row.id, look, &self.sampling)
         })
     }
 
@@ -422,7 +422,7 @@ fn copy(
     for first in (0..spans.len()).step_by(STRAIGHT_RUN) {
         let ids = first..spans.len().min(first + STRAIGHT_RUN);
         let piece = |id: usize| {
-            let mut piece = line.piece(layer, &lives, id, spans[id], fitter.tree, fitter.lookout)?;
+            let mut piece = line.piece(layer, &lives, id, spans[id], fitter.tree, fitter.sampling)?;
             (piece.primitive.label, piece.primitive.features) = (labels[id], features[id].clone());
             Some(piece)
         };

@@ -1,8 +1,8 @@
 //! One Gaussian becomes pieces: straight lines in the deepest nodes that hold its life, halved where they miss.
 
 use super::life::Envelope;
-use super::lookout::Lookout;
 use super::sample::{GEOMETRY, Row, Samples};
+use super::sampling::Lookout;
 use super::shape::{Shape, decompose, difference};
 use super::tree::{Span, Tree};
 use crate::format::playback::Primitive;
@@ -39,7 +39,7 @@ pub(super) struct Piece {
 #[derive(Clone, Copy)]
 pub(super) struct Fitter<'a> {
     pub tree: &'a Tree,
-    pub lookout: &'a Lookout,
+    pub sampling: &'a Lookout,
     /// Errors of shape and life that need not be improved, pixels.
     pub tolerance: f64,
     /// Largest error that is not split further, pixels.
@@ -113,7 +113,7 @@ impl Fitter<'_> {
         });
 
         let (life, opacity) = self.life(subject, span, held);
-        let pixels = self.lookout.pixels(mean);
+        let pixels = self.sampling.pixels(mean);
         let colors = colors(subject, held);
         let center: [f64; 3] = std::array::from_fn(|k| mean[k] + velocity[k] * (life.center - time));
         let worst = |shape: Option<&Shape>| {

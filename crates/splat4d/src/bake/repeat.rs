@@ -1,7 +1,7 @@
 //! A take played many times over: what stands still for ever is kept once, all else once a round.
 
 use super::fit::LEVEL_PIXELS;
-use super::lookout::Lookout;
+use super::sampling::Lookout;
 use crate::format::playback::{Node, Primitive};
 
 /// How a take is repeated.
@@ -16,14 +16,14 @@ pub(super) struct Rounds {
 
 impl Rounds {
     /// The nodes of all rounds from those of one; the first node must be the root.
-    pub(super) fn spread(&self, nodes: Vec<Node>, lookout: &Lookout, tolerance: f64) -> Vec<Node> {
+    pub(super) fn spread(&self, nodes: Vec<Node>, sampling: &Lookout, tolerance: f64) -> Vec<Node> {
         let end = self.first + self.length * self.count as f64;
         let mut root = Node { from: self.first, to: end, primitives: Vec::new() };
         let mut round = nodes;
         for node in round.iter_mut().filter(|n| n.from <= self.first && n.to >= self.first + self.length) {
             let all = std::mem::take(&mut node.primitives);
             for primitive in all {
-                match self.still(&primitive, lookout, tolerance) {
+                match self.still(&primitive, sampling, tolerance) {
                     Some(still) => root.primitives.push(still),
                     None => node.primitives.push(primitive),
                 }
@@ -53,7 +53,7 @@ impl Rounds {
     }
 
     /// The primitive as one that stands for ever, where that stays within the tolerance.
-    fn still(&self, p: &Primitive, lookout: &Lookout, tolerance: f64) -> Option<Primitive> {
+    fn still(&self, p: &Primitive, sampling: &Lookout, tolerance: f64) -> Option<Primitive> {
         let ends = [self.first, self.first + self.length];
         let middle = 0.5 * (ends[0] + ends[1]);
         let mean: [f64; 3] = std::array::from_fn(|k| p.mean[k] + f64::from(p.velocity[k]) * (middle - p.center));
@@ -73,7 +73,7 @@ impl Rounds {
         let speed = p.velocity.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
         let spin = p.turn.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
         let size = p.scales.iter().fold(0.0f32, |a, &b| a.max(b));
-        let shift = 0.5 * self.length * (speed + spin * f64::from(size)) * lookout.pixels(mean) * opacity;
+        let shift = 0.5 * self.length * (speed + spin * f64::from(size)) * sampling.pixels(mean) * opacity;
         if !(shift <= tolerance && LEVEL_PIXELS * level <= tolerance) {
             return None;
         }

@@ -2,8 +2,8 @@
 
 use super::fit::{COLORS, Piece, home, is_visible, primitive, seen};
 use super::life::{Envelope, Lives};
-use super::lookout::Lookout;
 use super::sample::own_colors;
+use super::sampling::Lookout;
 use super::shape::Shape;
 use super::tree::Tree;
 use crate::layers::Layer;
@@ -34,7 +34,7 @@ impl Line {
         id: usize,
         span: [f64; 2],
         tree: &Tree,
-        lookout: &Lookout,
+        sampling: &Lookout,
     ) -> Option<Piece> {
         let seen = seen(tree, span)?;
         let node = home(tree, seen)?;
@@ -55,7 +55,7 @@ impl Line {
         let life = if own.is_forever() { Envelope::forever(0.5 * (from + to)) } else { own };
         let at = |t: f64| std::array::from_fn(|k| mean[k] + velocity[k] * (t - origin));
         let shown = [seen[0].max(from), seen[1].min(to)];
-        let pixels = lookout.pixels(at(0.5 * (shown[0] + shown[1])));
+        let pixels = sampling.pixels(at(0.5 * (shown[0] + shown[1])));
         let area = pixels * pixels * ((shown[1] - shown[0]) / (to - from)).clamp(0.0, 1.0);
         let primitive = primitive(at(life.center), &life, &shape, opacity, velocity, &colors, area);
         Some(Piece { span: node, primitive, error: 0.0 })

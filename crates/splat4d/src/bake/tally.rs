@@ -1,7 +1,7 @@
 //! The primitives of the layers so far, and how they become nodes.
 
 use super::fit::Piece;
-use super::lookout::Lookout;
+use super::sampling::Lookout;
 use super::tree::Span;
 use super::{Errors, TOLERANCE};
 use crate::format::playback::{Node, Primitive, primitives};
@@ -67,14 +67,14 @@ pub(super) fn bounded(primitives: usize) -> Result<()> {
 }
 
 /// A layer of a playback file: pieces already, which stay as they are in their span. Their importance is not in the file.
-pub(super) fn page(layer: &Layer<f32>, lookout: &Lookout, tally: &mut Tally) -> Result<Option<Node>> {
+pub(super) fn page(layer: &Layer<f32>, sampling: &Lookout, tally: &mut Tally) -> Result<Option<Node>> {
     let mut all = primitives(layer);
     let before = all.len();
     all.retain(|p| is_sound(p) && p.opacity >= crate::layers::ALPHA_MIN as f32);
     for p in &mut all {
         let mut sizes = p.scales;
         sizes.sort_by(f32::total_cmp);
-        let pixels = lookout.pixels(p.mean) as f32;
+        let pixels = sampling.pixels(p.mean) as f32;
         let importance = p.opacity * sizes[2] * sizes[1] * pixels * pixels;
         p.importance = if importance.is_finite() { importance } else { 0.0 };
     }

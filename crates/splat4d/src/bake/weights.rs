@@ -5,8 +5,8 @@
 //! at some times stand for all. Of a camera that moves, each time has its own pose: a Gaussian counts when that camera sees it.
 //! What no render sees keeps a share of what its size and opacity would weigh alone, so that it is not lost for other views.
 
-use super::lookout::Lookout;
 use super::sample::GEOMETRY;
+use super::sampling::Lookout;
 use crate::layers::{Evaluation, Scene};
 use crate::math::sym3;
 use crate::render::{Importance, RenderConfig, Shot};
@@ -161,11 +161,11 @@ impl Weights {
     }
 
     /// The weight of row `row` of a layer that looks like `sample` where it is clearest.
-    pub(super) fn of(&self, layer: usize, row: usize, sample: &[f32], lookout: &Lookout) -> Weight {
+    pub(super) fn of(&self, layer: usize, row: usize, sample: &[f32], sampling: &Lookout) -> Weight {
         let v: [f64; GEOMETRY] = std::array::from_fn(|k| f64::from(sample[k]));
         let square = v[SPLAT_OPACITY] * v[SPLAT_OPACITY];
         let values = sym3::eigen([v[3], v[4], v[5], v[6], v[7], v[8]]).0;
-        let scale = lookout.pixels([v[0], v[1], v[2]]);
+        let scale = sampling.pixels([v[0], v[1], v[2]]);
         let pass = LOW_PASS / (scale * scale);
         let sizes = values.map(|s| s.max(0.0) + pass);
         let Seen { moment, energy: sum, color, still: [renders, still] } = self.seen[layer][row];

@@ -218,7 +218,7 @@ fn put(scene: &mut Scene<f32>, selected: &Selected, by: &Sim3) {
     for (_, index) in parts(selected) {
         let layer = &mut scene.layers[index];
         layer.frame = by.after(&layer.frame);
-        layer.absorb_frame();
+        layer.apply_transform();
     }
 }
 
@@ -339,7 +339,7 @@ fn merge(scene: &mut Scene<f32>, mut other: Scene<f32>, name: &str, at: Option<f
     for layer in &mut other.layers {
         layer.name = format!("{name}/{}", layer.name);
         layer.frame = to.after(&layer.frame);
-        layer.absorb_frame();
+        layer.apply_transform();
     }
     // Beyond its own clip nothing that moves is known.
     for own in [&mut *scene, &mut other] {

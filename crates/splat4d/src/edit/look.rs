@@ -47,7 +47,7 @@ struct LayerLooks {
 struct Looks(Vec<LayerLooks>);
 
 /// A time, the rows that are looked at then, and which of its looks it is for each.
-type Question<'a> = (Time, &'a (Vec<u32>, Vec<u8>));
+type Query<'a> = (Time, &'a (Vec<u32>, Vec<u8>));
 
 /// By layer and row: bit i stands for moment i of the row.
 type Bits = Vec<Vec<u8>>;
@@ -80,7 +80,7 @@ impl Looks {
                 }
             }
             let asked: Vec<_> = asked.into_iter().enumerate().filter(|(_, a)| !a.0.is_empty()).collect();
-            let questions: Vec<Question<'_>> = asked.iter().map(|(k, a)| (Time(time(*k)), a)).collect();
+            let questions: Vec<Query<'_>> = asked.iter().map(|(k, a)| (Time(time(*k)), a)).collect();
             LayerLooks::of(layer, expr, seen, count, &questions)
         };
         Self(scene.layers.iter().map(of).collect())
@@ -103,7 +103,7 @@ impl Looks {
 }
 
 impl LayerLooks {
-    fn of(layer: &Layer<f32>, expr: &Expr, seen: Vec<[f64; 2]>, count: Vec<u8>, questions: &[Question<'_>]) -> Self {
+    fn of(layer: &Layer<f32>, expr: &Expr, seen: Vec<[f64; 2]>, count: Vec<u8>, questions: &[Query<'_>]) -> Self {
         let wanted = |which: &dyn Fn(&Expr) -> bool| if expr.any(which) { LOOKS * count.len() } else { 0 };
         let none = f32::NAN;
         let mut out = Self {

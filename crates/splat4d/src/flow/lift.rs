@@ -24,7 +24,7 @@ pub fn lift_in_plane(camera: &Camera, pixel: [f64; 2], flow: [f64; 2], depth: f6
 
 /// One camera's observation of a point's motion.
 #[derive(Clone, Copy, Debug)]
-pub struct Sight<'a> {
+pub struct Observation<'a> {
     /// From where (pinhole, standing still).
     pub camera: &'a Camera,
     /// The point's flow in its image, pixels.
@@ -41,7 +41,7 @@ const SEEN: f64 = 1e-9;
 /// saw is zero.
 ///
 /// One camera sees 2, so that its answer lacks the motion along its ray. First order in s: exact for small motions.
-pub fn triangulate(x: [f64; 3], sights: &[Sight<'_>]) -> ([f64; 3], usize) {
+pub fn triangulate(x: [f64; 3], sights: &[Observation<'_>]) -> ([f64; 3], usize) {
     let (mut a, mut b) = ([0.0; 6], [0.0; 3]);
     for sight in sights {
         let p = sight.camera.cam_from_world.apply(x);
@@ -172,8 +172,8 @@ mod tests {
     fn three_cameras_see_all_of_a_motion_and_one_does_not() {
         let cameras = [camera(0.0), camera(70.0), camera(-50.0)];
         let (x, s) = ([0.2, 0.1, -0.3], [1e-5, -2e-5, 1.5e-5]);
-        let sights: Vec<Sight<'_>> =
-            cameras.iter().map(|camera| Sight { camera, flow: flow_of(camera, x, s), weight: 1.0 }).collect();
+        let sights: Vec<Observation<'_>> =
+            cameras.iter().map(|camera| Observation { camera, flow: flow_of(camera, x, s), weight: 1.0 }).collect();
         let (found, rank) = triangulate(x, &sights);
         assert!(rank == 3 && near(found, s, 1e-9), "{found:?}");
         let (alone, rank) = triangulate(x, &sights[..1]);

@@ -22,7 +22,8 @@ use super::limits::{GEOMETRY_WIDTH, THREADS};
 use super::upload::Upload;
 use super::{GpuRenderer, MOST_GROUPS};
 use crate::render::{
-    KEPT, KeptCameras, KeptLayer, KeptNumbers, KeptStep, KeptStepped, KeptTable, Moves, Resident, RowWeights,
+    KEPT, Moves, Resident, ResidentCameras, ResidentLayer, ResidentNumbers, ResidentStep, ResidentStepped,
+    ResidentTable, RowWeights,
 };
 use crate::scene::{BLOCK, LifeKind};
 use crate::{Error, ErrorKind, Result};
@@ -56,7 +57,7 @@ const VIEW_WORDS: usize = 8;
 
 /// The tables of one layer, or of a page of its rows.
 #[derive(Debug)]
-struct Kept {
+struct ResidentBuffers {
     /// Number of the layer, and of its first row here.
     layer: usize,
     first_row: usize,
@@ -75,8 +76,8 @@ struct Kept {
     ties: Option<Tied>,
 }
 
-impl Kept {
-    fn new(index: usize, layer: &KeptLayer<'_>, page: &Range<usize>) -> Self {
+impl ResidentBuffers {
+    fn new(index: usize, layer: &ResidentLayer<'_>, page: &Range<usize>) -> Self {
         Self {
             layer: index,
             first_row: page.start,
@@ -144,7 +145,7 @@ fn moments_width(width: usize) -> usize {
 pub(super) struct Tables {
     layers: usize,
     /// Page after page of layer after layer.
-    pages: Vec<Kept>,
+    pages: Vec<ResidentBuffers>,
     /// Geometry and SH of the pages, as they are drawn.
     upload: Upload,
     kernels: ResidentKernels,
@@ -176,7 +177,7 @@ impl Tables {
     pub(super) fn bytes(&self) -> u64 {
         let own = [&self.uniforms, &self.corrections, &self.staging, &self.status, self.cameras.buffer()];
         let own: u64 = own.iter().map(|b| b.bytes()).sum();
-        self.upload.bytes() + own + self.pages.iter().map(Kept::bytes).sum::<u64>()
+        self.upload.bytes() + own + self.pages.iter().map(ResidentBuffers::bytes).sum::<u64>()
     }
 
     /// What a step of so many views leaves in the status.
@@ -189,7 +190,7 @@ impl Tables {
             next += groups;
             first
         };
-        let groups = |l: &Kept| [l.groups() as usize, l.ties.as_ref().map_or(0, |t| t.groups() as usize)];
+        let groups = |l: &ResidentBuffers| [l.groups() as usize, l.ties.as_ref().map_or(0, |t| t.groups() as usize)];
         let sums = self.pages.iter().map(groups).map(|groups| groups.map(&mut place)).collect();
         Status { bad, alive, sums, words: next }
     }
@@ -213,7 +214,7 @@ impl Tables {
 
     /// Rows to splats.
     fn answer(&self, gpu: &Gpu, b: &Buffers, upload: &Upload, recorder: &mut Recorder<'_>) -> Result<()> {
-        let bind = |(i, page): (usize, &Kept)| {
+        let bind = |(i, page): (usize, &ResidentBuffers)| {
             let part = &upload.parts[i];
             let mut group = vec![self.ask(i), page.params.all(), part.geometry.all(), page.alive.all()];
             if matches!(page.moves, Moves::Sliced { .. }) {
@@ -260,7 +261,7 @@ fn cut<'a>(data: &'a [f32], width: usize, page: &Range<usize>) -> &'a [f32] {
 }
 
 /// The moments of a page of a table: zeros where it has not learnt.
-fn history<'a>(table: &KeptTable<'a>, page: &Range<usize>) -> Cow<'a, [f32]> {
+fn history<'a>(table: &ResidentTable<'a>, page: &Range<usize>) -> Cow<'a, [f32]> {
     let width = moments_width(table.width);
     match table.moments.is_empty() {
         true => Cow::Owned(vec![0.0; page.len() * width]),
@@ -285,13 +286,13 @@ fn send<T: bytemuck::NoUninit>(gpu: &Gpu, buffer: &mut Grown, data: &[T]) -> Res
 }
 
 /// One view of a step.
-struct KeptPass<'a> {
+struct ResidentPass<'a> {
     tables: &'a Tables,
     step: &'a Begun,
     view: usize,
 }
 
-impl KeptPass<'_> {
+impl ResidentPass<'_> {
     fn is_last(&self) -> bool {
         self.view + 1 == self.step.views.len()
     }
@@ -444,7 +445,7 @@ impl KeptPass<'_> {
         gpu: &Gpu,
         b: &Buffers,
         upload: &Upload,
-        (i, layer): (usize, &Kept),
+        (i, layer): (usize, &ResidentBuffers),
         words: &wgpu::BindingResource<'_>,
         runs: &mut Vec<Run>,
     ) {
@@ -521,8 +522,8 @@ impl GpuRenderer {
 impl Resident for GpuRenderer {
     fn keep(
         &mut self,
-        layers: &[KeptLayer<'_>],
-        cameras: Option<&KeptCameras<'_>>,
+        layers: &[ResidentLayer<'_>],
+        cameras: Option<&ResidentCameras<'_>>,
         corrections: &[[f32; 2]],
     ) -> Result<()> {
         self.for_training()?;
@@ -567,11 +568,11 @@ impl Resident for GpuRenderer {
         tables.pages.truncate(pages.len());
         for (at, (i, page)) in pages.into_iter().enumerate() {
             let layer = &layers[i];
-            let fresh = Kept::new(i, layer, &page);
+            let fresh = ResidentBuffers::new(i, layer, &page);
             if at == tables.pages.len() {
                 tables.pages.push(fresh);
             } else {
-                let Kept { layer, first_row, rows, moves, life, widths, .. } = fresh;
+                let ResidentBuffers { layer, first_row, rows, moves, life, widths, .. } = fresh;
                 let old = &mut tables.pages[at];
                 (old.layer, old.first_row, old.rows) = (layer, first_row, rows);
                 (old.moves, old.life, old.widths) = (moves, life, widths);
@@ -598,11 +599,11 @@ impl Resident for GpuRenderer {
         gpu.check()
     }
 
-    fn step(&mut self, step: &KeptStep<'_>) -> Result<Option<Vec<KeptStepped>>> {
+    fn step(&mut self, step: &ResidentStep<'_>) -> Result<Option<Vec<ResidentStepped>>> {
         self.begin(step)
     }
 
-    fn finish(&mut self) -> Result<Vec<KeptStepped>> {
+    fn finish(&mut self) -> Result<Vec<ResidentStepped>> {
         self.land_all()
     }
 
@@ -610,7 +611,7 @@ impl Resident for GpuRenderer {
         self.timings.stages().to_vec()
     }
 
-    fn fetch(&mut self, layer: usize) -> Result<KeptNumbers> {
+    fn fetch(&mut self, layer: usize) -> Result<ResidentNumbers> {
         let mut tables = self.resident.take().expect("tables are kept before they are fetched");
         let out = self.fetch_layer(&mut tables, layer);
         self.resident = Some(tables);
@@ -628,9 +629,9 @@ impl Resident for GpuRenderer {
 }
 
 impl GpuRenderer {
-    fn fetch_layer(&self, tables: &mut Tables, layer: usize) -> Result<KeptNumbers> {
+    fn fetch_layer(&self, tables: &mut Tables, layer: usize) -> Result<ResidentNumbers> {
         let Tables { pages, upload, staging, .. } = tables;
-        let mut out = KeptNumbers::default();
+        let mut out = ResidentNumbers::default();
         for (at, kept) in pages.iter().enumerate().filter(|(_, page)| page.layer == layer) {
             let padded = kept.rows.next_multiple_of(BLOCK);
             let [stride, moments_stride] = kept.strides();
@@ -652,7 +653,7 @@ impl GpuRenderer {
 }
 
 /// Rows of a page of a layer: whole blocks, as many as every one of its buffers has room for.
-fn page_rows(gpu: &Gpu, layer: &KeptLayer<'_>) -> usize {
+fn page_rows(gpu: &Gpu, layer: &ResidentLayer<'_>) -> usize {
     let small = layer.tables[..SH].iter();
     let [params, moments] = small.fold([0, 0], |[p, m], t| [p + t.width, m + moments_width(t.width)]);
     let widest = [params, moments, layer.tables[SH].width, moments_width(layer.tables[SH].width), GEOMETRY_WIDTH];

@@ -184,12 +184,12 @@ mod tests {
         for t in [1.3, 1.9, 2.5] {
             let value = |layer: &Layer<f64>, t: f64| {
                 let mut tape = LayerTape::default();
-                tape.ask(Space::Gaussians, Rows::All, Time(t));
+                tape.request(Space::Gaussians, Rows::All, Time(t));
                 layer.at(&Cache::default(), &mut tape);
                 (0..ROWS).map(|j| (1.0 + j as f64) * tape.out().get(j, SPLAT_OPACITY)).sum::<f64>()
             };
             let mut tape = LayerTape::default();
-            tape.ask(Space::Gaussians, Rows::All, Time(t));
+            tape.request(Space::Gaussians, Rows::All, Time(t));
             layer.at(&Cache::default(), &mut tape);
             let mut d_out = tape.out().zeros_like();
             (0..ROWS).for_each(|j| d_out.set(j, SPLAT_OPACITY, 1.0 + j as f64));

@@ -18,14 +18,14 @@ use crate::scene::{Grads, Rows, Space, SplatGrads, Splats, Table, Time};
 /// space and time. All memory is used again after [`begin`](Self::begin).
 #[derive(Debug, Default)]
 pub struct Evaluation<F: Real = f32> {
-    questions: Vec<Question<F>>,
-    spare: Vec<Question<F>>,
+    questions: Vec<Query<F>>,
+    spare: Vec<Query<F>>,
     /// By layer: what the motion model prepared, and the gradient to it.
     caches: Vec<(Cache, Cache)>,
 }
 
 #[derive(Debug, Default)]
-struct Question<F: Real> {
+struct Query<F: Real> {
     layer: usize,
     tape: LayerTape<F>,
     /// Whether the rows alive at that time are among those asked for.
@@ -42,8 +42,8 @@ impl<F: Real> Evaluation<F> {
     /// These rows of one layer at one time, answered.
     pub fn of_layer(layer: &Layer<F>, of: Space, rows: Rows<'_>, t: Time) -> Self {
         let mut out = Self::default();
-        out.ask(0, of, rows, t);
-        out.answer(std::slice::from_ref(layer));
+        out.request(0, of, rows, t);
+        out.evaluate(std::slice::from_ref(layer));
         out
     }
 
@@ -53,13 +53,13 @@ impl<F: Real> Evaluation<F> {
     }
 
     /// Asks for rows of a layer at a time, next to those that were asked for already. Returns the question's number.
-    pub fn ask(&mut self, layer: usize, of: Space, rows: Rows<'_>, t: Time) -> usize {
+    pub fn request(&mut self, layer: usize, of: Space, rows: Rows<'_>, t: Time) -> usize {
         match self.find(layer, of, t) {
             Some(i) => {
                 self.widen(i, rows);
                 i
             }
-            None => self.push(layer, |tape| tape.ask(of, rows, t)),
+            None => self.push(layer, |tape| tape.request(of, rows, t)),
         }
     }
 
@@ -83,13 +83,13 @@ impl<F: Real> Evaluation<F> {
 
     /// Asks for the rows of question i at another time. Returns the number of that question.
     pub fn ask_again(&mut self, i: usize, t: Time) -> usize {
-        let Question { layer, tape, .. } = &self.questions[i];
+        let Query { layer, tape, .. } = &self.questions[i];
         let (layer, of) = (*layer, tape.space());
         match tape.rows() {
-            Rows::All => self.ask(layer, of, Rows::All, t),
+            Rows::All => self.request(layer, of, Rows::All, t),
             Rows::Some(ids) => {
                 let ids = ids.to_vec();
-                self.ask(layer, of, Rows::Some(&ids), t)
+                self.request(layer, of, Rows::Some(&ids), t)
             }
         }
     }
@@ -107,16 +107,16 @@ impl<F: Real> Evaluation<F> {
         let tape = &mut self.questions[i].tape;
         match (tape.rows(), rows) {
             (Rows::All, _) => {}
-            (_, Rows::All) => tape.ask(tape.space(), Rows::All, tape.time()),
+            (_, Rows::All) => tape.request(tape.space(), Rows::All, tape.time()),
             (Rows::Some(a), Rows::Some(b)) => {
                 let both = union(a, b);
-                tape.ask(tape.space(), Rows::Some(&both), tape.time());
+                tape.request(tape.space(), Rows::Some(&both), tape.time());
             }
         }
     }
 
     /// Answers all questions: `prepare` once a layer, `at` once a question. Gradients begin again.
-    pub fn answer(&mut self, layers: &[Layer<F>]) {
+    pub fn evaluate(&mut self, layers: &[Layer<F>]) {
         self.caches.resize_with(layers.len(), Default::default);
         for (index, (layer, (cache, d_cache))) in layers.iter().zip(&mut self.caches).enumerate() {
             *d_cache = Cache::default();
@@ -199,7 +199,7 @@ impl<F: Real> Evaluation<F> {
         }
     }
 
-    /// The VJP of [`answer`](Self::answer): `backward` once a question, `finish` once a layer. Adds to `d`, one a layer.
+    /// The VJP of [`answer`](Self::evaluate): `backward` once a question, `finish` once a layer. Adds to `d`, one a layer.
     pub fn backward(&mut self, layers: &[Layer<F>], d: &mut [Grads<F>]) {
         assert_eq!(d.len(), layers.len(), "a gradient a layer is needed");
         for q in &mut self.questions {
@@ -216,12 +216,12 @@ impl<F: Real> Evaluation<F> {
 
     /// dL/dt of a time at which Gaussians were asked for, all layers together, after [`backward`](Self::backward).
     pub fn d_time(&self, t: Time) -> f64 {
-        let at_t = |q: &&Question<F>| q.tape.space() == Space::Gaussians && same(q.tape.time(), t);
+        let at_t = |q: &&Query<F>| q.tape.space() == Space::Gaussians && same(q.tape.time(), t);
         self.questions.iter().filter(at_t).map(|q| q.d_time).sum()
     }
 }
 
-impl<F: Real> Question<F> {
+impl<F: Real> Query<F> {
     /// Zeros, unless there is a gradient already.
     fn begin_gradient(&mut self) {
         if !self.begun {
@@ -239,7 +239,7 @@ pub fn sweep<F: Real>(layer: &Layer<F>, asked: &[(Rows<'_>, Time)], mut show: im
     let questions: Vec<At<'_, F>> = asked.iter().map(|&(rows, t)| At { p, of, rows, t }).collect();
     layer.motion.prepare(p, &questions, &mut cache);
     for (i, &(rows, t)) in asked.iter().enumerate() {
-        tape.ask(of, rows, t);
+        tape.request(of, rows, t);
         layer.at(&cache, &mut tape);
         show(i, &tape);
     }
@@ -250,7 +250,7 @@ fn same(a: Time, b: Time) -> bool {
     a == b || (a.0.is_nan() && b.0.is_nan())
 }
 
-fn of_layer<'a, F: Real>(questions: &'a [Question<F>], index: usize, layer: &'a Layer<F>) -> Vec<At<'a, F>> {
+fn of_layer<'a, F: Real>(questions: &'a [Query<F>], index: usize, layer: &'a Layer<F>) -> Vec<At<'a, F>> {
     questions.iter().filter(|q| q.layer == index).map(|q| q.tape.question(&layer.params)).collect()
 }
 

@@ -2,7 +2,7 @@
 //!
 //! With A = s R: μ' = A μ + t, Σ' = A Σ Aᵀ; opacity stays. Colours turn because the renderer takes the direction of view to
 //! the layer's axes ([`Part::layer_from_world`](crate::scene::Part)). Where a model's tables can take the frame in
-//! ([`Layer::absorb_frame`]), no numbers are lost by a decomposition.
+//! ([`Layer::apply_transform`]), no numbers are lost by a decomposition.
 
 use super::Layer;
 use crate::math::sh_rotation::{rotate_coefficients, sh_rotation};
@@ -104,24 +104,24 @@ fn congruence<F: Real>(a: &[[F; 3]; 3], m: [[F; 3]; 3]) -> [[F; 3]; 3] {
 }
 
 impl Layer<f32> {
-    /// The layer with its frame in its tables, as far as [`absorb_frame`](Self::absorb_frame) goes; itself where it has none.
+    /// The layer with its frame in its tables, as far as [`apply_transform`](Self::apply_transform) goes; itself where it has none.
     pub(crate) fn with_frame_absorbed(&self) -> Cow<'_, Self> {
         if self.frame.is_identity() {
             return Cow::Borrowed(self);
         }
         let mut own = self.clone();
-        own.absorb_frame();
+        own.apply_transform();
         Cow::Owned(own)
     }
 
     /// Writes the frame into the tables, after which it is the identity, where the motion model's can take it in
-    /// ([`Motion::absorb_frame`](crate::motion::Motion::absorb_frame)). Other layers (planes, grids, networks) keep theirs.
-    pub fn absorb_frame(&mut self) {
+    /// ([`Motion::apply_transform`](crate::motion::Motion::apply_transform)). Other layers (planes, grids, networks) keep theirs.
+    pub fn apply_transform(&mut self) {
         if self.frame.is_identity() {
             return;
         }
         let frame = self.frame;
-        if !self.motion.absorb_frame(&mut self.params, &frame) {
+        if !self.motion.apply_transform(&mut self.params, &frame) {
             return;
         }
         absorb_geometry(&mut self.params, &frame);

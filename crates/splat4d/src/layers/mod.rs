@@ -123,7 +123,7 @@ impl<F: Real> Default for LayerTape<F> {
 
 impl<F: Real> LayerTape<F> {
     /// A tape for the question (space, rows, time).
-    pub fn ask(&mut self, of: Space, rows: Rows<'_>, t: Time) {
+    pub fn request(&mut self, of: Space, rows: Rows<'_>, t: Time) {
         (self.of, self.t) = (of, t);
         self.ids.clear();
         match rows {
@@ -457,7 +457,7 @@ impl<F: Real> Scene<F> {
         for (index, layer) in self.layers.iter().enumerate() {
             evaluation.ask_active(index, layer, t);
         }
-        evaluation.answer(&self.layers);
+        evaluation.evaluate(&self.layers);
     }
 
     /// The splats that [`at`](Self::at) left in `evaluation`.

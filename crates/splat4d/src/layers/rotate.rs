@@ -36,11 +36,11 @@ pub fn rotation_between(from: [f64; 3], to: [f64; 3]) -> Option<[[f64; 3]; 3]> {
 
 impl Scene<f32> {
     /// Rotates everything by `r` (rows): the layers' frames, into the tables of models that can take them in
-    /// ([`Layer::absorb_frame`](super::Layer::absorb_frame)), the rays that a head sees, `up` and `offset`.
+    /// ([`Layer::apply_transform`](super::Layer::apply_transform)), the rays that a head sees, `up` and `offset`.
     pub fn rotate(&mut self, r: &[[f64; 3]; 3]) {
         for layer in &mut self.layers {
             layer.frame = Sim3::from_rotation(*r).after(&layer.frame);
-            layer.absorb_frame();
+            layer.apply_transform();
         }
         if let Some((layer, keys)) = self.head_keys() {
             rotate_head(&mut self.layers[layer].params, keys, r);

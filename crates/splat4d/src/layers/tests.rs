@@ -21,7 +21,7 @@ fn layer(spec: &Spec, life: LifeKind, rows: usize, seed: u64) -> Layer<f64> {
 
 fn loss(layer: &Layer<f64>, t: f64) -> f64 {
     let mut tape = LayerTape::default();
-    tape.ask(Space::Gaussians, Rows::Some(&[1, 4, 17]), Time(t));
+    tape.request(Space::Gaussians, Rows::Some(&[1, 4, 17]), Time(t));
     layer.at(&Cache::default(), &mut tape);
     (0..3).map(|j| (0..10).map(|c| weight(j, c) * tape.out().get(j, c)).sum::<f64>()).sum()
 }
@@ -53,7 +53,7 @@ fn every_parameter_and_time_against_finite_differences() {
         let base = layer(&spec, life, 20, 3);
         let detached = matches!(spec, Spec::Spacetime(s) if s.detach);
         let mut tape = LayerTape::default();
-        tape.ask(Space::Gaussians, Rows::Some(&[1, 4, 17]), Time(t));
+        tape.request(Space::Gaussians, Rows::Some(&[1, 4, 17]), Time(t));
         base.at(&Cache::default(), &mut tape);
         let mut d_out = tape.out().zeros_like();
         (0..3).for_each(|j| (0..10).for_each(|c| d_out.set(j, c, weight(j, c))));
@@ -90,7 +90,7 @@ fn detached_center_learns_from_opacity_alone() {
     let spec = Spec::Spacetime(SpacetimeSpec { order: 3, rotation: true, detach: true, origin: 0.0, features: None });
     let base = layer(&spec, LifeKind::GaussOne, 20, 3);
     let mut tape = LayerTape::default();
-    tape.ask(Space::Gaussians, Rows::All, Time(0.4));
+    tape.request(Space::Gaussians, Rows::All, Time(0.4));
     base.at(&Cache::default(), &mut tape);
     let mut d_out = tape.out().zeros_like();
     (0..20).for_each(|j| (0..9).for_each(|c| d_out.set(j, c, 1.0)));
@@ -107,13 +107,13 @@ fn zero_delta_is_the_base_pose_and_a_moving_frame_changes_nothing() {
     let mut l = layer(&spec, LifeKind::GaussHalf, 20, 5);
     let mut tape = LayerTape::default();
     let center = l.params[LIFE].get(7, 0);
-    tape.ask(Space::Gaussians, Rows::Some(&[7]), Time(center));
+    tape.request(Space::Gaussians, Rows::Some(&[7]), Time(center));
     l.at(&Cache::default(), &mut tape);
     let base = crate::motion::still::activate(l.params[GEOMETRY].read::<11>(7, 0));
     assert!((0..10).all(|c| (tape.out().get(0, c) - base[c]).abs() < 1e-15));
     // Galilean invariance: adding u to every velocity moves everything by u·(t − centre), and changes no shape.
     let before: Vec<f64> = {
-        tape.ask(Space::Gaussians, Rows::All, Time(0.9));
+        tape.request(Space::Gaussians, Rows::All, Time(0.9));
         l.at(&Cache::default(), &mut tape);
         tape.out().column_to_rows(0, 10)
     };

@@ -21,7 +21,7 @@ use super::still::Still;
 use super::{At, Cache, Capabilities, Model, Motion, Slot, Spec, Tape};
 use crate::math::{Real, Rng};
 use crate::nn::encoding::{MAX_LEVELS, encode, encode_backward, encoded};
-use crate::nn::{HashGrid, HashShape, InputGrad, Kept, Mlp, MlpShape, Passed};
+use crate::nn::{HashGrid, HashShape, InputGrad, LayerOutputs, Mlp, MlpShape, Passed};
 use crate::scene::{GEOMETRY, Grads, Key, Params, Space, SplatGrads, Table, Time};
 use crate::{Error, Result};
 use rayon::prelude::*;
@@ -142,8 +142,8 @@ struct Own<F> {
     shifts: Vec<Vec<F>>,
     /// γ(t̂), and what the shifts are made of.
     time: [Vec<F>; 2],
-    kept: Kept<F>,
-    time_kept: Kept<F>,
+    kept: LayerOutputs<F>,
+    time_kept: LayerOutputs<F>,
     /// [rows, heads]
     heads: Vec<F>,
     d_rows: Table<F>,
@@ -161,8 +161,8 @@ impl<F: Real> Default for Own<F> {
             points: Vec::new(),
             shifts: Vec::new(),
             time: [Vec::new(), Vec::new()],
-            kept: Kept::default(),
-            time_kept: Kept::default(),
+            kept: LayerOutputs::default(),
+            time_kept: LayerOutputs::default(),
             heads: Vec::new(),
             d_rows: Table::default(),
             d_heads: Vec::new(),
@@ -252,7 +252,7 @@ impl Deform {
 
     /// Says whether the networks learn: while they do not and move nothing, they are not evaluated (a static start costs what
     /// `still` costs).
-    pub fn let_learn<F: Real>(&self, p: &mut Params<F>, learns: bool) {
+    pub fn set_trainable<F: Real>(&self, p: &mut Params<F>, learns: bool) {
         let keys: Vec<Key> = self.trunk.keys().collect();
         for key in keys {
             p.info_mut(key).trainable = learns;
@@ -277,7 +277,7 @@ impl Deform {
     }
 
     /// Asks the network for every row of the question.
-    fn ask<F: Real>(&self, q: &At<'_, F>, own: &mut Own<F>) {
+    fn request<F: Real>(&self, q: &At<'_, F>, own: &mut Own<F>) {
         let (n, bounds, t) = (q.len(), self.bounds(q.p), F::of(self.unit_time(q.t).0));
         let geometry = &q.p[GEOMETRY];
         let place = |j: usize| bounds.unit(geometry.read::<3>(q.rows.id(j), 0));
@@ -334,7 +334,7 @@ impl Deform {
         self.trunk.forward_shifted(q.p, &own.x, &own.shifts, &mut own.heads, &mut own.kept);
     }
 
-    /// The VJP of [`ask`](Self::ask) from `own.d_heads`; returns dL/dt.
+    /// The VJP of [`ask`](Self::request) from `own.d_heads`; returns dL/dt.
     fn ask_backward<F: Real>(&self, q: &At<'_, F>, own: &mut Own<F>, d: &mut Grads<F>) -> f64 {
         let slope = self.unit_time(q.t).1;
         let Own { x, shifts, kept, d_heads, .. } = &*own;
@@ -390,11 +390,11 @@ impl<F: Real> Motion<F> for Deform {
         Spec::DeformMlp(self.spec.clone())
     }
 
-    /// Bytes of the trunk's inputs and outputs, each with its gradient; of the hidden layers what [`Kept`] keeps.
+    /// Bytes of the trunk's inputs and outputs, each with its gradient; of the hidden layers what [`LayerOutputs`] keeps.
     fn scratch_bytes(&self, _p: &Params<F>, rows: usize) -> u64 {
         let shape = self.trunk.shape();
         let number = size_of::<F>();
-        let hidden = (rows * shape.layers * shape.width * number).min(Kept::<F>::BYTES);
+        let hidden = (rows * shape.layers * shape.width * number).min(LayerOutputs::<F>::BYTES);
         (rows * 2 * (shape.inputs + shape.outputs) * number + hidden) as u64
     }
 
@@ -408,7 +408,7 @@ impl<F: Real> Motion<F> for Deform {
         own.moves = !rests;
         own.asked = !rests || self.trunk.keys().any(|k| q.p.info(k).trainable);
         if own.asked {
-            self.ask(q, own);
+            self.request(q, own);
         }
         if rests {
             Still.at(q, cache, tape);

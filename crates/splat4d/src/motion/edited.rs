@@ -594,10 +594,10 @@ impl<F: Real> Motion<F> for Edited<F> {
     }
 
     /// Places inside a path or a drag are not the world's: only what stands next to them can take a frame in.
-    fn absorb_frame(&self, p: &mut Params<F>, frame: &Sim3) -> bool {
+    fn apply_transform(&self, p: &mut Params<F>, frame: &Sim3) -> bool {
         match self.change {
             Change::Path { .. } | Change::Drag(_) => false,
-            _ => self.inner.absorb_frame(p, frame),
+            _ => self.inner.apply_transform(p, frame),
         }
     }
 

@@ -14,7 +14,7 @@ use super::still::{Still, activate_backward_lanes, activate_lanes};
 use super::{At, Cache, Capabilities, Model, Motion, Phase, Spec, Tape};
 use crate::math::{Real, Rng};
 use crate::nn::hexplane::{LANES, Lines, PlaneShape, Planes};
-use crate::nn::{InputGrad, Kept, Mlp, MlpShape, Passed};
+use crate::nn::{InputGrad, LayerOutputs, Mlp, MlpShape, Passed};
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::table::TableMut;
 use crate::scene::{BLOCK, Color, GEOMETRY, Grads, Params, Rows, SH, SplatGrads, Table};
@@ -246,9 +246,9 @@ struct Activations<F> {
     features: Vec<F>,
     /// ReLU(trunk), [n, W]
     hidden: Vec<F>,
-    trunk: Kept<F>,
-    heads: [Kept<F>; 4],
-    sh: Kept<F>,
+    trunk: LayerOutputs<F>,
+    heads: [LayerOutputs<F>; 4],
+    sh: LayerOutputs<F>,
 }
 
 /// Scratch of the backward, by chunk of rows: fresh memory every step would cost as much as the products.

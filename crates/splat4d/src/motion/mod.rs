@@ -194,7 +194,7 @@ pub trait Motion<F: Real = f32>: Any + Send + Sync {
 
     /// Takes a similarity into the model's own tables, as the layer takes it into geometry and colours. False: it cannot,
     /// and nothing has changed.
-    fn absorb_frame(&self, _p: &mut Params<F>, _frame: &Sim3) -> bool {
+    fn apply_transform(&self, _p: &mut Params<F>, _frame: &Sim3) -> bool {
         false
     }
 

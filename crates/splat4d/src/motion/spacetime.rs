@@ -174,7 +174,7 @@ impl<F: Real> Motion<F> for Spacetime {
         Spec::Spacetime(self.spec)
     }
 
-    fn absorb_frame(&self, p: &mut Params<F>, frame: &Sim3) -> bool {
+    fn apply_transform(&self, p: &mut Params<F>, frame: &Sim3) -> bool {
         let table = &mut p[self.velocities];
         for row in 0..table.rows() {
             for k in 0..self.spec.order {

@@ -31,7 +31,7 @@ impl<F: Real> Motion<F> for Still {
         Spec::Still
     }
 
-    fn absorb_frame(&self, _p: &mut Params<F>, _frame: &Sim3) -> bool {
+    fn apply_transform(&self, _p: &mut Params<F>, _frame: &Sim3) -> bool {
         true
     }
 

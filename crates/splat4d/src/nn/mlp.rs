@@ -88,15 +88,15 @@ pub struct Mlp {
     columns: Vec<String>,
 }
 
-/// Record of a forward pass for its backward: the hidden activations of as many rows as `Kept::BYTES` hold. The
+/// Record of a forward pass for its backward: the hidden activations of as many rows as `LayerOutputs::BYTES` hold. The
 /// others are computed again, to the same bits.
 #[derive(Clone, Debug, Default)]
-pub struct Kept<F> {
+pub struct LayerOutputs<F> {
     data: Vec<F>,
     chunks: usize,
 }
 
-impl<F> Kept<F> {
+impl<F> LayerOutputs<F> {
     /// Memory for activations: 65,000 rows of 8x256. Writing and reading them costs a fifth of computing them again.
     pub(crate) const BYTES: usize = 512 << 20;
 }
@@ -109,7 +109,7 @@ pub struct Passed<'a, F> {
     /// Its shifts; see `Mlp::forward_shifted`.
     pub shifts: &'a [Vec<F>],
     /// The activations that it kept, of the same input, shifts and weights; without them they are computed again.
-    pub kept: Option<&'a Kept<F>>,
+    pub kept: Option<&'a LayerOutputs<F>>,
 }
 
 impl<'a, F> Passed<'a, F> {
@@ -119,7 +119,7 @@ impl<'a, F> Passed<'a, F> {
     }
 
     /// A pass without shifts, of which activations were kept.
-    pub fn kept(x: &'a [F], kept: &'a Kept<F>) -> Self {
+    pub fn kept(x: &'a [F], kept: &'a LayerOutputs<F>) -> Self {
         Self { x, shifts: &[], kept: Some(kept) }
     }
 }
@@ -187,11 +187,11 @@ impl Mlp {
 
     /// x [n, inputs] → out [n, outputs], row-major. Panics: lengths that are not n rows.
     pub fn forward<F: Real>(&self, p: &Params<F>, x: &[F], out: &mut [F]) {
-        self.forward_keeping(p, x, out, &mut Kept { data: Vec::new(), chunks: usize::MAX });
+        self.forward_keeping(p, x, out, &mut LayerOutputs { data: Vec::new(), chunks: usize::MAX });
     }
 
     /// As [`forward`](Self::forward), and remembers activations for [`backward`](Self::backward).
-    pub fn forward_keeping<F: Real>(&self, p: &Params<F>, x: &[F], out: &mut [F], kept: &mut Kept<F>) {
+    pub fn forward_keeping<F: Real>(&self, p: &Params<F>, x: &[F], out: &mut [F], kept: &mut LayerOutputs<F>) {
         self.forward_shifted(p, x, &[], out, kept);
     }
 
@@ -203,7 +203,7 @@ impl Mlp {
         x: &[F],
         shifts: &[Vec<F>],
         out: &mut [F],
-        kept: &mut Kept<F>,
+        kept: &mut LayerOutputs<F>,
     ) {
         let n = self.rows(x, out);
         let biases = self.biases(p, shifts);
@@ -211,7 +211,7 @@ impl Mlp {
         // `forward` asks for nothing to be kept by a count that no pass can have.
         let wanted = if kept.chunks == usize::MAX { 0 } else { n.div_ceil(rows) };
         let per_chunk = rows * hidden;
-        kept.chunks = wanted.min(Kept::<F>::BYTES / size_of::<F>() / per_chunk.max(1));
+        kept.chunks = wanted.min(LayerOutputs::<F>::BYTES / size_of::<F>() / per_chunk.max(1));
         kept.data.resize((kept.chunks * per_chunk).min(n * hidden), F::ZERO);
         let mut stores: Vec<&mut [F]> = kept.data.chunks_mut(per_chunk.max(1)).take(kept.chunks).collect();
         stores.resize_with(n.div_ceil(rows), || &mut []);

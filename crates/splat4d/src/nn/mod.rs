@@ -16,4 +16,4 @@ mod tests;
 pub(crate) mod vector;
 
 pub use hashgrid::{HashGrid, HashShape};
-pub use mlp::{InputGrad, Kept, Mlp, MlpShape, Passed};
+pub use mlp::{InputGrad, LayerOutputs, Mlp, MlpShape, Passed};

@@ -39,8 +39,8 @@ pub use importance::{Importance, Sensitivity};
 pub use oracle::Oracle;
 pub use project::{Projected, ProjectedGrads, View};
 pub use resident::{
-    KEPT, KeptCameras, KeptLayer, KeptNoise, KeptNumbers, KeptRule, KeptStep, KeptStepped, KeptTable, KeptTies,
-    KeptView, Moves, Resident, RowWeights,
+    KEPT, Moves, Resident, ResidentCameras, ResidentLayer, ResidentNoise, ResidentNumbers, ResidentRule, ResidentStep,
+    ResidentStepped, ResidentTable, ResidentTies, ResidentView, RowWeights,
 };
 
 use crate::math::Real;

@@ -48,7 +48,7 @@ impl Moves {
 
 /// A table on the CPU, as [`Table::data`](crate::scene::Table::data) has it; nothing where a layer has no such table.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct KeptTable<'a> {
+pub struct ResidentTable<'a> {
     /// Columns.
     pub width: usize,
     /// Its numbers.
@@ -59,7 +59,7 @@ pub struct KeptTable<'a> {
 
 /// A layer on the CPU.
 #[derive(Clone, Copy, Debug)]
-pub struct KeptLayer<'a> {
+pub struct ResidentLayer<'a> {
     /// Gaussians.
     pub rows: usize,
     /// How they move.
@@ -67,17 +67,17 @@ pub struct KeptLayer<'a> {
     /// How they live.
     pub life: LifeKind,
     /// See [`KEPT`].
-    pub tables: [KeptTable<'a>; KEPT],
+    pub tables: [ResidentTable<'a>; KEPT],
     /// Sum of |dL/dmean2d|, number of views that drew it, largest radius: three columns.
     pub stats: &'a [f32],
     /// What the poses of a [`Moves::Posed`] layer are held by.
-    pub ties: Option<&'a KeptTies>,
+    pub ties: Option<&'a ResidentTies>,
 }
 
 /// The ties of a tracked frame's poses: rigidity, rotation and isometry along the edges of a graph, a floor below its points, and a
 /// background that stays where the geometry's own poses are. Weights are those of a point's or an edge's share in the loss.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct KeptTies {
+pub struct ResidentTies {
     /// Rows of the graph's points.
     pub points: Vec<u32>,
     /// Rows of the background.
@@ -121,7 +121,7 @@ pub struct RowWeights {
 
 /// Noise on the positions of the rows that are alive, after Adam (3DGS as MCMC).
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct KeptNoise {
+pub struct ResidentNoise {
     /// Times covariance times a standard normal vector times the gate.
     pub strength: f64,
     /// Opacity at which the gate is half open.
@@ -136,18 +136,18 @@ pub struct KeptNoise {
 
 /// The cameras' colour matrices, which learn with the tables.
 #[derive(Clone, Copy, Debug)]
-pub struct KeptCameras<'a> {
+pub struct ResidentCameras<'a> {
     /// Cameras.
     pub count: usize,
     /// A table of twelve columns a camera: its matrix without the identity, row by row, then an offset a channel.
-    pub table: KeptTable<'a>,
+    pub table: ResidentTable<'a>,
     /// Those whose mean is held at the identity.
     pub held: &'a [usize],
 }
 
 /// What one table learns by.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct KeptRule {
+pub struct ResidentRule {
     /// A rate a column; 0: frozen.
     pub rates: Vec<f64>,
     /// A column, and the least number in it.
@@ -156,7 +156,7 @@ pub struct KeptRule {
 
 /// One image of a step.
 #[derive(Clone, Copy, Debug)]
-pub struct KeptView<'a> {
+pub struct ResidentView<'a> {
     /// From where.
     pub camera: &'a Camera,
     /// When.
@@ -171,26 +171,26 @@ pub struct KeptView<'a> {
 
 /// All that a step is of.
 #[derive(Clone, Copy, Debug)]
-pub struct KeptStep<'a> {
+pub struct ResidentStep<'a> {
     /// Images, one after the other.
-    pub views: &'a [KeptView<'a>],
+    pub views: &'a [ResidentView<'a>],
     /// Highest degree of spherical harmonics.
     pub sh_degree: usize,
     /// Opacity times life from which on a row is alive.
     pub alpha_min: f64,
     /// By layer and table; none: it rests.
-    pub rules: &'a [[Option<KeptRule>; KEPT]],
+    pub rules: &'a [[Option<ResidentRule>; KEPT]],
     /// Losses on rows.
     pub rows: RowWeights,
     /// By layer.
-    pub noise: &'a [Option<KeptNoise>],
+    pub noise: &'a [Option<ResidentNoise>],
     /// Rate of the cameras' colour matrices; 0: they rest.
     pub cameras: f64,
 }
 
 /// The result of a step.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct KeptStepped {
+pub struct ResidentStepped {
     /// By view.
     pub comparisons: Vec<Comparison>,
     /// Losses on rows and ties of poses.
@@ -199,9 +199,9 @@ pub struct KeptStepped {
     pub bad: Option<[usize; 3]>,
 }
 
-/// The numbers of a layer, as [`KeptLayer`] has them.
+/// The numbers of a layer, as [`ResidentLayer`] has them.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct KeptNumbers {
+pub struct ResidentNumbers {
     /// Of the tables.
     pub params: [Vec<f32>; KEPT],
     /// Of their moments.
@@ -221,8 +221,8 @@ pub trait Resident {
     /// Errors: they are too large for the device, or it failed.
     fn keep(
         &mut self,
-        layers: &[KeptLayer<'_>],
-        cameras: Option<&KeptCameras<'_>>,
+        layers: &[ResidentLayer<'_>],
+        cameras: Option<&ResidentCameras<'_>>,
         corrections: &[[f32; 2]],
     ) -> Result<()>;
 
@@ -231,10 +231,10 @@ pub trait Resident {
     /// pixel of it counts, and nothing was begun.
     ///
     /// Errors: the device failed, and nothing kept is to be trusted. Panics: nothing is kept.
-    fn step(&mut self, step: &KeptStep<'_>) -> Result<Option<Vec<KeptStepped>>>;
+    fn step(&mut self, step: &ResidentStep<'_>) -> Result<Option<Vec<ResidentStepped>>>;
 
     /// The results of all steps that were begun, and not told yet. Errors: as of `step`.
-    fn finish(&mut self) -> Result<Vec<KeptStepped>>;
+    fn finish(&mut self) -> Result<Vec<ResidentStepped>>;
 
     /// Milliseconds of the stages of the last view that is done, by the device's own clock; 0 where it has none.
     fn stages(&self) -> Vec<(&'static str, f64)> {
@@ -242,7 +242,7 @@ pub trait Resident {
     }
 
     /// The numbers of a layer, with no step under way. Errors: the device failed. Panics: as of `step`.
-    fn fetch(&mut self, layer: usize) -> Result<KeptNumbers>;
+    fn fetch(&mut self, layer: usize) -> Result<ResidentNumbers>;
 
     /// The cameras' colour matrices and their moments, in the same way; nothing where none are kept. Errors: as of `fetch`.
     fn fetch_cameras(&mut self) -> Result<[Vec<f32>; 2]>;

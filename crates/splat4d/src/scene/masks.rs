@@ -80,7 +80,7 @@ impl KeyMasks {
     }
 
     /// Whether a row may be drawn at time t.
-    pub fn admits(&self, t: f64, row: usize) -> bool {
+    pub fn allows(&self, t: f64, row: usize) -> bool {
         let [l, r] = self.keys_at(t);
         self.get(l, row) || self.get(r, row)
     }
@@ -135,7 +135,7 @@ mod tests {
             m.retain(t, &mut ids);
             assert_eq!(ids, expected);
             // The union holds what each key holds.
-            assert!((0..77).all(|i| !m.get(keys[0], i) || m.admits(t, i)));
+            assert!((0..77).all(|i| !m.get(keys[0], i) || m.allows(t, i)));
         }
     }
 

@@ -76,7 +76,7 @@ fn dot(a: &Table<f64>, b: &Table<f64>) -> f64 {
 }
 
 impl Subject {
-    fn ask(&self, of: Space, rows: Rows<'_>, t: f64) -> (Cache, Tape<f64>) {
+    fn request(&self, of: Space, rows: Rows<'_>, t: f64) -> (Cache, Tape<f64>) {
         let q = At { p: &self.p, of, rows, t: Time(t) };
         let (mut cache, mut tape) = (Cache::default(), Tape::default());
         self.motion.prepare(&self.p, &[q], &mut cache);
@@ -86,7 +86,7 @@ impl Subject {
 
     /// The splats of a question.
     pub(crate) fn splats(&self, of: Space, rows: Rows<'_>, t: f64) -> Table<f64> {
-        self.ask(of, rows, t).1.out
+        self.request(of, rows, t).1.out
     }
 
     fn questions<'a>(&'a self, spaces: &[Space], rows: &'a [u32], times: &[f64]) -> Vec<At<'a, f64>> {

@@ -58,7 +58,7 @@ fn worst<F: Real>(a: &[F], b: &[F]) -> f64 {
 
 fn ask<F: Real>(layer: &Layer<F>, t: f64) -> (Cache, LayerTape<F>) {
     let (mut cache, mut tape) = (Cache::default(), LayerTape::default());
-    tape.ask(Space::Gaussians, Rows::All, Time(t));
+    tape.request(Space::Gaussians, Rows::All, Time(t));
     layer.motion.prepare(&layer.params, &[tape.question(&layer.params)], &mut cache);
     layer.at(&cache, &mut tape);
     (cache, tape)

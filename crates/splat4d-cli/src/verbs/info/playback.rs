@@ -12,12 +12,12 @@ const LISTED: usize = 24;
 const MOMENTS: usize = 5;
 
 /// The index in words and as JSON.
-pub(super) struct ToldIndex {
+pub(super) struct IndexSummary {
     pub text: String,
     pub json: Value,
 }
 
-pub(super) fn of_index(index: &Index) -> ToldIndex {
+pub(super) fn of_index(index: &Index) -> IndexSummary {
     let (meta, sections) = (&index.meta, &index.sections);
     let stored = |kind: Kind| sections.iter().filter(|e| e.kind == kind).map(|e| u64::from(e.stored)).sum::<u64>();
     let known: u64 = sections.iter().map(|e| u64::from(e.stored)).sum();
@@ -80,7 +80,7 @@ pub(super) fn of_index(index: &Index) -> ToldIndex {
         "moments": moments.iter().map(|m| json!({"time": m.time, "gaussians": m.gaussians, "pages": m.pages,
             "bytes": m.bytes})).collect::<Vec<_>>(),
     });
-    ToldIndex { text, json }
+    IndexSummary { text, json }
 }
 
 fn section(e: &Entry) -> Value {

@@ -6,7 +6,7 @@
 //! models", and Agisoft's description of the format.
 
 use super::{Convention, Export, Images, Said, Shot, only_points, take, without_pose};
-use crate::capture::{CaptureKind, CaptureOptions, Take, json, panorama, pose, rig};
+use crate::capture::{CaptureKind, CaptureOptions, RawCapture, json, panorama, pose, rig};
 use crate::text;
 use roxmltree::{Document, Node};
 use splat4d::math::{Se3, Sim3};
@@ -46,7 +46,7 @@ struct Optics {
     size: [usize; 2],
 }
 
-fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
+fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<RawCapture> {
     let bytes = json::read_bytes(marker)?;
     let text = text::decode(&bytes).unwrap_or_else(|_| String::from_utf8_lossy(&bytes));
     let text = text.trim_start_matches('\u{feff}');

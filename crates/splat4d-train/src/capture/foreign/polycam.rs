@@ -6,7 +6,7 @@
 
 use super::{Convention, Export, Said, Shot, only_points, take};
 use crate::capture::json::{self, Node};
-use crate::capture::{CaptureKind, CaptureOptions, DepthFile, DepthKind, Sequence, Take, pose, rig};
+use crate::capture::{CaptureKind, CaptureOptions, DepthFile, DepthKind, RawCapture, Sequence, pose, rig};
 use splat4d::scene::{Camera, Intrinsics, Lens};
 use splat4d::{Error, Result};
 use std::collections::BTreeMap;
@@ -41,7 +41,7 @@ fn camera_names(folder: &Path) -> Vec<String> {
     rig::file_names(folder).iter().filter_map(|n| n.strip_suffix(".json").map(str::to_owned)).collect()
 }
 
-fn read(root: &Path, folder: &Path, options: &CaptureOptions) -> Result<Take> {
+fn read(root: &Path, folder: &Path, options: &CaptureOptions) -> Result<RawCapture> {
     let [images, cameras] = pair(folder).ok_or_else(|| {
         Error::input("it has no images with cameras").at(folder.display()).remedy("Export the raw data again.")
     })?;

@@ -5,7 +5,7 @@
 //! Nerfstudio's documentation of its RealityCapture import describes them.
 
 use super::{Convention, Export, Images, Said, Shot, only_points, take};
-use crate::capture::{CaptureKind, CaptureOptions, Take, json, picture, pose, rig};
+use crate::capture::{CaptureKind, CaptureOptions, RawCapture, json, picture, pose, rig};
 use crate::text;
 use splat4d::math::se3::mat_mul;
 use splat4d::scene::{Camera, Intrinsics, Lens};
@@ -48,7 +48,7 @@ fn columns(line: &str) -> BTreeMap<String, usize> {
     line.split(separator(line)).enumerate().map(|(i, name)| (name.trim().trim_matches('"').to_lowercase(), i)).collect()
 }
 
-fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
+fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<RawCapture> {
     let bytes = json::read_bytes(marker)?;
     let text = text::decode(&bytes).unwrap_or_else(|_| String::from_utf8_lossy(&bytes));
     let place = |e: Error| e.at(marker.display());

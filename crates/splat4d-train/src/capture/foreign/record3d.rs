@@ -7,7 +7,7 @@
 
 use super::{Convention, Export, Said, Shot, only_points, take};
 use crate::capture::json::{self, Node};
-use crate::capture::{CaptureKind, CaptureOptions, DepthFile, DepthKind, Take, picture, pose, rig};
+use crate::capture::{CaptureKind, CaptureOptions, DepthFile, DepthKind, RawCapture, picture, pose, rig};
 use splat4d::math::quat;
 use splat4d::scene::{Camera, Intrinsics, Lens};
 use splat4d::{Error, Result};
@@ -35,7 +35,7 @@ fn is(path: &Path) -> bool {
         && json::read(path).is_ok_and(|v| v["poses"].is_array() && v["K"].is_array())
 }
 
-fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<Take> {
+fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<RawCapture> {
     let value = json::read(marker)?;
     let place = |e: Error| e.at(marker.display());
     let top = Node::root(&value);

@@ -2,7 +2,7 @@
 
 use super::super::account::{Account, Aspect, Severity};
 use super::super::frames::half_frame;
-use super::super::sequence::{Order, Timing};
+use super::super::sequence::{FrameOrder, Timing};
 use super::super::{CaptureOptions, Sequence, Times, pose, rig};
 use super::frame::Entry;
 use splat4d::math::Se3;
@@ -51,7 +51,7 @@ pub(super) fn told(
     options: &CaptureOptions,
     several: bool,
     account: &mut Account,
-) -> Option<(Order, f64)> {
+) -> Option<(FrameOrder, f64)> {
     let told: Option<Vec<f64>> = entries.iter().map(|e| e.time).collect();
     let Some(times) = told.filter(|t| !t.is_empty()) else {
         let without = entries.iter().filter(|e| e.time.is_none()).count();
@@ -72,7 +72,7 @@ pub(super) fn told(
     instants.dedup();
     let (cameras, of, named) = cameras(entries, &times);
     let reading = read(entries, (&times, &instants, &of), rate, options);
-    tell(&reading, &instants, rate, account);
+    report(&reading, &instants, rate, account);
     let start = instants.first().map_or(0.0, |first| first * reading.scale);
     let start = if start.abs() > FAR_CLOCK { start } else { 0.0 };
     if start != 0.0 {
@@ -83,7 +83,7 @@ pub(super) fn told(
     }
     let place = |(camera, &t): (usize, &f64)| (camera, nearest(&instants, t), t * reading.scale - start);
     let frames = of.into_iter().zip(&times).map(place).collect();
-    Some((Order { cameras, frames, named, timing: Timing::Told }, reading.fps))
+    Some((FrameOrder { cameras, frames, named, timing: Timing::Told }, reading.fps))
 }
 
 /// Whether a step is one frame at this rate.
@@ -170,7 +170,7 @@ fn read(
 }
 
 /// Says what times were read as, and how else they can be.
-fn tell(reading: &Reading, instants: &[f64], rate: Rate, account: &mut Account) {
+fn report(reading: &Reading, instants: &[f64], rate: Rate, account: &mut Account) {
     let [Some(first), Some(last)] = [instants.first(), instants.last()] else { return };
     if first == last {
         let what = format!("All times are {first}: the images show one instant, and nothing moves.");

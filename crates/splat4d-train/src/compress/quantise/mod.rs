@@ -10,10 +10,10 @@ mod state;
 mod tests;
 
 use crate::loss::terms::Codec;
-use crate::methods::spacetime::SpacetimeProgram;
-use crate::methods::{EVERY, Group, Plan, Program, Rate, RateSettings, SpacetimeSettings, Stage};
+use crate::maintenance::Strategy;
+use crate::methods::spacetime::SpacetimeMethod;
+use crate::methods::{EVERY, Group, Method, Rate, RateSettings, SpacetimeSettings, Stage, TrainContext};
 use crate::recipe::Recipe;
-use crate::upkeep::Strategy;
 use crate::{Error, Result};
 use rayon::prelude::*;
 use shared::Shared;
@@ -185,7 +185,13 @@ pub(crate) fn palette_rate(rates: &RateSettings, share: f64) -> Rate {
 
 /// A stage on the pages of a file, whatever model they were baked from: all groups of kinematic primitives with a life,
 /// in every layer. Its `start` is still to be told: it ends with [`Quantised::begin`].
-pub(crate) fn stage(recipe: &Recipe, plan: &Plan, iterations: usize, share: f64, codec: Arc<Quantised>) -> Stage {
+pub(crate) fn stage(
+    recipe: &Recipe,
+    plan: &TrainContext,
+    iterations: usize,
+    share: f64,
+    codec: Arc<Quantised>,
+) -> Stage {
     let rotates = recipe.program().is_ok_and(|p| p.capabilities(plan).rotates);
     let spacetime = SpacetimeSettings {
         order: 1,
@@ -193,13 +199,13 @@ pub(crate) fn stage(recipe: &Recipe, plan: &Plan, iterations: usize, share: f64,
         rotation_rate: recipe.spacetime.rotation_rate || rotates,
         ..recipe.spacetime.clone()
     };
-    let mut plan = Plan { iterations, ..plan.clone() };
+    let mut plan = TrainContext { iterations, ..plan.clone() };
     let c = &mut plan.common;
     c.life.kind = Some(LifeKind::Interval);
     c.densify.strategy = Strategy::None;
     c.appearance.sh_degree = 0;
     (c.loss.opacity_life, c.loss.velocity) = (0.0, 0.0);
-    let base = SpacetimeProgram { spacetime, guided: recipe.guided }.stages(&plan).remove(0);
+    let base = SpacetimeMethod { spacetime, guided: recipe.guided }.stages(&plan).remove(0);
     Stage {
         name: "quantised".into(),
         iterations,
@@ -209,7 +215,7 @@ pub(crate) fn stage(recipe: &Recipe, plan: &Plan, iterations: usize, share: f64,
         half_size_steps: 0,
         sh_interval: 0,
         // Rows that came or went would leave the file's labels behind.
-        upkeep: Vec::new(),
+        maintenance: Vec::new(),
         codec: Some(codec),
         ..base
     }

@@ -4,11 +4,11 @@
 use super::*;
 use crate::capture::frames::{Frames, Picture};
 use crate::loss::terms::StepInfo;
+use crate::maintenance::Limits;
 use crate::step::chain::{Chain, Losses, Step, View};
 use crate::step::loss::TrainLoss;
 use crate::step::tests::Made;
 use crate::step::trainer::{Settings, Trainer};
-use crate::upkeep::Limits;
 use splat4d::format::playback::{Draft, Node, Primitive, WriteConfig, read, read_pages, write, write_pages};
 use splat4d::math::Rng;
 use splat4d::render::{RenderConfig, Renderer};
@@ -270,7 +270,7 @@ fn tuning_makes_up_for_coarse_codes() {
     let floats = mean(&losses[losses.len() - 12..]);
     let codec = Quantised::new(coarse(), Rate { start: 5e-3, end: 5e-4 }).unwrap();
     let mut scene = Scene::default();
-    codec.begin(Pages { layers: plain.learner.into_scene().layers, ..pages }, &mut scene);
+    codec.begin(Pages { layers: plain.train_state.into_scene().layers, ..pages }, &mut scene);
     let mut t = trainer(scene, vec![tuning(200, Some(codec))]);
     let mut losses = Vec::new();
     while !t.is_done() {

@@ -121,9 +121,9 @@ fn a_recipe_lists_the_terms_that_have_a_weight() {
     let mut recipe = Recipe::default().with(|r| r.loss.depth = 0.0);
     let count = |r: &Recipe| terms(&r.loss).len();
     assert_eq!(count(&recipe), 1, "colours alone");
-    for knob in ["tv", "frequency", "mask", "mask_entropy", "depth_tv", "depth_normal", "depth", "flow", "tracks"] {
+    for setting in ["tv", "frequency", "mask", "mask_entropy", "depth_tv", "depth_normal", "depth", "flow", "tracks"] {
         let before = count(&recipe);
-        recipe.set(&format!("loss.{knob}=0.1")).unwrap();
-        assert_eq!(count(&recipe), before + 1, "{knob}");
+        recipe.set(&format!("loss.{setting}=0.1")).unwrap();
+        assert_eq!(count(&recipe), before + 1, "{setting}");
     }
 }

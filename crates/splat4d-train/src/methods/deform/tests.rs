@@ -2,14 +2,14 @@ use super::*;
 use crate::recipe::MotionName;
 use crate::recipe::Recipe;
 
-fn plan(settings: &[&str]) -> (DeformProgram, Plan) {
+fn plan(settings: &[&str]) -> (DeformMethod, TrainContext) {
     let mut recipe = Recipe::default().with(|r| {
         r.run.motion = MotionName::of("deform-mlp");
         r.run.iterations = 1000;
     });
     settings.iter().for_each(|s| recipe.set(s).unwrap());
-    let plan = Plan { extent: 2.0, clip: [0.0, 1.0], fps: 20.0, times: 21, fixed_cameras: 0, ..recipe.plan() };
-    (DeformProgram { deform: recipe.deform }, plan)
+    let plan = TrainContext { extent: 2.0, clip: [0.0, 1.0], fps: 20.0, times: 21, fixed_cameras: 0, ..recipe.plan() };
+    (DeformMethod { deform: recipe.deform }, plan)
 }
 
 fn stages(settings: &[&str]) -> Vec<Stage> {
@@ -28,7 +28,7 @@ fn two_stages_make_one_schedule() {
     assert_eq!(rate(&still, "deform_trunk.0.weight"), None, "the warm-up does not know the network");
     assert_eq!(rate(&moving, "deform_trunk.0.weight").unwrap().start, program.deform.lr_init);
     let mut whole = still::stage("x", &plan);
-    let last = |s: &mut Stage| s.upkeep.iter_mut().find_map(|u| u.densification().map(|e| e.last)).unwrap();
+    let last = |s: &mut Stage| s.maintenance.iter_mut().find_map(|u| u.densification().map(|e| e.last)).unwrap();
     assert_eq!(last(&mut moving) + 100, last(&mut whole));
     assert_eq!((still.half_size_steps, moving.half_size_steps), (300, 200));
     assert_eq!(stages(&["deform_warmup=0"]).len(), 1);
@@ -83,9 +83,9 @@ fn the_network_suits_the_cameras() {
 
 #[test]
 fn impossible_settings_are_refused_before_training() {
-    let check = |(program, plan): (DeformProgram, Plan)| program.check(&plan);
+    let check = |(program, plan): (DeformMethod, TrainContext)| program.check(&plan);
     let (program, many) = plan(&[]);
-    let single = Plan { times: 1, ..many };
+    let single = TrainContext { times: 1, ..many };
     assert!(program.check(&single).unwrap_err().to_string().contains("still"));
     let wide = plan(&["deform_width=100000"]);
     assert!(check(wide).unwrap_err().to_string().contains("deform_width"));

@@ -2,10 +2,10 @@
 //! and a scene on nodes learns.
 
 use super::*;
-use crate::learner::{Learner, Observation};
+use crate::maintenance::tests::context;
+use crate::maintenance::{AdaptNodes, At, Context, Maintenance, NodeSettings};
 use crate::methods::control::losses::{MaskSize, NodeAcceleration, NodeArap, NodeElastic, Sparse};
-use crate::upkeep::tests::context;
-use crate::upkeep::{AdaptNodes, At, Context, NodeSettings, Upkeep};
+use crate::train_state::{Observation, TrainState};
 use splat4d::layers::Evaluation;
 use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
 use splat4d::motion::skin::{Skin, SkinSpec};
@@ -110,15 +110,15 @@ fn nodes_are_added_where_gaussians_strain_and_removed_where_there_are_none() {
             if square < 0.09 { 1.0 } else { 0.0 }
         })
         .collect();
-    let mut learner = Learner::new(scene);
-    learner.stats_mut().observe(Observation { layer: 0, rows: Rows::All, mean2d: &mean2d, radii: &[1.0; 200] });
+    let mut train_state = TrainState::new(scene);
+    train_state.stats_mut().observe(Observation { layer: 0, rows: Rows::All, mean2d: &mean2d, radii: &[1.0; 200] });
     let settings = NodeSettings { bind_interval: 10, adapt_interval: 100, threshold: 0.2, cap: 21 };
     let mut adapt = AdaptNodes { settings, span: (100, 1000) };
     let at = |step: usize| At { step, steps: 2000 };
     assert!(adapt.due(&at(10)) && !adapt.due(&at(15)) && adapt.due(&at(500)));
     let limits = Limits { cap: 200, extent: 1.0, min_opacity: 0.0 };
-    adapt.run(&mut learner, &Context { at: at(100), ..context(limits, 0, 0) }).unwrap();
-    let (p, moments) = (&learner.scene().layers[0].params, learner.moments());
+    adapt.run(&mut train_state, &Context { at: at(100), ..context(limits, 0, 0) }).unwrap();
+    let (p, moments) = (&train_state.scene().layers[0].params, train_state.moments());
     assert!(skin.count(p) > 19 && skin.count(p) <= 21, "{} nodes", skin.count(p));
     assert!((0..skin.count(p)).all(|k| p[skin.nodes].get(k, 0) < 49.0), "a node without Gaussians stays");
     // The strongest strain comes first: the node that was born for it stands among its Gaussians.
@@ -129,8 +129,8 @@ fn nodes_are_added_where_gaussians_strain_and_removed_where_there_are_none() {
     assert!(moments[0].table(skin.nodes).read::<3>(19, 0) == [0.0; 3], "a new node starts without momentum");
     // Lists of nearest nodes are those of the new nodes.
     let list = p[skin.candidates].clone();
-    skin.bind(&mut learner.scene_mut().layers[0].params);
-    assert_eq!(list, learner.scene().layers[0].params[skin.candidates]);
+    skin.bind(&mut train_state.scene_mut().layers[0].params);
+    assert_eq!(list, train_state.scene().layers[0].params[skin.candidates]);
 }
 
 #[test]
@@ -152,7 +152,7 @@ fn a_scene_on_nodes_learns_with_every_trajectory() {
             batch: 4,
             groups: all,
             probes: vec![probe],
-            upkeep: vec![Box::new(AdaptNodes { settings, span: (20, 60) })],
+            maintenance: vec![Box::new(AdaptNodes { settings, span: (20, 60) })],
             ..Stage::new("nodes", 80)
         };
         let mut t = trainer(scene, vec![stage], 90);

@@ -2,8 +2,8 @@
 //! tables in which every number says from which row and column it came.
 
 use super::*;
-use crate::learner::{Learner, Stats};
 use crate::optim::Moments;
+use crate::train_state::{Stats, TrainState};
 use splat4d::scene::{Born, RowEdit};
 
 /// A number that names its row and column exactly in f32.
@@ -104,7 +104,7 @@ fn one_edit_moves_every_table_alike() {
         let rng = Rng::new(17, "edits", round);
         let rows = 20 + rng.below(50, 40);
         let (scene, moments, stats) = tagged(rows);
-        let mut learner = Learner::resumed(scene, moments, stats);
+        let mut train_state = TrainState::resumed(scene, moments, stats);
         // Several edits in a row, Gaussians and nodes in turn: where every row came from, and whether it is as old.
         let mut origin: Vec<Vec<(u32, bool)>> = [rows, 19].map(|n| (0..n as u32).map(|r| (r, true)).collect()).to_vec();
         for turn in 0..4 {
@@ -114,7 +114,7 @@ fn one_edit_moves_every_table_alike() {
             if edit.len() < 14 {
                 continue;
             }
-            learner.apply(0, &edit, &rng);
+            train_state.apply(0, &edit, &rng);
             origin[which] = edit
                 .parent
                 .iter()
@@ -122,7 +122,7 @@ fn one_edit_moves_every_table_alike() {
                 .map(|(&p, &b)| (origin[which][p as usize].0, b == Born::Kept && origin[which][p as usize].1))
                 .collect();
         }
-        let (scene, moments, stats) = (learner.scene(), learner.moments(), learner.stats());
+        let (scene, moments, stats) = (train_state.scene(), train_state.moments(), train_state.stats());
         let layer = &scene.layers[0];
         for key in layer.params.keys() {
             let info = layer.params.info(key);

@@ -148,7 +148,7 @@ fn rows_come_and_go_with_their_features() {
     assert_eq!((params[key].read::<6>(2, 0), params[key].read::<6>(7, 0)), (first, first));
     assert_eq!((params[key].rows(), &params[head.first]), (8, &weights));
     let mut tape = LayerTape::default();
-    tape.ask(Space::Gaussians, Rows::All, Time(0.1));
+    tape.request(Space::Gaussians, Rows::All, Time(0.1));
     scene.layers[0].at(&Cache::default(), &mut tape);
     assert_eq!(tape.out().rows(), 8);
 }

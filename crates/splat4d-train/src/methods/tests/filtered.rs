@@ -3,8 +3,8 @@
 
 use super::*;
 use crate::loss::transport::{Align, Metric, Transport, TransportConfig};
+use crate::maintenance::{At, Once};
 use crate::recipe::MotionName;
-use crate::upkeep::{At, Once};
 use splat4d::format::scene;
 use splat4d::motion::filtered::{Filtered, FilteredSpec, Fusion, GAINS, Predictor};
 use splat4d::scene::Rows;
@@ -168,8 +168,8 @@ fn it_is_switched_on_in_the_middle_of_a_stage_and_trains() {
     assert_falls(&losses, 0.8, "filtered");
 }
 
-pub(super) fn made_plan(recipe: &Recipe) -> Plan {
-    Plan { extent: 1.0, clip: [0.0, 0.3], fps: 20.0, times: 7, fixed_cameras: 3, ..recipe.plan() }
+pub(super) fn made_plan(recipe: &Recipe) -> TrainContext {
+    TrainContext { extent: 1.0, clip: [0.0, 0.3], fps: 20.0, times: 7, fixed_cameras: 3, ..recipe.plan() }
 }
 
 #[test]
@@ -192,8 +192,8 @@ fn a_recipe_wraps_any_program_and_leaves_no_trace() {
         assert_eq!((spec.fusion, spec.frame, spec.inner.name()), (Fusion::Off, 0.05, "spacetime"));
         let mut stages = program.stages(&plan);
         assert!(stages[0].groups.iter().any(|g| g.column == "velocities") && stages[0].probes.len() == 1);
-        stages[0].upkeep.retain(|u| u.once());
-        let due = |step: &usize| stages[0].upkeep.iter().any(|u| u.due(&At { step: *step, steps: 40 }));
+        stages[0].maintenance.retain(|u| u.once());
+        let due = |step: &usize| stages[0].maintenance.iter().any(|u| u.due(&At { step: *step, steps: 40 }));
         assert_eq!((0..40).filter(due).collect::<Vec<_>>(), [20]);
         let mut p = cloud::<f32>(40, LifeKind::GaussHalf, 4);
         let motion = build_as(&Spec::Filtered(spec), &mut p).unwrap();
@@ -221,8 +221,8 @@ fn a_recipe_wraps_any_program_and_leaves_no_trace() {
     }
     let early = recipe("filter=geodesic filter_start=0.25 filter.until=0.75");
     let mut early = early.program().unwrap().stages(&made_plan(&early));
-    early[0].upkeep.retain(|u| u.once());
-    let due = |step: &usize| early[0].upkeep.iter().any(|u| u.due(&At { step: *step, steps: 40 }));
+    early[0].maintenance.retain(|u| u.once());
+    let due = |step: &usize| early[0].maintenance.iter().any(|u| u.due(&At { step: *step, steps: 40 }));
     assert_eq!((0..40).filter(due).collect::<Vec<_>>(), [10, 30]);
     for bad in ["filter.until=0.1", "filter.until=0.5 filter_keep=true"] {
         let recipe = recipe(&format!("filter=geodesic {bad}"));
@@ -239,11 +239,11 @@ fn a_recipe_wraps_any_program_and_leaves_no_trace() {
 #[test]
 fn hooks_of_the_program_inside_see_its_own_model() {
     struct Hooked;
-    impl Program for Hooked {
-        fn spec(&self, _: &Plan) -> Spec {
+    impl Method for Hooked {
+        fn spec(&self, _: &TrainContext) -> Spec {
             inner()
         }
-        fn stages(&self, plan: &Plan) -> Vec<Stage> {
+        fn stages(&self, plan: &TrainContext) -> Vec<Stage> {
             let hook = || -> Option<Hook> {
                 Some(Box::new(|scene, _| {
                     assert_eq!(scene.layers[0].motion.spec(), inner(), "the filter is taken off");

@@ -4,10 +4,10 @@
 use super::*;
 use crate::init::Source;
 use crate::init::{self, Seeds};
+use crate::maintenance::Strategy;
 use crate::methods::stages;
 use crate::recipe::MotionName;
 use crate::recipe::Recipe;
-use crate::upkeep::Strategy;
 use splat4d::layers::Evaluation;
 use splat4d::math::Se3;
 use splat4d::math::se3::{dot, normalize, sub};
@@ -115,7 +115,7 @@ fn errors(motion: &str, life: &str) -> [f64; 2] {
     let party = Arc::new(Party::new());
     let recipe = recipe(motion, life);
     let clip = [0.0, (MOMENTS - 1) as f64 / FPS];
-    let plan = Plan {
+    let plan = TrainContext {
         extent: 4.4,
         center: [0.0; 3],
         clip,

@@ -1,14 +1,14 @@
 //! The stages of `hexplane`: what learns in which, and that they are one run.
 
 use super::*;
-use crate::methods::hexplane::HexplaneProgram;
+use crate::maintenance::Strategy;
+use crate::methods::hexplane::HexplaneMethod;
 use crate::recipe::MotionName;
 use crate::recipe::Recipe;
-use crate::upkeep::Strategy;
 use splat4d::nn::hexplane::PlaneShape;
 use std::ops::Range;
 
-fn plan() -> (HexplaneProgram, Plan) {
+fn plan() -> (HexplaneMethod, TrainContext) {
     let recipe = Recipe::default().with(|r| {
         r.run.motion = MotionName::of("hexplane");
         r.run.iterations = 150;
@@ -22,11 +22,11 @@ fn plan() -> (HexplaneProgram, Plan) {
         r.run.half_size_until = 0.0;
         r.rates.position_init = 5e-3;
     });
-    let plan = Plan { extent: 4.0, clip: [0.0, 0.2], fps: 10.0, times: 3, fixed_cameras: 4, ..recipe.plan() };
-    (HexplaneProgram { hexplane: recipe.hexplane }, plan)
+    let plan = TrainContext { extent: 4.0, clip: [0.0, 0.2], fps: 10.0, times: 3, fixed_cameras: 4, ..recipe.plan() };
+    (HexplaneMethod { hexplane: recipe.hexplane }, plan)
 }
 
-fn start((program, plan): &(HexplaneProgram, Plan)) -> Trainer<'static> {
+fn start((program, plan): &(HexplaneMethod, TrainContext)) -> Trainer<'static> {
     let mut p = cloud::<f32>(60, LifeKind::Infinite, 3);
     let motion = build_as(&program.spec(plan), &mut p).unwrap();
     trainer(one_layer(p, motion, LifeKind::Infinite), program.stages(plan), 60)
@@ -99,7 +99,7 @@ fn rates_and_densification_go_on_over_the_stages() {
     assert!(ends("hexplane.1.zt", program.hexplane.grid_lr_final));
     assert!(ends("hexplane.position.1.bias", program.hexplane.deformation_lr_final));
     let mut stages = stages;
-    let steps = stages.iter_mut().map(|s| s.upkeep.iter_mut().find_map(|u| u.densification().copied()).unwrap());
+    let steps = stages.iter_mut().map(|s| s.maintenance.iter_mut().find_map(|u| u.densification().copied()).unwrap());
     assert_eq!(steps.map(|e| (e.first, e.last)).collect::<Vec<_>>(), [(20, 40), (1, 50), (1, 10)]);
     program.hexplane.unlock_interval = 0;
     assert_eq!(program.stages(&plan).iter().map(|s| s.iterations).collect::<Vec<_>>(), [40, 110]);

@@ -1,8 +1,8 @@
 //! Two layers with different models, both densified under one cap over all layers.
 
 use super::*;
+use crate::maintenance::{Adc, AdcSettings, Every, Mcmc, McmcSettings, MortonOrder};
 use crate::optim::Noise;
-use crate::upkeep::{Adc, AdcSettings, Every, Mcmc, McmcSettings, MortonOrder};
 
 /// A function that adds a strategy to a stage.
 pub(super) type Strategy = fn(&mut Stage, Every);
@@ -61,7 +61,7 @@ fn every_layer_is_densified_under_one_cap() {
             for (layer, most) in t.scene().layers.iter().zip(&mut largest) {
                 *most = layer.params.len().max(*most);
             }
-            for (layer, moments) in t.scene().layers.iter().zip(t.learner.moments()) {
+            for (layer, moments) in t.scene().layers.iter().zip(t.train_state.moments()) {
                 let n = layer.params.len();
                 let ok = layer.params.keys().all(|k| layer.params[k].rows() == n && moments.table(k).rows() == n);
                 assert!(ok, "{name}: tables of a layer have one length");

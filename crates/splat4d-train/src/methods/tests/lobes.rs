@@ -122,7 +122,7 @@ pub(super) fn lobes_scene<F: Real>(rows: usize) -> (Scene<F>, Lobes) {
 fn shapes(scene: &Scene<f64>) -> Vec<[f64; 9]> {
     let layer = &scene.layers[0];
     let mut tape = splat4d::layers::LayerTape::default();
-    tape.ask(Space::Gaussians, splat4d::scene::Rows::All, Time(0.0));
+    tape.request(Space::Gaussians, splat4d::scene::Rows::All, Time(0.0));
     layer.at(&Cache::default(), &mut tape);
     (0..layer.params.len()).map(|r| tape.out().read::<9>(r, 0)).collect()
 }
@@ -171,7 +171,7 @@ fn lobes_learn_while_they_are_split_and_relocated() {
     for (name, densify) in layers::STRATEGIES {
         let mut stage =
             Stage { batch: 4, sampler: Sampler::Frame(1), groups: groups(&columns), ..Stage::new("lobes", 30) };
-        densify(&mut stage, crate::upkeep::Every { first: 5, last: 15, interval: 5 });
+        densify(&mut stage, crate::maintenance::Every { first: 5, last: 15, interval: 5 });
         let mut t = trainer(lobes_scene(60).0, vec![stage], 90);
         let losses = finish_stage(&mut t);
         assert_falls(&losses, 0.85, name);

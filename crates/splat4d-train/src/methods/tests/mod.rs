@@ -10,25 +10,25 @@ mod guests;
 mod hexplane;
 mod layers;
 mod lobes;
+mod maintenance;
 mod nodes;
 mod pruned;
 mod refine;
 mod scan;
 mod split;
 mod triple;
-mod upkeep;
 mod wrapper;
 
 use super::*;
 use crate::capture::frames::{Frames, Picture};
 use crate::loss::image::{ImageTerm, PictureGrads, Shown};
+use crate::maintenance::Limits;
 use crate::recipe::Recipe;
 use crate::recipe::parts::PROGRAMS;
 use crate::step::chain::{Chain, Losses, Step, StepInfo, StepReport, View};
 use crate::step::loss::TrainLoss;
 use crate::step::tests::Made;
 use crate::step::trainer::{Settings, Trainer};
-use crate::upkeep::Limits;
 use splat4d::layers::Layer;
 use splat4d::math::sh::MAX_DEGREE;
 use splat4d::math::{Real, Rng};
@@ -61,7 +61,7 @@ fn lasting_clouds_come_and_go_before_fixed_cameras() {
             r.run.motion = crate::recipe::MotionName::of(motion);
             change(r);
         });
-        let plan = Plan { fixed_cameras, ..filtered::made_plan(&recipe) };
+        let plan = TrainContext { fixed_cameras, ..filtered::made_plan(&recipe) };
         recipe.program().unwrap().life(&plan)
     };
     for motion in ["control", "ssm", "deform-mlp", "hexplane"] {
@@ -263,7 +263,7 @@ fn check_gradients(scene: &Scene<f64>, shots: &[Shot], probes: &Probes) -> Vec<V
                 let turned = |by: f64| {
                     let mut s = shots.to_vec();
                     let twist = std::array::from_fn(|j| if j == k { by } else { 0.0 });
-                    s[i].camera.cam_from_world = crate::learner::moved(&shot.camera.cam_from_world, twist);
+                    s[i].camera.cam_from_world = crate::train_state::moved(&shot.camera.cam_from_world, twist);
                     value(scene, &s, probes)
                 };
                 let fd = (turned(H) - turned(-H)) / (2.0 * H);

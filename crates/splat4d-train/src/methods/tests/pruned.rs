@@ -2,9 +2,9 @@
 
 use super::nodes::Skinned;
 use super::*;
-use crate::learner::Learner;
-use crate::upkeep::worth::{MaskConfig, ScoreConfig, Spatial, key_masks, prune, score};
-use crate::upkeep::{Prune, PruneSettings};
+use crate::maintenance::importance::{MaskConfig, ScoreConfig, Spatial, key_masks, prune, score};
+use crate::maintenance::{Prune, PruneSettings};
+use crate::train_state::TrainState;
 
 /// A deformation model whose nodes move between its two pages, and whose first ten Gaussians live for a moment.
 fn deformed(rows: usize) -> Scene<f32> {
@@ -36,9 +36,9 @@ fn a_deformation_model_is_scored_pruned_masked_and_trained_on() {
         s.layers[0].params[skin].read::<4>(row, 0)
     };
     let old = scene.clone();
-    let mut learner = Learner::new(scene);
-    learner.apply(0, &edits[0], &Rng::new(0, "prune", 0));
-    let mut scene = learner.into_scene();
+    let mut train_state = TrainState::new(scene);
+    train_state.apply(0, &edits[0], &Rng::new(0, "prune", 0));
+    let mut scene = train_state.into_scene();
     assert_eq!(scene.len(), 60);
     assert!(edits[0].parent.iter().all(|&p| p >= 10), "those of a moment go first");
     assert!((0..60).all(|r| weights(&scene, r) == weights(&old, edits[0].parent[r] as usize)), "the skin goes along");
@@ -51,7 +51,7 @@ fn a_deformation_model_is_scored_pruned_masked_and_trained_on() {
     scene.layers[0].active(Time(0.05), &mut active);
     assert!(active.len() > 30, "{} are drawn", active.len());
     let masks = scene.layers[0].masks.clone().expect("made above");
-    assert!((0..60).all(|r| masks.admits(0.05, r) == active.contains(&(r as u32))), "all of them live throughout");
+    assert!((0..60).all(|r| masks.allows(0.05, r) == active.contains(&(r as u32))), "all of them live throughout");
 
     let mut stage = Stage::new("tune", 40);
     stage.groups = groups(&ORDINARY);

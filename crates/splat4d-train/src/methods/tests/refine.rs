@@ -1,7 +1,7 @@
 //! What is learnt of cameras, through a whole step: the gradients that Adam gets against central differences.
 
 use super::*;
-use crate::learner::{Corrections, Origin, RefineSettings, Scale};
+use crate::train_state::{Corrections, Origin, RefineSettings, Scale};
 
 /// Half the step of the differences, a power of two: of numbers that are kept in f32 it makes exact neighbours.
 const NEAR: f32 = 1.0 / 65_536.0;

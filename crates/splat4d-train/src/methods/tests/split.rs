@@ -1,8 +1,8 @@
 //! The split into still and moving is asked for by a recipe, in the last stage of any program.
 
 use super::*;
+use crate::maintenance::At;
 use crate::recipe::MotionName;
-use crate::upkeep::At;
 
 #[test]
 fn the_last_stage_splits_where_it_is_asked_to() {
@@ -12,11 +12,12 @@ fn the_last_stage_splits_where_it_is_asked_to() {
             r.run.motion = MotionName::of(motion);
         });
         recipe.set(&format!("static_split={static_split}")).unwrap();
-        let plan = Plan { extent: 1.0, clip: [0.0, 1.0], fps: 30.0, times: 30, ..recipe.plan() };
+        let plan = TrainContext { extent: 1.0, clip: [0.0, 1.0], fps: 30.0, times: 30, ..recipe.plan() };
         let stages = stages(recipe.program().unwrap().as_ref(), &plan);
         let last = stages.last().unwrap();
         let shared = last.groups.iter().filter(|g| g.layer == EVERY).count();
-        let splits = |step: &usize| last.upkeep.iter().any(|u| u.once() && u.due(&At { step: *step, steps: 1000 }));
+        let splits =
+            |step: &usize| last.maintenance.iter().any(|u| u.once() && u.due(&At { step: *step, steps: 1000 }));
         ((0..1000).filter(splits).collect::<Vec<_>>(), shared)
     };
     assert_eq!(at(0.01, "spacetime"), (vec![750], 6));

@@ -87,7 +87,7 @@ fn probes_and_views_share_their_questions() {
 fn direct(scene: &Scene<f64>, rows: Option<&[u32]>) -> f64 {
     let seen = TIMES.map(|t| {
         let mut tape = LayerTape::default();
-        tape.ask(Space::Gaussians, rows.map_or(Rows::All, Rows::Some), Time(t));
+        tape.request(Space::Gaussians, rows.map_or(Rows::All, Rows::Some), Time(t));
         scene.layers[0].at(&Cache::default(), &mut tape);
         tape.out().clone()
     });

@@ -1,12 +1,12 @@
 use super::*;
 use crate::capture::frames::{Frames, Picture};
 use crate::event::Progress;
-use crate::learner::Exposure;
+use crate::maintenance::Limits;
+use crate::maintenance::Strategy;
 use crate::recipe::{MotionName, Recipe};
 use crate::step::loss::TrainLoss;
 use crate::step::trainer::{Settings, Trainer};
-use crate::upkeep::Limits;
-use crate::upkeep::Strategy;
+use crate::train_state::Exposure;
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::sh::rgb_to_dc;
 use splat4d::math::{Rng, Se3};
@@ -132,15 +132,15 @@ fn draw(s: &Scene<f32>, cameras: Vec<Camera>, frames: usize, masks: Option<usize
     Drawn { cameras, pictures }
 }
 
-fn plan(frames: usize, cameras: usize, masks: bool, knobs: &[&str]) -> (TrackedProgram, Plan) {
+fn plan(frames: usize, cameras: usize, masks: bool, settings: &[&str]) -> (TrackedMethod, TrainContext) {
     let mut recipe = Recipe::default().with(|r| {
         r.run.motion = MotionName::of("tracked");
         r.appearance.sh_degree = 0;
         r.run.half_size_until = 0.0;
     });
     recipe.densify.strategy = Strategy::None;
-    knobs.iter().for_each(|k| recipe.set(k).unwrap());
-    let plan = Plan {
+    settings.iter().for_each(|k| recipe.set(k).unwrap());
+    let plan = TrainContext {
         extent: 3.0,
         center: [0.0; 3],
         clip: [0.0, (frames - 1) as f64 / FPS],
@@ -151,12 +151,12 @@ fn plan(frames: usize, cameras: usize, masks: bool, knobs: &[&str]) -> (TrackedP
         masks,
         ..recipe.plan()
     };
-    (TrackedProgram { tracked: recipe.tracked }, plan)
+    (TrackedMethod { tracked: recipe.tracked }, plan)
 }
 
 fn trainer(
     s: Scene<f32>,
-    (program, plan): &(TrackedProgram, Plan),
+    (program, plan): &(TrackedMethod, TrainContext),
     frames: Arc<dyn Frames>,
     exposure: Option<Exposure>,
 ) -> Trainer<'static> {
@@ -170,7 +170,7 @@ fn trainer(
     let draw = Box::new(Renderer::new(RenderConfig::default()));
     let loss = TrainLoss::photometric(0.2);
     let mut trainer = Trainer::new(s, program.stages(plan), frames, draw, loss, settings);
-    trainer.learner.exposure = exposure;
+    trainer.train_state.exposure = exposure;
     trainer
 }
 
@@ -198,9 +198,9 @@ fn a_turning_ball_is_followed_and_without_ties_it_is_not() {
     let params = ball(260, 0);
     let world = truth(&params, 260, FRAMES, 3f64.to_radians());
     let frames: Arc<dyn Frames> = Arc::new(draw(&world, cameras(8, 40), FRAMES, None));
-    let track = |knobs: &[&str]| {
+    let track = |settings: &[&str]| {
         let steps = ["iterations=476", "first_share=0.002", "track_lr_init=1e-3", "track_lr_final=3e-4"];
-        let plan = plan(FRAMES, 8, false, &[&steps, knobs].concat());
+        let plan = plan(FRAMES, 8, false, &[&steps, settings].concat());
         let mut t = trainer(scene(params.clone(), &first_frame(false)), &plan, frames.clone(), None);
         // Frame 0 is known: what is measured is the tracking.
         t.stages[0].groups.clear();
@@ -237,8 +237,8 @@ fn masks_identify_static_parts_which_stay() {
     let params = ball(200, 60);
     let world = truth(&params, 200, 3, 0.05);
     let frames: Arc<dyn Frames> = Arc::new(draw(&world, cameras(8, 32), 3, Some(200)));
-    let knobs = ["iterations=200", "first_share=0.5", "position_lr_init=1e-6", "position_lr_final=1e-6"];
-    let plan = plan(3, 8, true, &knobs);
+    let settings = ["iterations=200", "first_share=0.5", "position_lr_init=1e-6", "position_lr_final=1e-6"];
+    let plan = plan(3, 8, true, &settings);
     let mut t = trainer(scene(params, &first_frame(true)), &plan, frames, None);
     while t.progress.stage == 0 {
         t.step().unwrap().expect("no fault");
@@ -275,7 +275,7 @@ fn only_the_newest_page_learns_and_memory_does_not_grow() {
         while t.progress.stage == stage && !t.is_done() {
             t.step().unwrap().expect("no fault");
             if t.progress.stage_step == 3 {
-                sizes.push(t.learner.moments()[0].bytes());
+                sizes.push(t.train_state.moments()[0].bytes());
             }
         }
         let after = &t.scene().layers[0].params;
@@ -299,13 +299,13 @@ fn exposures_are_learnt_on_frame_0_and_kept() {
         let [m, c] = known[i % 4];
         picture.color.data.iter_mut().for_each(|x| *x = *x * (1.0 + m) + c);
     }
-    let knobs = ["iterations=1200", "first_share=0.95", "exposure=true", "exposure_lr=1e-3"];
-    let plan = plan(2, 4, false, &knobs);
+    let settings = ["iterations=1200", "first_share=0.95", "exposure=true", "exposure_lr=1e-3"];
+    let plan = plan(2, 4, false, &settings);
     let exposure = Exposure::new(4, vec![0, 1, 2, 3]);
     let mut t = trainer(scene(params, &first_frame(false)), &plan, Arc::new(frames), Some(exposure));
     t.stages[0].groups.clear();
     let learnt = |t: &Trainer<'_>| {
-        let e = t.learner.exposure.as_ref().unwrap();
+        let e = t.train_state.exposure.as_ref().unwrap();
         (0..4).map(|c| e.params[e.key()].read::<12>(c, 0)).collect::<Vec<_>>()
     };
     while t.progress.stage == 0 {
@@ -335,7 +335,7 @@ fn tuning_looks_at_every_frame_and_moves_every_page() {
         assert!(learns(&page_name("means", k)) && learns(&page_name("quats", k)), "page {k} rests");
     }
     assert!(learns("means") && learns("sh") && !learns(FOREGROUND));
-    assert!(stage.start.is_none() && stage.end.is_none() && stage.upkeep.is_empty());
+    assert!(stage.start.is_none() && stage.end.is_none() && stage.maintenance.is_empty());
 }
 
 #[test]
@@ -350,8 +350,8 @@ fn captures_that_cannot_be_tracked_are_refused_with_those_that_can() {
         let text = program.check(&bad).unwrap_err().to_string();
         assert!(text.contains("3 fixed, synchronised cameras") && text.contains("spacetime, deform-mlp"), "{text}");
     }
-    let with = |knob: &str| {
-        let (program, plan) = plan(5, 4, false, &[knob]);
+    let with = |setting: &str| {
+        let (program, plan) = plan(5, 4, false, &[setting]);
         program.check(&plan)
     };
     assert!(with("floor_height=-0.3").is_ok());
@@ -369,6 +369,6 @@ fn steps_are_shared_out_and_every_frame_has_its_stage() {
         let later: Vec<usize> = stages[1..].iter().map(|s| s.iterations).collect();
         let (low, high) = (later.iter().min().copied(), later.iter().max().copied());
         assert!(high.unwrap_or(0) - low.unwrap_or(0) <= 1, "{later:?}");
-        assert!(stages[1..].iter().all(|s| s.upkeep.is_empty() && s.params.len() == 1));
+        assert!(stages[1..].iter().all(|s| s.maintenance.is_empty() && s.params.len() == 1));
     }
 }

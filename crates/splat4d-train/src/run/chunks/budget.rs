@@ -31,7 +31,7 @@ const JOIN: f64 = 0.1;
 
 /// A take in chunks before it is begun.
 #[derive(Clone, Debug)]
-pub struct Outlook {
+pub struct ChunkEstimate {
     /// The recipe, with the motion model and the steps that are chosen.
     pub recipe: Recipe,
     /// Even cuts.
@@ -66,7 +66,7 @@ impl Pacing {
     }
 }
 
-impl Outlook {
+impl ChunkEstimate {
     /// Looks at a take as `train` would before its first step, of which at least [`look_ahead`](super::look_ahead) is listed.
     /// Within `minutes`, if there are any, from the start of `clock` on, and within the recipe's memory limit. What the caller
     /// does after training takes as long as `finish` steps at its end. `timed`: steps are timed even without `minutes`.

@@ -15,7 +15,7 @@ mod tests;
 mod tie;
 mod train;
 
-pub use budget::{Outlook, Pacing};
+pub use budget::{ChunkEstimate, Pacing};
 pub use join::{Joined, Seams};
 pub use plan::ChunkPlan;
 

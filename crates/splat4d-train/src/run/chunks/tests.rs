@@ -200,7 +200,8 @@ fn the_parts_end_on_time_on_a_machine_that_is_slower_than_it_was_timed() {
     let trained = |name: &str, paced: bool| {
         let clock = ticking(4e-3);
         let capture = place.open(&recipe);
-        let outlook = Outlook::new(&capture, &recipe, Some(minutes), 0.0, false, &clock, &mut |_| {}).unwrap().unwrap();
+        let outlook =
+            ChunkEstimate::new(&capture, &recipe, Some(minutes), 0.0, false, &clock, &mut |_| {}).unwrap().unwrap();
         let begun = Chunked::begin(&capture, &outlook.recipe, &place.run(name), &mut |_| {}).unwrap().unwrap();
         let run = begun.paced(outlook.pacing.filter(|_| paced));
         let options = TrainOptions { clock: clock.clone(), ..TrainOptions::default() };
@@ -236,7 +237,7 @@ fn a_plan_keeps_to_its_memory_and_its_minutes() {
     let place = Place::of(MOMENTS);
     let outlook = |changes: &[&str], minutes: Option<f64>| {
         let recipe = of_chunks(changes);
-        Outlook::new(&place.open(&recipe), &recipe, minutes, 0.0, false, &ticking(1e-3), &mut |_| {})
+        ChunkEstimate::new(&place.open(&recipe), &recipe, minutes, 0.0, false, &ticking(1e-3), &mut |_| {})
     };
     let free = outlook(&["max_cap=20000"], None).unwrap().unwrap();
     let limit = free.memory - (4 << 20);
@@ -251,7 +252,8 @@ fn a_plan_keeps_to_its_memory_and_its_minutes() {
     assert!(steps[1].seconds.unwrap() <= 60.0 * 0.2);
     // What follows training takes its steps from it.
     let recipe = of_chunks(&[]);
-    let finish = Outlook::new(&place.open(&recipe), &recipe, Some(0.2), 2000.0, false, &ticking(1e-3), &mut |_| {});
+    let finish =
+        ChunkEstimate::new(&place.open(&recipe), &recipe, Some(0.2), 2000.0, false, &ticking(1e-3), &mut |_| {});
     assert!(finish.unwrap().unwrap().recipe.run.iterations < steps[1].recipe.run.iterations);
     assert!(outlook(&["chunks.frames=20"], None).unwrap().is_none(), "it is learnt at once");
 }

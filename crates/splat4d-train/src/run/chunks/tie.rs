@@ -2,10 +2,10 @@
 
 use super::shared::read_file;
 use crate::Result;
-use crate::learner::Exposure;
 use crate::loss::image::{ImageTerm, PictureGrads, Shown, View};
 use crate::loss::terms::StepInfo;
 use crate::run::identity::file_print;
+use crate::train_state::Exposure;
 use splat4d::device;
 use splat4d::format::scene;
 use splat4d::layers::{Evaluation, Scene};

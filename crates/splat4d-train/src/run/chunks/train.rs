@@ -7,7 +7,7 @@ use crate::Result;
 use crate::capture::Capture;
 use crate::event::Event;
 use crate::init::Seeds;
-use crate::methods::{Plan, stages};
+use crate::methods::{TrainContext, stages};
 use crate::recipe::Recipe;
 use crate::run::checkpoint;
 use crate::run::flows;
@@ -111,7 +111,7 @@ fn neighbours(chunked: &Chunked, chunk: usize, capture: &Capture) -> Result<Vec<
 fn first_scene(
     opened: &OpenCapture,
     recipe: &Recipe,
-    plan: &Plan,
+    plan: &TrainContext,
     shared: &Shared,
     neighbours: &[Neighbour],
 ) -> Result<Scene<f32>> {

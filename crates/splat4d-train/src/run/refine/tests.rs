@@ -5,7 +5,7 @@ use super::*;
 use crate::ErrorKind;
 use crate::compress::quantise::{self, Quantised};
 use crate::loss::terms::{Codec, ParamLoss, StepInfo};
-use crate::methods::{Plan, Rate};
+use crate::methods::{Rate, TrainContext};
 use crate::run::tests::{Place, copy_folder, recipe};
 use crate::run::{plan, training_frames};
 use splat4d::bake::{self, bake};
@@ -41,7 +41,7 @@ impl<F: Fn(&mut [Grads<f32>]) + Send + Sync> ParamLoss<f32> for Meddle<F> {
 struct Bed {
     place: Place,
     recipe: Recipe,
-    plan: Plan,
+    plan: TrainContext,
     frames: Arc<Dataset>,
     source: Scene<f32>,
 }
@@ -80,7 +80,7 @@ impl Bed {
             name: "pruned".into(),
             iterations: FLOATS,
             groups: quantise::tuned(base.groups.clone(), 0.5),
-            upkeep: Vec::new(),
+            maintenance: Vec::new(),
             noise: None,
             half_size_steps: 0,
             start: Some(Box::new(move |scene, progress| {

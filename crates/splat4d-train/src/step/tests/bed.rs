@@ -1,13 +1,13 @@
 //! Short training in memory, on the tiny capture of the tests of runs.
 
 use crate::init::{self, Seeds};
+use crate::maintenance::Change;
 use crate::recipe::Recipe;
 use crate::run::checkpoint::{self, Identity, RunState};
 use crate::run::dataset::Dataset;
 use crate::run::tests::{Place, recipe};
 use crate::run::{OpenCapture, training_frames};
 use crate::step::trainer::Trainer;
-use crate::upkeep::Change;
 use splat4d::device::Device;
 use splat4d::format::scene;
 use splat4d::layers::{Evaluation, Scene};
@@ -54,7 +54,7 @@ impl Ran {
 }
 
 /// The recipe with the changes in a line of `key=value`.
-pub(super) fn knobs(line: &str) -> Recipe {
+pub(super) fn settings(line: &str) -> Recipe {
     let changes: Vec<&str> = ["densify_grad_threshold=1e-5"].into_iter().chain(line.split_whitespace()).collect();
     recipe(&changes).resolve()
 }
@@ -115,7 +115,7 @@ impl Bed {
 
     /// Trains to the end, and calls `look` after every step.
     pub(super) fn watch(&self, line: &str, mut look: impl FnMut(&Trainer<'static>, Change)) -> Ran {
-        let mut trainer = self.start(&knobs(line));
+        let mut trainer = self.start(&settings(line));
         let (mut mse, mut rows, mut change) = (Vec::new(), Vec::new(), Change::default());
         while !trainer.is_done() {
             let step = trainer.step().unwrap().unwrap_or_else(|fault| panic!("{line}: {}", fault.0));

@@ -1,7 +1,7 @@
 //! Training with a GPU that draws, against the CPU alone; on any driver, that of a CPU too. Without one each test prints
 //! "skipped"; with REQUIRE_GPU=1 that is a failure.
 
-use super::bed::{Bed, bytes, knobs, saved};
+use super::bed::{Bed, bytes, saved, settings};
 use crate::recipe::Recipe;
 use crate::step::trainer::Trainer;
 use splat4d::device::Device;
@@ -65,7 +65,7 @@ fn every_model_learns_as_on_the_cpu() {
     let bed = Bed::new();
     let mut troubles = Vec::new();
     for (line, most) in MODELS {
-        let recipe = knobs(line);
+        let recipe = settings(line);
         let Some(mut trainer) = on_gpu(&bed, &recipe) else { return };
         let mut cpu = bed.start(&recipe);
         let ((mse, notices), (expected, _)) = (finish(&mut trainer, line), finish(&mut cpu, line));
@@ -91,7 +91,7 @@ fn every_model_learns_as_on_the_cpu() {
 #[test]
 fn a_run_on_a_gpu_repeats_and_resumes_bit_for_bit() {
     let bed = Bed::new();
-    let recipe = knobs("motion=spacetime strategy=mcmc refine.poses=true batch_size=2");
+    let recipe = settings("motion=spacetime strategy=mcmc refine.poses=true batch_size=2");
     let Some(mut trainer) = on_gpu(&bed, &recipe) else { return };
     let mut checkpoints = Vec::new();
     while !trainer.is_done() {
@@ -119,7 +119,7 @@ fn a_run_on_a_gpu_repeats_and_resumes_bit_for_bit() {
 #[test]
 fn unsupported_channels_render_on_the_cpu_and_are_reported_once() {
     let bed = Bed::new();
-    let recipe = knobs("motion=spacetime features=full iterations=6");
+    let recipe = settings("motion=spacetime features=full iterations=6");
     let Some(mut trainer) = on_gpu(&bed, &recipe) else { return };
     let mut cpu = bed.start(&recipe);
     let (mse, notices) = finish(&mut trainer, "a pixel head");
@@ -131,7 +131,7 @@ fn unsupported_channels_render_on_the_cpu_and_are_reported_once() {
 #[test]
 fn further_loss_terms_run_on_the_cpu_and_are_reported_once() {
     let bed = Bed::new();
-    let recipe = knobs("motion=spacetime strategy=none loss.tv=0.1 iterations=8");
+    let recipe = settings("motion=spacetime strategy=none loss.tv=0.1 iterations=8");
     let Some(mut trainer) = on_gpu(&bed, &recipe) else { return };
     let mut cpu = bed.start(&recipe);
     let (mse, notices) = finish(&mut trainer, "total variation");

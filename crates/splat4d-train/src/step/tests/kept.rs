@@ -2,20 +2,20 @@
 //! poses, losses on rows and
 //! noise on positions. The camera looks away, so that a step has no other gradient.
 
-use crate::learner::Learner;
 use crate::loss::graph::Weigh;
 use crate::loss::scene::{MeanOpacity, MeanScale, OpacityEntropy};
-use crate::loss::terms::{KeptLoss, ParamLoss, StepInfo};
+use crate::loss::terms::{ParamLoss, ResidentLoss, StepInfo};
 use crate::loss::tracked::{Ties, Tracking, Weights};
 use crate::optim::{Noise, corrections};
+use crate::train_state::TrainState;
 use splat4d::device::{self, Device};
 use splat4d::layers::{Layer, Scene};
 use splat4d::math::{Rng, Se3};
 use splat4d::motion::tracked::{FOREGROUND, POSE, TrackedSpec, page_of};
 use splat4d::motion::{Spec, build};
 use splat4d::render::{
-    KEPT, KeptLayer, KeptNoise, KeptNumbers, KeptRule, KeptStep, KeptStepped, KeptTable, KeptTies, KeptView, Moves,
-    RenderConfig, RowWeights, Target,
+    KEPT, Moves, RenderConfig, ResidentLayer, ResidentNoise, ResidentNumbers, ResidentRule, ResidentStep,
+    ResidentStepped, ResidentTable, ResidentTies, ResidentView, RowWeights, Target,
 };
 use splat4d::scene::params::OPACITY;
 use splat4d::scene::{Camera, GEOMETRY, Grads, Key, LifeKind, Params, Planes, Rows, SH, Space, Time};
@@ -54,10 +54,10 @@ fn scene() -> Scene<f32> {
 fn step(
     scene: &Scene<f32>,
     rate: f64,
-    ties: Option<&KeptTies>,
+    ties: Option<&ResidentTies>,
     rows: RowWeights,
-    noise: Option<KeptNoise>,
-) -> Option<(KeptStepped, KeptNumbers)> {
+    noise: Option<ResidentNoise>,
+) -> Option<(ResidentStepped, ResidentNumbers)> {
     let opened = device::open_to_train(Device::Gpu, RenderConfig::default());
     let mut backend = opened.backend;
     let Some(resident) = backend.resident() else {
@@ -65,25 +65,25 @@ fn step(
         println!("skipped: {}", opened.why);
         return None;
     };
-    let (learner, layer) = (Learner::new(scene.clone()), &scene.layers[0]);
+    let (train_state, layer) = (TrainState::new(scene.clone()), &scene.layers[0]);
     let page = page_of(&layer.params, 1).unwrap();
     let tables = [Some(GEOMETRY), None, Some(page), None, Some(SH)].map(|key: Option<Key>| {
-        key.map_or(KeptTable::default(), |key| {
-            let (params, moments) = (&layer.params[key], learner.moments()[0].table(key));
-            KeptTable { width: params.width(), params: params.data(), moments: moments.data() }
+        key.map_or(ResidentTable::default(), |key| {
+            let (params, moments) = (&layer.params[key], train_state.moments()[0].table(key));
+            ResidentTable { width: params.width(), params: params.data(), moments: moments.data() }
         })
     });
-    let stats = learner.stats().tables[0].data();
-    let kept = KeptLayer { rows: ROWS, moves: Moves::Posed, life: LifeKind::Infinite, tables, stats, ties };
+    let stats = train_state.stats().tables[0].data();
+    let kept = ResidentLayer { rows: ROWS, moves: Moves::Posed, life: LifeKind::Infinite, tables, stats, ties };
     resident.keep(&[kept], None, &corrections::<f32>()).unwrap();
     let away = Se3::look_at([0.0, 0.0, 50.0], [0.0, 0.0, 90.0], [0.0, 1.0, 0.0]);
     let camera = Camera::with_fov_y(away, 0.8, 32, 24);
     let truth = Planes::new(3, 24, 32);
     let target = Target { truth: &truth, weight: None, picture: 0, dssim: 0.2, response: None };
-    let view = KeptView { camera: &camera, t: Time(1.0), background: NO_VIEW, target, rig: 0 };
-    let rule = |width: usize| Some(KeptRule { rates: vec![rate; width], floor: None });
-    let rules: [Option<KeptRule>; KEPT] = [rule(11), None, rule(POSE), None, None];
-    let step = KeptStep {
+    let view = ResidentView { camera: &camera, t: Time(1.0), background: NO_VIEW, target, rig: 0 };
+    let rule = |width: usize| Some(ResidentRule { rates: vec![rate; width], floor: None });
+    let rules: [Option<ResidentRule>; KEPT] = [rule(11), None, rule(POSE), None, None];
+    let step = ResidentStep {
         views: &[view],
         sh_degree: 0,
         alpha_min: splat4d::layers::ALPHA_MIN,
@@ -135,7 +135,7 @@ fn ties_pull_as_on_the_cpu() {
         let mut d = vec![Grads::new(&scene.layers[0].params)];
         d[0].activate(Space::Gaussians, Rows::All);
         let expected_loss = tied.eval(&scene, &info(), &mut d);
-        assert_eq!(ParamLoss::<f32>::kept(&tied), Some(KeptLoss::Ties));
+        assert_eq!(ParamLoss::<f32>::kept(&tied), Some(ResidentLoss::Ties));
         let ties = tied.ties(&scene).unwrap();
         let Some((stepped, numbers)) = step(&scene, 1e-3, Some(&ties), RowWeights::default(), None) else { return };
         assert!((stepped.loss - expected_loss).abs() < VECTOR * expected_loss, "{} {expected_loss}", stepped.loss);
@@ -161,7 +161,7 @@ fn losses_on_rows_pull_as_on_the_cpu() {
         let mut d = vec![Grads::new(&scene.layers[0].params)];
         d[0].activate(Space::Gaussians, Rows::All);
         let expected_loss = loss.eval(&scene, &info(), &mut d);
-        let Some(KeptLoss::Rows(weights)) = loss.kept() else { panic!("{} is known", loss.name()) };
+        let Some(ResidentLoss::Rows(weights)) = loss.kept() else { panic!("{} is known", loss.name()) };
         let Some((stepped, numbers)) = step(&scene, 1e-3, None, weights, None) else { return };
         assert!((stepped.loss - expected_loss).abs() < VECTOR * expected_loss, "{} {expected_loss}", stepped.loss);
         let first = columns(&numbers.moments[0], 23, 0..11);

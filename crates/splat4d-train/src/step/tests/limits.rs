@@ -1,6 +1,6 @@
 //! The time and memory of a run of several stages.
 
-use super::bed::{bytes, knobs};
+use super::bed::{bytes, settings};
 use crate::run::tests::Place;
 use crate::run::{TrainOptions, train};
 use std::sync::atomic::AtomicBool;
@@ -19,7 +19,7 @@ const MODELS: [&str; 6] = [
 fn minutes_fix_a_run_of_any_model() {
     let place = Place::new();
     for (k, line) in MODELS.iter().enumerate() {
-        let asked = knobs(line).with(|r| {
+        let asked = settings(line).with(|r| {
             r.run.iterations = 7000;
             r.densify.from = 0;
             r.densify.until = 0;

@@ -1,15 +1,15 @@
 //! Cameras and clocks that the capture states wrongly, found while a tiny scene is learnt.
 
 use super::Made;
-use super::bed::knobs;
+use super::bed::settings;
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};
 use crate::init;
-use crate::learner::{Corrections, Origin, Scale, moved, zoomed};
-use crate::methods::{Plan, stages};
+use crate::maintenance::Limits;
+use crate::methods::{TrainContext, stages};
 use crate::step::loss::TrainLoss;
 use crate::step::trainer::{Settings, Trainer};
-use crate::upkeep::Limits;
+use crate::train_state::{Corrections, Origin, Scale, moved, zoomed};
 use splat4d::device;
 use splat4d::math::align::Trajectory;
 use splat4d::math::{Rng, Se3};
@@ -101,13 +101,13 @@ struct Left {
 }
 
 fn run(frames: Disturbed, line: &str) -> Left {
-    let recipe = knobs(&format!("motion=spacetime batch_size=2 init=hull {line}"));
+    let recipe = settings(&format!("motion=spacetime batch_size=2 init=hull {line}"));
     let (truth, stated) = (Made::new(CAMERAS, MOMENTS, frames.cameras[0].width), frames.cameras.clone());
     let late = frames.late;
     let frames: Arc<dyn Frames> = Arc::new(frames);
     let times: Vec<f64> = (0..frames.len()).map(|i| frames.time(i).0).collect();
     let end = |f: fn(f64, f64) -> f64| times.iter().copied().reduce(f).unwrap();
-    let plan = Plan {
+    let plan = TrainContext {
         extent: EXTENT,
         center: [0.0; 3],
         clip: [end(f64::min), end(f64::max)],
@@ -135,11 +135,11 @@ fn run(frames: Disturbed, line: &str) -> Left {
     let origins: Vec<Origin<'_>> =
         (0..frames.len()).map(|i| Origin { rig: frames.rig(i), fixed: true, camera: frames.camera(i) }).collect();
     let scale = Scale { extent: EXTENT, frame: FRAME };
-    trainer.learner.corrections = Some(Corrections::new(&recipe.refine, scale, &origins, CAMERAS, true));
+    trainer.train_state.corrections = Some(Corrections::new(&recipe.refine, scale, &origins, CAMERAS, true));
     while !trainer.is_done() {
         trainer.step().unwrap().unwrap_or_else(|fault| panic!("{line}: {}", fault.0));
     }
-    let found = trainer.learner.corrections.as_ref().unwrap();
+    let found = trainer.train_state.corrections.as_ref().unwrap();
     let poses = |of: &dyn Fn(usize) -> Camera| (0..CAMERAS).map(|i| of(i).cam_from_world).collect::<Vec<Se3>>();
     let (stated_poses, true_poses) = (poses(&|i| stated[i].clone()), poses(&|i| truth.camera(i).clone()));
     let found_poses = poses(&|i| found.camera(i, &stated[i]));

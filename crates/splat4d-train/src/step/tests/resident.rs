@@ -1,6 +1,6 @@
 //! Tables that stay on a GPU against the CPU's engine: gradients, resumes, faults.
 
-use super::bed::{Bed, bytes, knobs, saved};
+use super::bed::{Bed, bytes, saved, settings};
 use super::gpu::{finish, on_gpu, steps_to};
 use crate::recipe::Recipe;
 use crate::step::engine::Blame;
@@ -8,8 +8,8 @@ use crate::step::resident::DeviceEngine;
 use splat4d::device::{self, Device};
 use splat4d::layers::ALPHA_MIN;
 use splat4d::render::{
-    Antialias, Backend, Image, ImageGrads, KeptCameras, KeptLayer, KeptNumbers, KeptStep, KeptStepped, RenderConfig,
-    RenderGrads, Resident, Shot, Wanted,
+    Antialias, Backend, Image, ImageGrads, RenderConfig, RenderGrads, Resident, ResidentCameras, ResidentLayer,
+    ResidentNumbers, ResidentStep, ResidentStepped, Shot, Wanted,
 };
 use splat4d::scene::{GEOMETRY, Table};
 use splat4d::{Error, ErrorKind, Result};
@@ -40,7 +40,7 @@ const FEW: usize = 2;
 
 /// The first moments of all tables with columns, and how often rows stepped.
 fn moments(trainer: &crate::step::trainer::Trainer<'_>) -> Vec<(String, Vec<f64>, Vec<f32>)> {
-    let (scene, all) = (trainer.scene(), trainer.learner.moments());
+    let (scene, all) = (trainer.scene(), trainer.train_state.moments());
     let mut out = Vec::new();
     for (layer, moments) in scene.layers.iter().zip(all) {
         for key in layer.params.keys().filter(|&k| layer.params[k].width() > 0) {
@@ -56,7 +56,7 @@ fn moments(trainer: &crate::step::trainer::Trainer<'_>) -> Vec<(String, Vec<f64>
 fn gradients_of_the_whole_chain_equal_the_cpus() {
     let bed = Bed::new();
     for line in STAYS {
-        let recipe = knobs(line);
+        let recipe = settings(line);
         let Some(mut trainer) = on_gpu(&bed, &recipe) else { return };
         let mut cpu = bed.start(&recipe);
         for step in 1..=FEW {
@@ -90,14 +90,14 @@ fn gradients_of_the_whole_chain_equal_the_cpus() {
                 worst = worst.max(off);
             }
             println!("{line}, step {step}: {worst:.1e}");
-            if let (Some(a), Some(b)) = (&trainer.learner.exposure, &cpu.learner.exposure) {
-                let first = |e: &crate::learner::Exposure| e.moments.table(e.key()).column_to_rows(0, 12);
+            if let (Some(a), Some(b)) = (&trainer.train_state.exposure, &cpu.train_state.exposure) {
+                let first = |e: &crate::train_state::Exposure| e.moments.table(e.key()).column_to_rows(0, 12);
                 let (a, b) = (first(a), first(b));
                 let off: f64 = a.iter().zip(&b).map(|(a, b)| f64::from(a - b).powi(2)).sum();
                 let all: f64 = b.iter().map(|b| f64::from(*b).powi(2)).sum();
                 assert!(all > 0.0 && (off / all).sqrt() < GRADIENT, "{line}: cameras differ by {off:.1e} of {all:.1e}");
             }
-            let stats = [&trainer, &cpu].map(|t| t.learner.stats().tables[0].column_to_rows(0, 3));
+            let stats = [&trainer, &cpu].map(|t| t.train_state.stats().tables[0].column_to_rows(0, 3));
             let sums = stats.map(|s| s.chunks_exact(3).map(|r| [r[0], r[1], r[2]].map(f64::from)).collect::<Vec<_>>());
             for c in 0..3 {
                 let [a, b] = sums.each_ref().map(|s| s.iter().map(|r| r[c]).sum::<f64>());
@@ -116,7 +116,7 @@ fn tables_that_stay_repeat_and_resume_bit_for_bit() {
         "motion=native4d strategy=mcmc sh_harmonics=1",
         "motion=tracked strategy=mcmc rigid_neighbours=5",
     ] {
-        repeats_and_resumes(&bed, &knobs(line));
+        repeats_and_resumes(&bed, &settings(line));
     }
 }
 
@@ -153,15 +153,17 @@ fn repeats_and_resumes(bed: &Bed, recipe: &Recipe) {
 #[test]
 fn a_number_that_is_not_finite_is_found_and_named() {
     let bed = Bed::new();
-    let recipe = knobs("motion=spacetime strategy=none");
+    let recipe = settings("motion=spacetime strategy=none");
     let Some(mut trainer) = on_gpu(&bed, &recipe) else { return };
     trainer.step().unwrap().unwrap();
     trainer.settle().unwrap();
     let before = saved(&trainer);
-    trainer.learner.scene_mut().layers[0].params[GEOMETRY].set(7, 0, f32::NAN);
-    let (learner, progress) =
-        (std::mem::replace(&mut trainer.learner, crate::learner::Learner::new(Default::default())), trainer.progress);
-    trainer.restore(learner, progress);
+    trainer.train_state.scene_mut().layers[0].params[GEOMETRY].set(7, 0, f32::NAN);
+    let (train_state, progress) = (
+        std::mem::replace(&mut trainer.train_state, crate::train_state::TrainState::new(Default::default())),
+        trainer.progress,
+    );
+    trainer.restore(train_state, progress);
     let fault = (0..3).find_map(|_| trainer.step().unwrap().err()).or_else(|| trainer.settle().err());
     let fault = fault.expect("it is found");
     assert!(fault.1 == Blame::Numbers && fault.0.contains("not finite") && fault.0.contains('7'), "{}", fault.0);
@@ -245,22 +247,22 @@ impl Backend for Failing {
 impl Resident for Failing {
     fn keep(
         &mut self,
-        layers: &[KeptLayer<'_>],
-        cameras: Option<&KeptCameras<'_>>,
+        layers: &[ResidentLayer<'_>],
+        cameras: Option<&ResidentCameras<'_>>,
         corrections: &[[f32; 2]],
     ) -> Result<()> {
         // Want of room is no failure.
         self.left[0] = self.left[0].checked_sub(1).ok_or_else(|| Error::new(ErrorKind::Unsupported, FULL))?;
         self.here()?.resident().expect("a GPU").keep(layers, cameras, corrections)
     }
-    fn step(&mut self, step: &KeptStep<'_>) -> Result<Option<Vec<KeptStepped>>> {
+    fn step(&mut self, step: &ResidentStep<'_>) -> Result<Option<Vec<ResidentStepped>>> {
         assert_eq!(step.alpha_min, ALPHA_MIN);
         self.tables(1)?.step(step)
     }
-    fn finish(&mut self) -> Result<Vec<KeptStepped>> {
+    fn finish(&mut self) -> Result<Vec<ResidentStepped>> {
         self.here()?.resident().expect("a GPU").finish()
     }
-    fn fetch(&mut self, layer: usize) -> Result<KeptNumbers> {
+    fn fetch(&mut self, layer: usize) -> Result<ResidentNumbers> {
         self.tables(2)?.fetch(layer)
     }
     fn fetch_cameras(&mut self) -> Result<[Vec<f32>; 2]> {
@@ -271,7 +273,7 @@ impl Resident for Failing {
 #[test]
 fn a_device_that_fails_costs_the_steps_since_it_was_settled_and_nothing_else() {
     let bed = Bed::new();
-    let recipe = knobs("motion=spacetime strategy=none");
+    let recipe = settings("motion=spacetime strategy=none");
     let start = saved(&bed.start(&recipe));
     let mut on_cpu = bed.start(&recipe);
     finish(&mut on_cpu, "on the CPU");
@@ -308,7 +310,7 @@ fn a_device_that_fails_costs_the_steps_since_it_was_settled_and_nothing_else() {
 fn a_device_without_room_for_the_tables_goes_on_drawing() {
     let bed = Bed::new();
     for line in ["motion=tracked strategy=none rigid_neighbours=5", "motion=spacetime strategy=adc"] {
-        let recipe = knobs(line);
+        let recipe = settings(line);
         let run = |keeps: bool| {
             let mut device = Failing::new([0; 3])?;
             device.keeps = keeps;

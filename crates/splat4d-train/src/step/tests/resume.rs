@@ -1,14 +1,14 @@
 //! A run of several stages, models with state of their own and losses with a memory continue from a checkpoint at any place
 //! as if nothing had been: the same bytes, on another number of threads.
 
-use super::bed::{Bed, bytes, knobs, saved};
+use super::bed::{Bed, bytes, saved, settings};
 
 /// Trains once; then again from checkpoints around every change of stage, and in the middle of every stage.
 fn check(lines: &[&str]) {
     let bed = Bed::new();
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     for line in lines {
-        let recipe = knobs(line);
+        let recipe = settings(line);
         let mut trainer = bed.start(&recipe);
         let lengths: Vec<usize> = trainer.stages.iter().map(|s| s.iterations).collect();
         let mut kept = Vec::new();

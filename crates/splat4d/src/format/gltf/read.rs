@@ -43,7 +43,7 @@ pub(super) fn read(file: &File<'_>) -> Result<Opened> {
             }
             let mut layer = still(params).layers.remove(0);
             layer.frame = frame;
-            layer.absorb_frame();
+            layer.apply_transform();
             layers.push(layer);
         }
     }

@@ -43,7 +43,7 @@ pub(super) fn opened(stage: &Stage) -> Result<Opened> {
         }
         for mut layer in field.layers(&mut warnings)? {
             layer.frame = frame;
-            layer.absorb_frame();
+            layer.apply_transform();
             layers.push(layer);
         }
     }

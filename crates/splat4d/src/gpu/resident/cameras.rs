@@ -4,7 +4,7 @@ use crate::Result;
 use crate::gpu::buffers::Grown;
 use crate::gpu::compare::RESPONSES;
 use crate::gpu::device::Gpu;
-use crate::render::KeptCameras;
+use crate::render::ResidentCameras;
 use crate::scene::BLOCK;
 
 /// Matrices, gradients, first and second moments; then a step count and a mark a camera.
@@ -44,7 +44,7 @@ impl Cameras {
     }
 
     /// Takes them over. Errors: no memory.
-    pub(super) fn keep(&mut self, gpu: &Gpu, cameras: Option<&KeptCameras<'_>>) -> Result<()> {
+    pub(super) fn keep(&mut self, gpu: &Gpu, cameras: Option<&ResidentCameras<'_>>) -> Result<()> {
         self.count = cameras.map_or(0, |c| c.count);
         let mut all = vec![0.0; self.numbers()];
         if let Some(cameras) = cameras {

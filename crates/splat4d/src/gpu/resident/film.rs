@@ -6,7 +6,7 @@ use crate::gpu::buffers::UNIFORM_STRIDE;
 use crate::gpu::clock::{Recorder, StageClock};
 use crate::gpu::frame::{Band, Groups, TILE, count};
 use crate::gpu::{GpuRenderer, GpuStats, Way};
-use crate::render::{KeptLayer, Resident, Shot};
+use crate::render::{Resident, ResidentLayer, Shot};
 use crate::scene::{Camera, Splats, Time};
 use std::collections::VecDeque;
 use std::time::Instant;
@@ -28,7 +28,7 @@ impl GpuRenderer {
     /// `None`: an image must be drawn in bands. Errors: a driver that failed.
     pub fn film(
         &mut self,
-        layers: &[KeptLayer<'_>],
+        layers: &[ResidentLayer<'_>],
         alpha_min: f64,
         background: [f32; 3],
         frames: &[(Camera, Time)],

@@ -7,14 +7,14 @@
 //! the moment at
 //! which its record is read changes a bit.
 
-use super::{KeptPass, STEP_WORDS, Tables, VIEW_WORDS};
+use super::{ResidentPass, STEP_WORDS, Tables, VIEW_WORDS};
 use crate::gpu::buffers::{Grown, UNIFORM_STRIDE};
 use crate::gpu::clock::{self, Recorder, StageClock, TIMES_BYTES};
 use crate::gpu::compare::{Loss, PARTIALS, RESPONSES, means, sums_at};
 use crate::gpu::frame::{Back, Band, Frame, Groups, RECORD_BYTES, TILE, count};
 use crate::gpu::pictures::Held;
 use crate::gpu::{GpuRenderer, GpuStats, GpuTimings, Way, back};
-use crate::render::{KEPT, KeptNoise, KeptRule, KeptStep, KeptStepped, RowWeights, Shot};
+use crate::render::{KEPT, ResidentNoise, ResidentRule, ResidentStep, ResidentStepped, RowWeights, Shot};
 use crate::scene::{Camera, Splats, Time};
 use crate::{Error, ErrorKind, Result};
 use std::collections::VecDeque;
@@ -43,9 +43,9 @@ pub(super) struct Begun {
     pub views: Vec<Seen>,
     sh_degree: usize,
     pub alpha_min: f64,
-    pub rules: Vec<[Option<KeptRule>; KEPT]>,
+    pub rules: Vec<[Option<ResidentRule>; KEPT]>,
     pub rows: RowWeights,
-    pub noise: Vec<Option<KeptNoise>>,
+    pub noise: Vec<Option<ResidentNoise>>,
     pub cameras: f64,
 }
 
@@ -66,7 +66,7 @@ struct Flight {
 pub(in crate::gpu) struct Flights {
     under_way: VecDeque<Flight>,
     /// Those that are done, not told yet.
-    done: Vec<KeptStepped>,
+    done: Vec<ResidentStepped>,
     /// Memory of records that are not in use.
     spare: Vec<Grown>,
     /// Steps that were begun again for want of room.
@@ -92,7 +92,7 @@ impl GpuRenderer {
     }
 
     /// [`Resident::step`](crate::render::Resident::step).
-    pub(super) fn begin(&mut self, step: &KeptStep<'_>) -> Result<Option<Vec<KeptStepped>>> {
+    pub(super) fn begin(&mut self, step: &ResidentStep<'_>) -> Result<Option<Vec<ResidentStepped>>> {
         let Some(begun) = self.take_over(step)? else { return Ok(None) };
         self.make_room_for_status(begun.views.len())?;
         self.with_tables(|renderer, tables| renderer.launch(tables, begun, 0))?;
@@ -118,7 +118,7 @@ impl GpuRenderer {
     }
 
     /// [`Resident::finish`](crate::render::Resident::finish).
-    pub(super) fn land_all(&mut self) -> Result<Vec<KeptStepped>> {
+    pub(super) fn land_all(&mut self) -> Result<Vec<ResidentStepped>> {
         while !self.flights.under_way.is_empty() {
             self.land()?;
         }
@@ -141,7 +141,7 @@ impl GpuRenderer {
     }
 
     /// A step with what it needs of its own; `None`: it cannot be taken.
-    pub(super) fn take_over(&mut self, step: &KeptStep<'_>) -> Result<Option<Begun>> {
+    pub(super) fn take_over(&mut self, step: &ResidentStep<'_>) -> Result<Option<Begun>> {
         let tables = self.resident.as_ref().expect("tables are kept before steps are taken");
         let (n, cameras) = (tables.rows(), tables.cameras.count());
         let mut views = Vec::with_capacity(step.views.len());
@@ -189,7 +189,7 @@ impl GpuRenderer {
         let times_at = words.next_multiple_of(UNIFORM_STRIDE);
         record.ensure(&self.gpu, times_at + TIMES_BYTES)?;
         for at in from..step.views.len() {
-            let pass = KeptPass { tables, step: &step, view: at };
+            let pass = ResidentPass { tables, step: &step, view: at };
             let to = pass.is_last().then_some((&record, words, times_at));
             let (work, recorded) = self.submit_view(&pass, to)?;
             if pass.is_last() {
@@ -205,7 +205,7 @@ impl GpuRenderer {
     /// Returns the last work, and the stages that are timed.
     fn submit_view(
         &mut self,
-        pass: &KeptPass<'_>,
+        pass: &ResidentPass<'_>,
         to: Option<(&Grown, u64, u64)>,
     ) -> Result<(wgpu::SubmissionIndex, Option<[usize; 2]>)> {
         let (tables, view) = (pass.tables, &pass.step.views[pass.view]);
@@ -378,7 +378,7 @@ impl GpuRenderer {
     }
 
     /// The result of a step that was applied.
-    fn stepped(&mut self, step: &Begun, words: &[u32]) -> KeptStepped {
+    fn stepped(&mut self, step: &Begun, words: &[u32]) -> ResidentStepped {
         let tables = self.resident.as_ref().expect("tables are kept");
         let status = tables.status(step.views.len());
         let view = |(i, view): (usize, &Seen)| {
@@ -392,7 +392,7 @@ impl GpuRenderer {
         let bad = bad.map(|at| [at / KEPT, at % KEPT, words[status.bad + at] as usize - 1]);
         let first = status.sums.first().map_or(status.words, |sums| sums[0]);
         let loss = words[first..status.words].iter().map(|bits| f64::from(f32::from_bits(*bits))).sum();
-        KeptStepped { comparisons, loss, bad }
+        ResidentStepped { comparisons, loss, bad }
     }
 }
 

@@ -7,7 +7,9 @@ use crate::layers::{ALPHA_MIN, Evaluation, Layer, Scene};
 use crate::math::{Real, Rng};
 use crate::motion::native4d::{Native4dSpec, TABLE};
 use crate::motion::{At, Cache, Motion, Slices, Spec, Tape, build_as};
-use crate::render::{Backend, Image, KeptNoise, KeptRule, KeptTies, KeptView, RowWeights, Shot, Target};
+use crate::render::{
+    Backend, Image, ResidentNoise, ResidentRule, ResidentTies, ResidentView, RowWeights, Shot, Target,
+};
 use crate::scene::{Camera, GEOMETRY, Grads, Key, Params, Planes, Rows, Space, SplatGrads, Table, Time};
 use std::sync::Arc;
 
@@ -73,15 +75,16 @@ fn slices_equal_the_model_forth_and_back() {
     motion.backward(&question, &Cache::default(), &mut tape, &d_out, &mut Cache::default(), &mut d);
     // The same by the kernels: the first of two views, after which nothing learns.
     let moves = moves(motion.as_ref());
-    let table = |key: Key| KeptTable { width: single[key].width(), params: single[key].data(), moments: &[] };
-    let tables = [table(GEOMETRY), KeptTable::default(), table(own), KeptTable::default(), table(crate::scene::SH)];
+    let table = |key: Key| ResidentTable { width: single[key].width(), params: single[key].data(), moments: &[] };
+    let tables =
+        [table(GEOMETRY), ResidentTable::default(), table(own), ResidentTable::default(), table(crate::scene::SH)];
     let stats = vec![0.0; STATS_WIDTH * ROWS.next_multiple_of(BLOCK)];
-    let layer = KeptLayer { rows: ROWS, moves, life: LifeKind::Infinite, tables, stats: &stats, ties: None };
+    let layer = ResidentLayer { rows: ROWS, moves, life: LifeKind::Infinite, tables, stats: &stats, ties: None };
     r.keep(&[layer], None, &[[1.0; 2]]).expect("a small scene");
     let (camera, truth) = (camera([0.0, 0.0, -4.0], 16, 16), Planes::new(3, 16, 16));
     let target = Target { truth: &truth, weight: None, picture: 0, dssim: 0.2, response: None };
-    let view = KeptView { camera: &camera, t: Time(t), background: [0.0; 3], target, rig: 0 };
-    let step = KeptStep {
+    let view = ResidentView { camera: &camera, t: Time(t), background: [0.0; 3], target, rig: 0 };
+    let step = ResidentStep {
         views: &[view, view],
         sh_degree: 0,
         alpha_min: 1.0 / 255.0,
@@ -93,7 +96,7 @@ fn slices_equal_the_model_forth_and_back() {
     let step = r.take_over(&step).expect("it is sent").expect("a small picture");
     r.make_room_for_status(2).expect("room");
     let (geometry, gradient, alive) = r.with_tables(|r, tables| {
-        let pass = KeptPass { tables, step: &step, view: 0 };
+        let pass = ResidentPass { tables, step: &step, view: 0 };
         r.make_room_for_splats(ROWS).expect("room");
         r.buffers.back.ensure(&r.gpu, (4 * back.len()) as u64).expect("room");
         r.make_room_for_loss([16, 16], 16).expect("room");
@@ -140,26 +143,27 @@ fn slices_equal_the_model_forth_and_back() {
 }
 
 /// What steps measured, and the numbers of the layer and of the cameras after them.
-type After = (Vec<KeptStepped>, KeptNumbers, [Vec<f32>; 2]);
+type After = (Vec<ResidentStepped>, ResidentNumbers, [Vec<f32>; 2]);
 
 /// Hands a layer over, with ties or without, and cameras that learn their colours: its numbers.
-fn kept(r: &mut GpuRenderer, ties: Option<&KeptTies>) -> Result<Params<f32>> {
+fn kept(r: &mut GpuRenderer, ties: Option<&ResidentTies>) -> Result<Params<f32>> {
     let spec = Native4dSpec::default();
     let (p, own, motion) = params::<f32>(&spec);
     let moves = moves(motion.as_ref());
-    let table = |key: Key| KeptTable { width: p[key].width(), params: p[key].data(), moments: &[] };
-    let tables = [table(GEOMETRY), KeptTable::default(), table(own), KeptTable::default(), table(crate::scene::SH)];
+    let table = |key: Key| ResidentTable { width: p[key].width(), params: p[key].data(), moments: &[] };
+    let tables =
+        [table(GEOMETRY), ResidentTable::default(), table(own), ResidentTable::default(), table(crate::scene::SH)];
     let stats = vec![0.0; STATS_WIDTH * ROWS.next_multiple_of(BLOCK)];
-    let layer = KeptLayer { rows: ROWS, moves, life: LifeKind::Infinite, tables, stats: &stats, ties };
+    let layer = ResidentLayer { rows: ROWS, moves, life: LifeKind::Infinite, tables, stats: &stats, ties };
     let colors: Vec<f32> = (0..12 * BLOCK).map(|i| 0.01 * (i % 5) as f32).collect();
-    let table = KeptTable { width: 12, params: &colors, moments: &[] };
-    let cameras = KeptCameras { count: 3, table, held: &[0, 1] };
+    let table = ResidentTable { width: 12, params: &colors, moments: &[] };
+    let cameras = ResidentCameras { count: 3, table, held: &[0, 1] };
     r.keep(&[layer], Some(&cameras), &[[1.0; 2]; 3])?;
     Ok(p)
 }
 
 /// Begins a step that sees these cameras, with losses on rows and noise: steps that are done.
-fn begun(r: &mut GpuRenderer, number: usize, cameras: &[Camera], rate: f64) -> Result<Vec<KeptStepped>> {
+fn begun(r: &mut GpuRenderer, number: usize, cameras: &[Camera], rate: f64) -> Result<Vec<ResidentStepped>> {
     let truth = |camera: &Camera| {
         let mut truth = Planes::new(3, camera.height, camera.width);
         truth.data.iter_mut().enumerate().for_each(|(i, x)| *x = (i % 7) as f32 / 7.0);
@@ -169,13 +173,13 @@ fn begun(r: &mut GpuRenderer, number: usize, cameras: &[Camera], rate: f64) -> R
     let view = |(i, camera): (usize, _)| {
         let picture = 100 * truths[i].width + i;
         let target = Target { truth: &truths[i], weight: None, picture, dssim: 0.2, response: None };
-        KeptView { camera, t: Time(0.0), background: [0.5; 3], target, rig: i }
+        ResidentView { camera, t: Time(0.0), background: [0.5; 3], target, rig: i }
     };
-    let views: Vec<KeptView<'_>> = cameras.iter().enumerate().map(view).collect();
-    let rule = |width: usize| Some(KeptRule { rates: vec![rate; width], floor: None });
+    let views: Vec<ResidentView<'_>> = cameras.iter().enumerate().map(view).collect();
+    let rule = |width: usize| Some(ResidentRule { rates: vec![rate; width], floor: None });
     let rng = Rng::new(5, "noise", number as u64);
-    let noise = KeptNoise { strength: 0.1, dead: 0.005, slope: 100.0, limit: 0.5, rng };
-    let step = KeptStep {
+    let noise = ResidentNoise { strength: 0.1, dead: 0.005, slope: 100.0, limit: 0.5, rng };
+    let step = ResidentStep {
         views: &views,
         sh_degree: 0,
         alpha_min: 1.0 / 255.0,
@@ -337,8 +341,8 @@ fn a_device_that_is_lost_with_steps_under_way_is_an_error_whatever_is_asked() {
 fn ties_of_more_rows_than_a_page_are_refused_and_nothing_else_is() {
     let Some(mut r) = own_renderer() else { return };
     r.page_rows = Some(ROWS.next_multiple_of(BLOCK) - BLOCK);
-    let refused = |r: &mut GpuRenderer, ties: Option<&KeptTies>| kept(r, ties).err().map(|e| e.to_string());
-    let ties = KeptTies::default();
+    let refused = |r: &mut GpuRenderer, ties: Option<&ResidentTies>| kept(r, ties).err().map(|e| e.to_string());
+    let ties = ResidentTies::default();
     let error = refused(&mut r, Some(&ties)).expect("it has two pages");
     assert!(error.contains("tied poses are too many for one buffer"), "{error}");
     assert_eq!(refused(&mut r, None), None, "rows without ties lie in two pages");
@@ -381,12 +385,13 @@ fn a_film_shows_what_an_image_does() {
         [(&far, 0.3), (&near, 0.1), (&near, 0.5)].map(|(c, t): (&Camera, f64)| (c.clone(), Time(t))).to_vec();
     let layer = &scene.layers[0];
     let table =
-        |key: Key| KeptTable { width: layer.params[key].width(), params: layer.params[key].data(), moments: &[] };
+        |key: Key| ResidentTable { width: layer.params[key].width(), params: layer.params[key].data(), moments: &[] };
     let own = layer.params.find(TABLE).expect("the model made it");
-    let tables = [table(GEOMETRY), KeptTable::default(), table(own), KeptTable::default(), table(crate::scene::SH)];
+    let tables =
+        [table(GEOMETRY), ResidentTable::default(), table(own), ResidentTable::default(), table(crate::scene::SH)];
     let stats = vec![0.0; STATS_WIDTH * ROWS.next_multiple_of(BLOCK)];
     let moves = moves(layer.motion.as_ref());
-    let kept = KeptLayer { rows: ROWS, moves, life: layer.life, tables, stats: &stats, ties: None };
+    let kept = ResidentLayer { rows: ROWS, moves, life: layer.life, tables, stats: &stats, ties: None };
     let film = |r: &mut GpuRenderer| -> Vec<f32> {
         let seconds = r.film(&[kept], ALPHA_MIN, scene.background, &frames).expect("it is drawn");
         assert!(seconds.expect("in one piece") > 0.0);

@@ -5,7 +5,7 @@ use crate::Result;
 use crate::gpu::buffers::Grown;
 use crate::gpu::device::Gpu;
 use crate::gpu::limits::THREADS;
-use crate::render::KeptTies;
+use crate::render::ResidentTies;
 
 /// The ties of a layer.
 #[derive(Debug)]
@@ -19,7 +19,7 @@ pub(super) struct Tied {
 
 impl Tied {
     /// Sends them. Errors: no memory.
-    pub(super) fn new(gpu: &Gpu, ties: &KeptTies) -> Result<Self> {
+    pub(super) fn new(gpu: &Gpu, ties: &ResidentTies) -> Result<Self> {
         let before: Vec<[f32; 8]> = ties.before.iter().map(|[x, y, z, q @ ..]| pose([*x, *y, *z], *q)).collect();
         let edges: Vec<[u32; 4]> =
             ties.edges.iter().map(|(to, long, weight)| [*to, long.to_bits(), weight.to_bits(), 0]).collect();

@@ -1,7 +1,7 @@
 //! The structures of uniforms that the kernels of tables read, filled.
 
-use super::{Kept, SH, moments_width};
-use crate::render::{KeptNoise, KeptRule, Moves, RowWeights};
+use super::{ResidentBuffers, SH, moments_width};
+use crate::render::{Moves, ResidentNoise, ResidentRule, RowWeights};
 use crate::scene::{LifeKind, Time};
 
 /// Most columns that Adam takes at once (adam.wgsl).
@@ -42,7 +42,7 @@ pub(super) struct Ask {
 
 impl Ask {
     /// At a time; `first`: of a step's first view.
-    pub(super) fn new(layer: &Kept, at: Time, first: bool, alpha_min: f64, first_splat: usize) -> Self {
+    pub(super) fn new(layer: &ResidentBuffers, at: Time, first: bool, alpha_min: f64, first_splat: usize) -> Self {
         let flag = |on: bool, flag: u32| if on { flag } else { 0 };
         let t = at.0;
         let life = match layer.life {
@@ -112,7 +112,13 @@ pub(super) struct Rule {
 
 impl Rule {
     /// Of the piece of a table that begins with column `from`.
-    pub(super) fn new(layer: &Kept, table: usize, from: usize, rule: &KeptRule, [counted, word]: [usize; 2]) -> Self {
+    pub(super) fn new(
+        layer: &ResidentBuffers,
+        table: usize,
+        from: usize,
+        rule: &ResidentRule,
+        [counted, word]: [usize; 2],
+    ) -> Self {
         let width = layer.widths[table];
         let ([first, moments_first], [stride, moments_stride]) =
             if table == SH { ([0; 2], [width, moments_width(width)]) } else { (layer.first(table), layer.strides()) };
@@ -167,7 +173,7 @@ pub(super) struct Noise {
 }
 
 impl Noise {
-    pub(super) fn new(noise: &KeptNoise) -> Self {
+    pub(super) fn new(noise: &ResidentNoise) -> Self {
         let key = noise.rng.key();
         Self {
             strength: noise.strength as f32,

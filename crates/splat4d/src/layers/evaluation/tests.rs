@@ -57,19 +57,19 @@ fn ids(rows: Rows<'_>) -> Option<Vec<u32>> {
 fn equal_questions_are_one_and_rows_are_united() {
     let mut e = Evaluation::<f64>::default();
     let t = Time(0.3);
-    assert_eq!(e.ask(0, Space::Gaussians, Rows::Some(&[1, 4, 9]), t), 0);
-    assert_eq!(e.ask(0, Space::Gaussians, Rows::Some(&[0, 4, 5, 12]), t), 0);
+    assert_eq!(e.request(0, Space::Gaussians, Rows::Some(&[1, 4, 9]), t), 0);
+    assert_eq!(e.request(0, Space::Gaussians, Rows::Some(&[0, 4, 5, 12]), t), 0);
     assert_eq!(ids(e.tape(0).rows()), Some(vec![0, 1, 4, 5, 9, 12]));
-    assert_eq!(e.ask(1, Space::Gaussians, Rows::Some(&[3]), t), 1, "another layer");
-    assert_eq!(e.ask(0, Space::Nodes, Rows::Some(&[3]), t), 2, "another space");
-    assert_eq!(e.ask(0, Space::Gaussians, Rows::Some(&[3]), Time(0.4)), 3, "another time");
-    assert_eq!(e.ask(0, Space::Gaussians, Rows::All, t), 0);
+    assert_eq!(e.request(1, Space::Gaussians, Rows::Some(&[3]), t), 1, "another layer");
+    assert_eq!(e.request(0, Space::Nodes, Rows::Some(&[3]), t), 2, "another space");
+    assert_eq!(e.request(0, Space::Gaussians, Rows::Some(&[3]), Time(0.4)), 3, "another time");
+    assert_eq!(e.request(0, Space::Gaussians, Rows::All, t), 0);
     assert_eq!(ids(e.tape(0).rows()), None, "all rows hold every other");
-    e.ask(0, Space::Gaussians, Rows::Some(&[2]), t);
+    e.request(0, Space::Gaussians, Rows::Some(&[2]), t);
     assert_eq!((ids(e.tape(0).rows()), e.len()), (None, 4));
     assert_eq!((e.find(0, Space::Nodes, t), e.find(1, Space::Nodes, t)), (Some(2), None));
-    e.ask(0, Space::Gaussians, Rows::Some(&[0]), Time(f64::NAN));
-    assert_eq!(e.ask(0, Space::Gaussians, Rows::Some(&[1]), Time(f64::NAN)), 4, "no time is one time");
+    e.request(0, Space::Gaussians, Rows::Some(&[0]), Time(f64::NAN));
+    assert_eq!(e.request(0, Space::Gaussians, Rows::Some(&[1]), Time(f64::NAN)), 4, "no time is one time");
     e.begin();
     assert!(e.is_empty() && e.find(0, Space::Gaussians, t).is_none());
 }
@@ -89,7 +89,7 @@ fn the_rows_alive_join_those_that_were_asked_for() {
     for asks_first in [false, true] {
         e.begin();
         let rows = [dead];
-        let ask = |e: &mut Evaluation<f64>| assert_eq!(e.ask(0, Space::Gaussians, Rows::Some(&rows), t), 0);
+        let ask = |e: &mut Evaluation<f64>| assert_eq!(e.request(0, Space::Gaussians, Rows::Some(&rows), t), 0);
         if asks_first {
             ask(&mut e);
         }
@@ -108,9 +108,9 @@ const ASKED: [(usize, Option<&[u32]>, f64); 4] =
 fn evaluation(layers: &[Layer<f64>]) -> Evaluation<f64> {
     let mut e = Evaluation::default();
     for (layer, rows, t) in ASKED {
-        e.ask(layer, Space::Gaussians, rows.map_or(Rows::All, Rows::Some), Time(t));
+        e.request(layer, Space::Gaussians, rows.map_or(Rows::All, Rows::Some), Time(t));
     }
-    e.answer(layers);
+    e.evaluate(layers);
     e
 }
 
@@ -170,7 +170,7 @@ fn the_backward_pass_equals_the_motion_model_bit_for_bit() {
         let mine: Vec<usize> = (0..ASKED.len()).filter(|&i| ASKED[i].0 == index).collect();
         let mut tapes: Vec<LayerTape<f64>> = mine.iter().map(|_| LayerTape::default()).collect();
         for (tape, &i) in tapes.iter_mut().zip(&mine) {
-            tape.ask(Space::Gaussians, ASKED[i].1.map_or(Rows::All, Rows::Some), Time(ASKED[i].2));
+            tape.request(Space::Gaussians, ASKED[i].1.map_or(Rows::All, Rows::Some), Time(ASKED[i].2));
         }
         let (mut cache, mut d_cache, mut d) = (Cache::default(), Cache::default(), Grads::new(&layer.params));
         let questions: Vec<At<'_, f64>> = tapes.iter().map(|t| t.question(&layer.params)).collect();

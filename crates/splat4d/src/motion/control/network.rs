@@ -10,7 +10,7 @@ use crate::Result;
 use crate::math::{Real, Rng};
 use crate::motion::Slot;
 use crate::nn::encoding::{MAX_LEVELS, encode, encode_backward, encoded};
-use crate::nn::{InputGrad, Kept, Mlp, MlpShape, Passed};
+use crate::nn::{InputGrad, LayerOutputs, Mlp, MlpShape, Passed};
 use crate::scene::{Grads, Key, Params, Space, Table, Time};
 
 /// From so many hidden layers on the input comes in again in the middle (Mildenhall et al. 2020: after the fourth of
@@ -44,7 +44,7 @@ struct Pass<F> {
     t: Time,
     x: Vec<F>,
     out: Vec<F>,
-    kept: Kept<F>,
+    kept: LayerOutputs<F>,
 }
 
 /// All times of a step.
@@ -108,8 +108,12 @@ impl Network {
 
     fn pass<F: Real>(&self, p: &Params<F>, t: Time) -> Pass<F> {
         let (count, width) = (p[self.nodes].rows(), self.mlp.shape().inputs);
-        let mut pass =
-            Pass { t, x: vec![F::ZERO; count * width], out: vec![F::ZERO; count * POSE], kept: Kept::default() };
+        let mut pass = Pass {
+            t,
+            x: vec![F::ZERO; count * width],
+            out: vec![F::ZERO; count * POSE],
+            kept: LayerOutputs::default(),
+        };
         let split = encoded(3, self.levels[0]);
         for (node, row) in pass.x.chunks_exact_mut(width).enumerate() {
             encode(&self.position(p, node), self.levels[0], &mut row[..split]);

@@ -38,7 +38,7 @@ fn layer(rows: usize, spec: Native4dSpec) -> Layer<f64> {
 
 fn splats<F: Real>(layer: &Layer<F>, t: f64) -> Table<F> {
     let mut tape = LayerTape::default();
-    tape.ask(Space::Gaussians, Rows::All, Time(t));
+    tape.request(Space::Gaussians, Rows::All, Time(t));
     layer.at(&Cache::default(), &mut tape);
     tape.out().clone()
 }
@@ -341,7 +341,7 @@ fn colours_in_time_have_their_period_are_even_and_join_the_table() {
     let own = l.params.find(TABLE).unwrap();
     let weights = |l: &Layer<f64>, t: f64| {
         let mut tape = LayerTape::default();
-        tape.ask(Space::Gaussians, Rows::All, Time(t));
+        tape.request(Space::Gaussians, Rows::All, Time(t));
         l.at(&Cache::default(), &mut tape);
         match l.part(&tape).color {
             Color::Sh { weights: Some(w), base: true, .. } => w.clone(),
@@ -414,7 +414,7 @@ fn far_from_its_life_everything_is_a_number() {
     let single: Layer<f32> = single;
     for t in [-1e30, -1e4, 1e4, 1e30] {
         let mut tape = LayerTape::default();
-        tape.ask(Space::Gaussians, Rows::All, Time(t));
+        tape.request(Space::Gaussians, Rows::All, Time(t));
         single.at(&Cache::default(), &mut tape);
         assert!(tape.out().first_non_finite().is_none(), "{t}");
         let mut d_out = tape.out().zeros_like();

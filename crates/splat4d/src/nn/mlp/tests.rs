@@ -107,7 +107,7 @@ fn starts_as_the_zero_map_with_hidden_layers_that_keep_their_size() {
     let mut p = params::<f32>();
     let mlp = Mlp::new("net", shape, 0.0, Rng::new(1, "mlp", 0), &mut p).unwrap();
     let x = numbers::<f32>(100 * 20, 4);
-    let (mut out, mut kept) = (vec![1.0; 300], Kept::default());
+    let (mut out, mut kept) = (vec![1.0; 300], LayerOutputs::default());
     mlp.forward_keeping(&p, &x, &mut out, &mut kept);
     assert!(out.iter().all(|y| *y == 0.0));
     let last = mlp.input(6, &x, &kept.data);
@@ -128,7 +128,7 @@ fn any_number_of_threads_and_kept_activations_give_the_same_bits() {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| {
             let (mut out, mut d_x, mut d) = (vec![0.0; n * 5], vec![0.0; n * 7], Grads::new(&p));
-            let mut kept = Kept::default();
+            let mut kept = LayerOutputs::default();
             if keep {
                 mlp.forward_keeping(&p, &x, &mut out, &mut kept);
                 assert!(kept.chunks > 0);
@@ -163,7 +163,7 @@ fn a_shift_is_an_input_that_all_rows_share() {
     let weights = numbers::<f64>(10, 4);
     let value = |shifts: &[Vec<f64>]| {
         let mut out = vec![0.0; 10];
-        mlp.forward_shifted(&p, &x, shifts, &mut out, &mut Kept::default());
+        mlp.forward_shifted(&p, &x, shifts, &mut out, &mut LayerOutputs::default());
         out.iter().zip(&weights).map(|(a, b)| a * b).sum::<f64>()
     };
     let mut d = Grads::new(&p);

@@ -79,7 +79,7 @@ fn a_player_draws_whom_the_masks_admit() {
             if let Some(masks) = layer.masks.as_ref().filter(|_| layer.spans_over(t)) {
                 let mut ids = Vec::new();
                 layer.active(t, &mut ids);
-                let want: Vec<u32> = here.filter(|&i| masks.admits(t.0, i)).map(|i| i as u32).collect();
+                let want: Vec<u32> = here.filter(|&i| masks.allows(t.0, i)).map(|i| i as u32).collect();
                 assert_eq!(ids, want);
             }
         }

@@ -1,10 +1,10 @@
 //! Opacity reset: every so many steps all opacities are lowered, so that what the images do not ask for stays faint and
 //! is pruned. Source: Kerbl et al. 2023 §5.2.
 
-use super::{At, Change, Context, DensifySettings, Every, Order, Strategy, Upkeep, logit};
+use super::{At, Change, Context, DensifySettings, Every, Maintenance, RunOrder, Strategy, logit};
 use crate::Result;
-use crate::learner::Learner;
 use crate::settings::settings;
+use crate::train_state::TrainState;
 use splat4d::scene::GEOMETRY;
 use splat4d::scene::params::OPACITY;
 
@@ -38,23 +38,23 @@ impl OpacityReset {
     }
 }
 
-impl Upkeep for OpacityReset {
+impl Maintenance for OpacityReset {
     fn name(&self) -> &str {
         "opacity reset"
     }
 
-    fn order(&self) -> Order {
-        Order::Reset
+    fn order(&self) -> RunOrder {
+        RunOrder::Reset
     }
 
     fn due(&self, at: &At) -> bool {
         at.step.is_multiple_of(self.settings.interval) && at.step < self.densification.last
     }
 
-    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
+    fn run(&mut self, train_state: &mut TrainState, c: &Context<'_>) -> Result<Change> {
         let ceiling = logit(ABOVE_DEAD * c.limits.min_opacity);
-        let learning = learner.learning();
-        let (scene, moments) = learner.tables_mut();
+        let learning = train_state.learning();
+        let (scene, moments) = train_state.tables_mut();
         for index in learning {
             let (layer, moments) = (&mut scene.layers[index], &mut moments[index]);
             let geometry = &mut layer.params[GEOMETRY];
@@ -79,7 +79,7 @@ mod tests {
     use super::super::Limits;
     use super::super::tests::{context, due_steps, scene};
     use super::*;
-    use crate::learner::Touched;
+    use crate::train_state::Touched;
 
     fn reset() -> OpacityReset {
         let densification = Every { first: 1, last: 30, interval: 7 };
@@ -88,16 +88,16 @@ mod tests {
 
     #[test]
     fn opacities_above_twice_the_dead_one_are_lowered_and_their_moments_forgotten() {
-        let mut learner = Learner::new(scene(20));
-        learner.scene_mut().layers[0].params[GEOMETRY].set(3, OPACITY, -9.0);
-        learner.tables_mut().1[0].table_mut(GEOMETRY).fill(1.0);
-        learner.take_touched();
+        let mut train_state = TrainState::new(scene(20));
+        train_state.scene_mut().layers[0].params[GEOMETRY].set(3, OPACITY, -9.0);
+        train_state.tables_mut().1[0].table_mut(GEOMETRY).fill(1.0);
+        train_state.take_touched();
         let limits = Limits { cap: 20, extent: 1.0, min_opacity: 0.005 };
-        reset().run(&mut learner, &context(limits, 0, 0)).unwrap();
-        let (g, m) = (&learner.scene().layers[0].params[GEOMETRY], learner.moments()[0].table(GEOMETRY));
+        reset().run(&mut train_state, &context(limits, 0, 0)).unwrap();
+        let (g, m) = (&train_state.scene().layers[0].params[GEOMETRY], train_state.moments()[0].table(GEOMETRY));
         assert_eq!([3, 4].map(|r| g.get(r, OPACITY)), [-9.0, logit(0.01)]);
         assert_eq!([OPACITY, g.width() + OPACITY, 0].map(|c| m.get(4, c)), [0.0, 0.0, 1.0]);
-        assert_eq!(learner.take_touched(), Touched::Values);
+        assert_eq!(train_state.take_touched(), Touched::Values);
     }
 
     #[test]

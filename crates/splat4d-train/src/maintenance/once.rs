@@ -1,9 +1,9 @@
 //! Once: a change of the scene in the middle of a stage, whose schedules go on: a filter that is switched on, a model that
 //! becomes another.
 
-use super::{At, Change, Context, Upkeep};
+use super::{At, Change, Context, Maintenance};
 use crate::Result;
-use crate::learner::Learner;
+use crate::train_state::TrainState;
 use splat4d::layers::Scene;
 
 /// A change of the scene before one step of a stage. Done twice it must be as if it had been done once: it is repeated
@@ -15,7 +15,7 @@ pub(crate) struct Once<C> {
     pub change: C,
 }
 
-impl<C: Fn(&mut Scene<f32>) -> Result<()> + Send + Sync> Upkeep for Once<C> {
+impl<C: Fn(&mut Scene<f32>) -> Result<()> + Send + Sync> Maintenance for Once<C> {
     fn name(&self) -> &str {
         "once"
     }
@@ -28,8 +28,8 @@ impl<C: Fn(&mut Scene<f32>) -> Result<()> + Send + Sync> Upkeep for Once<C> {
         true
     }
 
-    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
-        learner.rebuild(c.learns, &self.change)?;
+    fn run(&mut self, train_state: &mut TrainState, c: &Context<'_>) -> Result<Change> {
+        train_state.rebuild(c.learns, &self.change)?;
         Ok(Change::default())
     }
 }
@@ -50,9 +50,9 @@ mod tests {
         let due = |at: usize| (0..=10).filter(|&step| Once { at, change: darker }.due(&At { step, steps: 10 })).count();
         assert!(once.due(&At { step: 4, steps: 10 }) && due(4) == 1);
         assert_eq!([due(0), due(10)], [1, 0]);
-        let mut learner = Learner::new(scene(3));
+        let mut train_state = TrainState::new(scene(3));
         let limits = Limits { cap: 3, extent: 1.0, min_opacity: 0.0 };
-        once.run(&mut learner, &context(limits, 0, 0)).unwrap();
-        assert_eq!(learner.scene().background, [0.5; 3]);
+        once.run(&mut train_state, &context(limits, 0, 0)).unwrap();
+        assert_eq!(train_state.scene().background, [0.5; 3]);
     }
 }

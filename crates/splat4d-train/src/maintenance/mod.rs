@@ -1,14 +1,15 @@
 //! Maintenance of a learner between steps: Gaussians are added, moved, merged and removed, control nodes follow,
 //! opacities are lowered, rows are sorted.
 //!
-//! A stage has a list of [`Upkeep`] operations; after every step those that are due run, in the order of [`Order`]. An
-//! operation changes rows only through [`Learner::apply`], so it works for every motion model, and losses are notified.
+//! A stage has a list of [`Maintenance`] operations; after every step those that are due run, in the order of [`RunOrder`]. An
+//! operation changes rows only through [`TrainState::apply`], so it works for every motion model, and losses are notified.
 //! A new one is a file here, and a line where a program adds it to a stage.
 
 pub(crate) mod adc;
 pub(crate) mod densify;
 pub(crate) mod floaters;
 pub(crate) mod guided;
+pub mod importance;
 pub(crate) mod mcmc;
 pub(crate) mod merge;
 pub(crate) mod morton;
@@ -20,7 +21,6 @@ pub(crate) mod relocate;
 pub(crate) mod split;
 #[cfg(test)]
 pub(crate) mod tests;
-pub mod worth;
 
 pub(crate) use adc::{Adc, AdcSettings, DENSE, FINEST};
 pub(crate) use densify::LEAST;
@@ -39,7 +39,7 @@ pub(crate) use split::{Split, SplitSettings};
 
 use crate::Result;
 use crate::capture::frames::Frames;
-use crate::learner::Learner;
+use crate::train_state::TrainState;
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::{Real, Rng, sym3};
 use splat4d::render::Antialias;
@@ -147,7 +147,7 @@ impl Context<'_> {
 /// The order in which operations of one step run, whatever the order in which they were added; those of one place run in
 /// that one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Order {
+pub enum RunOrder {
     /// Nodes, while statistics of the Gaussians that follow them are still there.
     Nodes,
     /// Gaussians are put where images want them; before densification, which begins the statistics again.
@@ -170,20 +170,20 @@ pub enum Order {
 ///
 /// `run` takes `&mut self`: what an operation remembers from time to time is its own, and goes into checkpoints by
 /// [`state`](Self::state).
-pub trait Upkeep: Send + Sync {
+pub trait Maintenance: Send + Sync {
     /// Its name, which is its own among the operations of a stage that remember anything: checkpoints use it.
     fn name(&self) -> &str;
 
     /// When it runs among those that are due at one step.
-    fn order(&self) -> Order {
-        Order::Last
+    fn order(&self) -> RunOrder {
+        RunOrder::Last
     }
 
     /// Whether it is to run after so many steps of the stage; see [`once`](Self::once) for the time before the first one.
     fn due(&self, at: &At) -> bool;
 
     /// Does it.
-    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change>;
+    fn run(&mut self, train_state: &mut TrainState, c: &Context<'_>) -> Result<Change>;
 
     /// Whether it is done once in a stage, perhaps before the first step (`at.step` is 0 then). After a resume at that
     /// very step it runs again, and must then change nothing.
@@ -221,24 +221,24 @@ pub trait Upkeep: Send + Sync {
 /// Lets every layer grow under the one cap: `layer` gets a layer's number, how many rows it may add (to be lowered by those
 /// it adds) and its random numbers. Statistics begin again.
 fn grow(
-    learner: &mut Learner,
+    train_state: &mut TrainState,
     c: &Context<'_>,
-    layer: impl Fn(&mut Learner, usize, &mut usize, Rng) -> Change,
+    layer: impl Fn(&mut TrainState, usize, &mut usize, Rng) -> Change,
 ) -> Change {
     let mut change = Change::default();
-    let mut spare = c.limits.cap.saturating_sub(learner.scene().len());
-    let learning = learner.learning();
-    let mut rest: usize = learning.iter().map(|&l| learner.scene().layers[l].params.len()).sum();
+    let mut spare = c.limits.cap.saturating_sub(train_state.scene().len());
+    let learning = train_state.learning();
+    let mut rest: usize = learning.iter().map(|&l| train_state.scene().layers[l].params.len()).sum();
     for index in learning {
         // What is left of the cap is shared by size, so that the first layer does not starve the others; what a
         // layer does not use goes to the next.
-        let rows = learner.scene().layers[index].params.len();
+        let rows = train_state.scene().layers[index].params.len();
         let mut room = (spare * rows).div_ceil(rest.max(1));
         (spare, rest) = (spare - room, rest - rows);
-        change += layer(learner, index, &mut room, c.rng("densify").fork(index as u64));
+        change += layer(train_state, index, &mut room, c.rng("densify").fork(index as u64));
         spare += room;
     }
-    learner.clear_stats();
+    train_state.clear_stats();
     change
 }
 

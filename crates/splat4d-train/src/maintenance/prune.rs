@@ -1,11 +1,11 @@
 //! Pruning by worth while a scene is trained: again and again a share of the Gaussians goes, and what remains learns on.
 //! Source: 4DGS-1K (Yuan et al. 2025), there once, after training.
 
-use super::worth::{ScoreConfig, Scores, Spatial, prune, score};
-use super::{At, Change, Context, Order, Upkeep};
+use super::importance::{ScoreConfig, Scores, Spatial, prune, score};
+use super::{At, Change, Context, Maintenance, RunOrder};
 use crate::Result;
-use crate::learner::Learner;
 use crate::settings::{Choice, settings};
+use crate::train_state::TrainState;
 
 impl Choice for Spatial {
     const NAMES: &'static [(&'static str, Self)] = &[
@@ -49,22 +49,22 @@ impl Prune {
     }
 
     /// The scores that it goes by.
-    fn scores(&self, learner: &Learner, c: &Context<'_>) -> Result<Scores> {
+    fn scores(&self, train_state: &TrainState, c: &Context<'_>) -> Result<Scores> {
         let PruneSettings { views, spatial, .. } = self.settings;
         let every = c.frames.len().div_ceil(views.max(1)).max(1);
         // As `compress` does by default; docs/benchmarks.md has what it won.
         let config = ScoreConfig { spatial, volume: false, every, antialias: c.antialias, ..ScoreConfig::default() };
-        score(learner.scene(), c.frames, &config, &mut |_, _| {})
+        score(train_state.scene(), c.frames, &config, &mut |_, _| {})
     }
 }
 
-impl Upkeep for Prune {
+impl Maintenance for Prune {
     fn name(&self) -> &str {
         "prune"
     }
 
-    fn order(&self) -> Order {
-        Order::Remove
+    fn order(&self) -> RunOrder {
+        RunOrder::Remove
     }
 
     /// Not if fewer than half an interval is left, in which the scene would not recover.
@@ -73,14 +73,14 @@ impl Upkeep for Prune {
         at.step.is_multiple_of(interval) && at.steps.saturating_sub(at.step) >= interval.div_ceil(2)
     }
 
-    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
-        let before = learner.scene().len();
-        let scores = self.scores(learner, c)?;
-        let edits = prune(learner.scene(), &scores, self.settings.ratio);
-        for layer in learner.learning() {
-            learner.apply(layer, &edits[layer], &c.rng("prune"));
+    fn run(&mut self, train_state: &mut TrainState, c: &Context<'_>) -> Result<Change> {
+        let before = train_state.scene().len();
+        let scores = self.scores(train_state, c)?;
+        let edits = prune(train_state.scene(), &scores, self.settings.ratio);
+        for layer in train_state.learning() {
+            train_state.apply(layer, &edits[layer], &c.rng("prune"));
         }
-        Ok(Change { removed: before - learner.scene().len(), ..Change::default() })
+        Ok(Change { removed: before - train_state.scene().len(), ..Change::default() })
     }
 }
 
@@ -97,11 +97,11 @@ mod tests {
 
     #[test]
     fn a_share_of_the_gaussians_goes() {
-        let (frames, mut learner) = (Made::new(4, 1, 16), Learner::new(scene(40)));
+        let (frames, mut train_state) = (Made::new(4, 1, 16), TrainState::new(scene(40)));
         let limits = Limits { cap: 40, extent: 4.0, min_opacity: 0.005 };
         let c = Context { frames: &frames, ..context(limits, 0, 0) };
-        let change = pruning().run(&mut learner, &c).unwrap();
-        assert_eq!((change, learner.scene().len()), (Change { removed: 10, ..Change::default() }, 30));
+        let change = pruning().run(&mut train_state, &c).unwrap();
+        assert_eq!((change, train_state.scene().len()), (Change { removed: 10, ..Change::default() }, 30));
     }
 
     #[test]

@@ -2,10 +2,10 @@
 //! cannot (as in Swift4D, Wu et al. 2025, and Ex4DGS, Lee et al. 2024). They are then free to play, cannot flicker, and
 //! what is left for the motion model is what moves.
 
-use super::{At, Change, Context, Upkeep};
+use super::{At, Change, Context, Maintenance};
 use crate::Result;
-use crate::learner::Learner;
 use crate::settings::settings;
+use crate::train_state::TrainState;
 use splat4d::layers::{ALWAYS, Evaluation, Layer, Scene, freeze_rows};
 use splat4d::math::Rng;
 use splat4d::motion::Still;
@@ -53,7 +53,7 @@ impl Split {
     }
 }
 
-impl Upkeep for Split {
+impl Maintenance for Split {
     fn name(&self) -> &str {
         "split"
     }
@@ -66,8 +66,8 @@ impl Upkeep for Split {
         true
     }
 
-    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
-        learner.rebuild(c.learns, |scene| split(scene, self.reach).map(drop))?;
+    fn run(&mut self, train_state: &mut TrainState, c: &Context<'_>) -> Result<Change> {
+        train_state.rebuild(c.learns, |scene| split(scene, self.reach).map(drop))?;
         Ok(Change::default())
     }
 }

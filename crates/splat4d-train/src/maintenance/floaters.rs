@@ -5,11 +5,11 @@
 //! between the other cameras, where it veils every view from there. What it showed is learnt again where others see it, or
 //! farther away. What stands before the camera that sees it may be there, and stays; so does all that two cameras see.
 
-use super::{At, Change, Context, DensifySettings, Every, Order, Upkeep};
+use super::{At, Change, Context, DensifySettings, Every, Maintenance, RunOrder};
 use crate::Result;
 use crate::capture::frames::Frames;
-use crate::learner::Learner;
 use crate::settings::settings;
+use crate::train_state::TrainState;
 use rayon::prelude::*;
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::se3::{norm, sub};
@@ -54,13 +54,13 @@ impl Floaters {
     }
 }
 
-impl Upkeep for Floaters {
+impl Maintenance for Floaters {
     fn name(&self) -> &str {
         "floaters"
     }
 
-    fn order(&self) -> Order {
-        Order::Remove
+    fn order(&self) -> RunOrder {
+        RunOrder::Remove
     }
 
     fn due(&self, at: &At) -> bool {
@@ -71,20 +71,20 @@ impl Upkeep for Floaters {
         Some(&mut self.steps)
     }
 
-    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
+    fn run(&mut self, train_state: &mut TrainState, c: &Context<'_>) -> Result<Change> {
         let places = Places::of(c.frames);
         if places.cameras.len() < FEWEST {
             return Ok(Change::default());
         }
-        let before = learner.scene().len();
-        for layer in 0..learner.scene().layers.len() {
-            let keep = places.supported(learner.scene(), layer, self.settings.distance);
+        let before = train_state.scene().len();
+        for layer in 0..train_state.scene().layers.len() {
+            let keep = places.supported(train_state.scene(), layer, self.settings.distance);
             // A layer without rows could never grow again.
             if keep.contains(&false) && keep.contains(&true) {
-                learner.apply(layer, &RowEdit::prune(Space::Gaussians, keep.into_iter()), &c.rng("floaters"));
+                train_state.apply(layer, &RowEdit::prune(Space::Gaussians, keep.into_iter()), &c.rng("floaters"));
             }
         }
-        Ok(Change { removed: before - learner.scene().len(), ..Change::default() })
+        Ok(Change { removed: before - train_state.scene().len(), ..Change::default() })
     }
 }
 
@@ -209,13 +209,13 @@ mod tests {
         g.write(4, 0, ahead.map(|v: f64| v as f32));
         let c = Context { frames: &frames, ..context(Limits { cap: 60, extent: 4.0, min_opacity: 0.005 }, 0, 0) };
         let settings = FloaterSettings { interval: 10, distance: 1.1 * near(floater) / depth };
-        let mut learner = Learner::new(s);
-        let change = Floaters { settings, steps: Every::NEVER }.run(&mut learner, &c).unwrap();
-        assert_eq!((change.removed, learner.scene().len()), (1, 59));
-        let g = &learner.scene().layers[0].params[GEOMETRY];
+        let mut train_state = TrainState::new(s);
+        let change = Floaters { settings, steps: Every::NEVER }.run(&mut train_state, &c).unwrap();
+        assert_eq!((change.removed, train_state.scene().len()), (1, 59));
+        let g = &train_state.scene().layers[0].params[GEOMETRY];
         let left: Vec<[f32; 3]> = (0..59).map(|r| g.read(r, 0)).collect();
         assert!(!left.contains(&floater.map(|v| v as f32)) && left.contains(&ahead.map(|v| v as f32)));
-        let again = Floaters { settings, steps: Every::NEVER }.run(&mut learner, &c).unwrap();
+        let again = Floaters { settings, steps: Every::NEVER }.run(&mut train_state, &c).unwrap();
         assert_eq!(again.removed, 0);
     }
 }

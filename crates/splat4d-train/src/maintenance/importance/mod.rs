@@ -20,7 +20,7 @@ use splat4d::scene::{RowEdit, Space};
 /// One edit a layer that takes away the share `ratio` (to the nearest whole number) of all Gaussians: those with the
 /// lowest scores, the earlier layer and row first among equals. One always stays.
 ///
-/// Apply it with [`Learner::apply`](crate::learner::Learner::apply), which carries moments and statistics along, or with
+/// Apply it with [`TrainState::apply`](crate::train_state::TrainState::apply), which carries moments and statistics along, or with
 /// `Layer::edit`. Panics: scores of
 /// another scene, a ratio outside of 0 to 1.
 pub fn prune(scene: &Scene<f32>, scores: &Scores, ratio: f64) -> Vec<RowEdit> {

@@ -4,10 +4,10 @@
 //! Source: Huang et al. 2024 (SC-GS), there every 5,000 of 80,000 steps from 1,000 to 25,000 with the gradient to
 //! positions in space; here with that to positions in the image, which densification gathers anyway.
 
-use super::{At, Change, Context, DensifySettings, Every, Order, Upkeep};
+use super::{At, Change, Context, DensifySettings, Every, Maintenance, RunOrder};
 use crate::Result;
-use crate::learner::Learner;
 use crate::settings::settings;
+use crate::train_state::TrainState;
 use splat4d::math::Rng;
 use splat4d::motion::skin::{NODE_HYPER, Skin, Weights};
 use splat4d::scene::{Born, GEOMETRY, RowEdit, Space};
@@ -52,13 +52,13 @@ impl AdaptNodes {
     }
 }
 
-impl Upkeep for AdaptNodes {
+impl Maintenance for AdaptNodes {
     fn name(&self) -> &str {
         "nodes"
     }
 
-    fn order(&self) -> Order {
-        Order::Nodes
+    fn order(&self) -> RunOrder {
+        RunOrder::Nodes
     }
 
     fn due(&self, at: &At) -> bool {
@@ -66,15 +66,15 @@ impl Upkeep for AdaptNodes {
         self.edits_at(at.step) || (interval > 0 && at.step.is_multiple_of(interval))
     }
 
-    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
-        for layer in 0..learner.scene().layers.len() {
-            let Some(skin) = Skin::find(&learner.scene().layers[layer].params) else { continue };
+    fn run(&mut self, train_state: &mut TrainState, c: &Context<'_>) -> Result<Change> {
+        for layer in 0..train_state.scene().layers.len() {
+            let Some(skin) = Skin::find(&train_state.scene().layers[layer].params) else { continue };
             if self.edits_at(c.at.step) {
-                self.settings.edit(&skin, learner, layer, &c.rng("adapt"));
+                self.settings.edit(&skin, train_state, layer, &c.rng("adapt"));
             }
-            skin.bind(&mut learner.scene_mut().layers[layer].params);
+            skin.bind(&mut train_state.scene_mut().layers[layer].params);
         }
-        learner.neighbours_changed();
+        train_state.neighbours_changed();
         Ok(Change::default())
     }
 
@@ -94,8 +94,8 @@ struct Pull {
 }
 
 impl NodeSettings {
-    fn edit(&self, skin: &Skin, learner: &mut Learner, layer: usize, rng: &Rng) {
-        let (p, stats) = (&learner.scene().layers[layer].params, learner.stats());
+    fn edit(&self, skin: &Skin, train_state: &mut TrainState, layer: usize, rng: &Rng) {
+        let (p, stats) = (&train_state.scene().layers[layer].params, train_state.stats());
         let count = skin.count(p);
         let mut weights = Weights::default();
         skin.weigh(p, &mut weights);
@@ -127,8 +127,8 @@ impl NodeSettings {
             return;
         }
         strained.iter().for_each(|&k| edit.push(k as u32, Born::Clone));
-        learner.apply(layer, &edit, rng);
-        let nodes = &mut learner.scene_mut().layers[layer].params[skin.nodes];
+        train_state.apply(layer, &edit, rng);
+        let nodes = &mut train_state.scene_mut().layers[layer].params[skin.nodes];
         for (j, &k) in strained.iter().enumerate() {
             nodes.write(kept + j, 0, pulls[k].place.map(|x| (x / pulls[k].gradient) as f32));
             for c in 0..skin.spec.hyper {

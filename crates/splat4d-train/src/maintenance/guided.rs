@@ -6,11 +6,11 @@
 //! 16 pixels of which 85 % are among the worst 40 % of the pixels, a border of 10 % left out; every second pixel; depths
 //! between 0.7 and 7.5 times the largest seen, with 5 % of jitter; opacity 0.1.
 
-use super::{At, Change, Context, Order, Upkeep, logit};
+use super::{At, Change, Context, Maintenance, RunOrder, logit};
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};
-use crate::learner::Learner;
 use crate::settings::settings;
+use crate::train_state::TrainState;
 use splat4d::device;
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::Rng;
@@ -86,13 +86,13 @@ impl Guided {
     }
 }
 
-impl Upkeep for Guided {
+impl Maintenance for Guided {
     fn name(&self) -> &str {
         "guided sampling"
     }
 
-    fn order(&self) -> Order {
-        Order::Place
+    fn order(&self) -> RunOrder {
+        RunOrder::Place
     }
 
     fn due(&self, at: &At) -> bool {
@@ -106,8 +106,8 @@ impl Upkeep for Guided {
     }
 
     /// Adds Gaussians to the first layer. Errors: an image cannot be read.
-    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
-        let (rng, scene) = (c.rng("guided"), learner.scene());
+    fn run(&mut self, train_state: &mut TrainState, c: &Context<'_>) -> Result<Change> {
+        let (rng, scene) = (c.rng("guided"), train_state.scene());
         let room = c.limits.cap.saturating_sub(scene.len());
         let budget = room.min((scene.len() as f64 * self.settings.share) as usize);
         if budget == 0 || scene.layers.first().is_none_or(|l| l.params.is_empty()) {
@@ -124,8 +124,8 @@ impl Upkeep for Guided {
         let rows = scene.layers[0].params.len();
         let mut edit = RowEdit::identity(Space::Gaussians, rows);
         points.iter().for_each(|_| edit.push(0, Born::Clone));
-        learner.apply(0, &edit, &rng);
-        let scene = learner.scene_mut();
+        train_state.apply(0, &edit, &rng);
+        let scene = train_state.scene_mut();
         let clip = scene.clip[1] - scene.clip[0] + 1.0 / scene.fps;
         let p = &mut scene.layers[0].params;
         let still = [VELOCITIES, ROTATION_RATES, FEATURE_TABLE].map(|name| p.find(name));
@@ -248,14 +248,14 @@ mod tests {
                 let mean = s.layers[0].params[GEOMETRY].read::<3>(row, 0);
                 s.layers[0].params[GEOMETRY].write(row, 0, mean.map(|x| 0.3 * x));
             }
-            let mut learner = Learner::new(s);
+            let mut train_state = TrainState::new(s);
             let mut guided = Guided { settings: GuidedSettings { from: 0.2, times: 2, share: 0.5 } };
             let limits = Limits { cap, extent: 4.0, min_opacity: 0.005 };
             let c = Context { frames: &frames, ..context(limits, 3, 9) };
-            let change = guided.run(&mut learner, &c).unwrap();
-            let rows = [learner.scene().len(), learner.moments()[0].table(GEOMETRY).rows()];
+            let change = guided.run(&mut train_state, &c).unwrap();
+            let rows = [train_state.scene().len(), train_state.moments()[0].table(GEOMETRY).rows()];
             assert_eq!(rows, [200 + change.added; 2]);
-            learner.into_scene()
+            train_state.into_scene()
         };
         let s = run(1000);
         assert!(s.len() > 210, "{} Gaussians", s.len());

@@ -6,10 +6,10 @@
 //! gradient and ½ opacity; the correction of opacity and scale is that of 3DGS as MCMC (Kheradmand et al. 2024).
 
 use super::mcmc::{Places, join};
-use super::{At, Change, Context, DensifySettings, Every, Order, Upkeep, is_dead, opacity};
+use super::{At, Change, Context, DensifySettings, Every, Maintenance, RunOrder, is_dead, opacity};
 use crate::Result;
-use crate::learner::Learner;
 use crate::settings::settings;
+use crate::train_state::TrainState;
 
 settings! {
     /// Settings of the relocation of the faintest Gaussians, with any strategy.
@@ -47,13 +47,13 @@ impl Relocate {
     }
 }
 
-impl Upkeep for Relocate {
+impl Maintenance for Relocate {
     fn name(&self) -> &str {
         "relocate"
     }
 
-    fn order(&self) -> Order {
-        Order::Place
+    fn order(&self) -> RunOrder {
+        RunOrder::Place
     }
 
     /// Not in the last interval: what moved then would learn nothing any more.
@@ -63,11 +63,11 @@ impl Upkeep for Relocate {
     }
 
     /// Moves rows of every layer; their number stays.
-    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
+    fn run(&mut self, train_state: &mut TrainState, c: &Context<'_>) -> Result<Change> {
         let settings = &self.settings;
         let mut moved = 0;
-        for layer in learner.learning() {
-            let scene = learner.scene();
+        for layer in train_state.learning() {
+            let scene = train_state.scene();
             let rows = scene.layers[layer].params.len();
             let spans = scene.layers[layer].spans();
             let faint = |r: usize| is_dead(scene, layer, r, settings.threshold, spans[r]);
@@ -84,11 +84,11 @@ impl Upkeep for Relocate {
                 continue;
             }
             moved += moves.len();
-            let places = Places::new(learner, layer, live, settings.gradient_share);
-            join(learner, &c.limits, &places, &moves, 0, c.rng("relocate").fork(layer as u64));
+            let places = Places::new(train_state, layer, live, settings.gradient_share);
+            join(train_state, &c.limits, &places, &moves, 0, c.rng("relocate").fork(layer as u64));
         }
         if self.densification.interval == 0 || c.at.step >= self.densification.last {
-            learner.clear_stats();
+            train_state.clear_stats();
         }
         Ok(Change { added: 0, moved, removed: 0 })
     }
@@ -133,13 +133,13 @@ mod tests {
             g.set(r, OPACITY, if r < 30 { -6.0 - 0.1 * r as f32 } else { -1.0 });
         }
         let before = picture(&s);
-        let mut learner = Learner::new(s);
+        let mut train_state = TrainState::new(s);
         // Row 150 alone has a gradient: half of all draws are its.
-        learner.stats_mut().tables[0].write(150, 0, [1.0, 1.0, 3.0]);
+        train_state.stats_mut().tables[0].write(150, 0, [1.0, 1.0, 3.0]);
         let limits = Limits { cap: 300, extent: 4.0, min_opacity: 0.005 };
         let mut relocate = RELOCATE;
-        let change = relocate.run(&mut learner, &context(limits, 1, 7)).unwrap();
-        let s = learner.into_scene();
+        let change = relocate.run(&mut train_state, &context(limits, 1, 7)).unwrap();
+        let s = train_state.into_scene();
         assert_eq!((change, s.len()), (Change { added: 0, moved: 20, removed: 0 }, 200));
         let opaque = |r: usize| opacity(&s, 0, r);
         assert!((0..10).all(|r| opaque(r) < 0.02), "the less faint stay");

@@ -5,11 +5,11 @@
 //! Source: Kheradmand et al. 2024 (3DGS as MCMC) §3; Wang et al. 2025 (FreeTimeGS) §3.3.
 
 use super::{
-    At, Change, Context, DensifySettings, Every, Limits, Order, Strategy, Upkeep, grow, is_dead, logit, opacity,
+    At, Change, Context, DensifySettings, Every, Limits, Maintenance, RunOrder, Strategy, grow, is_dead, logit, opacity,
 };
 use crate::Result;
-use crate::learner::Learner;
 use crate::settings::settings;
+use crate::train_state::TrainState;
 use splat4d::math::Rng;
 use splat4d::scene::params::OPACITY;
 use splat4d::scene::{Born, GEOMETRY, RowEdit, Space};
@@ -53,22 +53,22 @@ impl Mcmc {
     }
 }
 
-impl Upkeep for Mcmc {
+impl Maintenance for Mcmc {
     fn name(&self) -> &str {
         "mcmc"
     }
 
-    fn order(&self) -> Order {
-        Order::Grow
+    fn order(&self) -> RunOrder {
+        RunOrder::Grow
     }
 
     fn due(&self, at: &At) -> bool {
         self.steps.is_due(at.step)
     }
 
-    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
+    fn run(&mut self, train_state: &mut TrainState, c: &Context<'_>) -> Result<Change> {
         let this = *self;
-        Ok(grow(learner, c, |learner, layer, spare, rng| this.layer(learner, &c.limits, layer, spare, rng)))
+        Ok(grow(train_state, c, |train_state, layer, spare, rng| this.layer(train_state, &c.limits, layer, spare, rng)))
     }
 
     fn densification(&mut self) -> Option<&mut Every> {
@@ -99,8 +99,15 @@ pub(crate) fn relocated(o: f64, copies: usize) -> (f64, f64) {
 }
 
 impl Mcmc {
-    fn layer(&self, learner: &mut Learner, limits: &Limits, layer: usize, spare: &mut usize, rng: Rng) -> Change {
-        let scene = learner.scene();
+    fn layer(
+        &self,
+        train_state: &mut TrainState,
+        limits: &Limits,
+        layer: usize,
+        spare: &mut usize,
+        rng: Rng,
+    ) -> Change {
+        let scene = train_state.scene();
         let rows = scene.layers[layer].params.len();
         let spans = scene.layers[layer].spans();
         let dead: Vec<bool> = (0..rows).map(|r| is_dead(scene, layer, r, limits.min_opacity, spans[r])).collect();
@@ -111,9 +118,9 @@ impl Mcmc {
         let grown = ((rows as f64 * self.settings.growth).ceil() as usize).saturating_sub(rows);
         let added = grown.min(*spare);
         *spare -= added;
-        let places = Places::new(learner, layer, live, self.gradient_share);
+        let places = Places::new(train_state, layer, live, self.gradient_share);
         let moves: Vec<u32> = (0..rows as u32).filter(|&r| dead[r as usize]).collect();
-        join(learner, limits, &places, &moves, added, rng);
+        join(train_state, limits, &places, &moves, added, rng);
         Change { added, moved: moves.len(), removed: 0 }
     }
 }
@@ -127,10 +134,10 @@ pub(super) struct Places {
 
 impl Places {
     /// The `live` rows of a layer; where nothing was seen to have a gradient, opacity alone counts.
-    pub(super) fn new(learner: &Learner, layer: usize, live: Vec<usize>, share: f64) -> Self {
+    pub(super) fn new(train_state: &TrainState, layer: usize, live: Vec<usize>, share: f64) -> Self {
         let mean = |f: &dyn Fn(usize) -> f64| (live.iter().map(|&r| f(r)).sum::<f64>() / live.len() as f64).max(1e-30);
-        let gradient = |r: usize| f64::from(learner.stats().gradient(layer, r));
-        let opaque = |r: usize| opacity(learner.scene(), layer, r);
+        let gradient = |r: usize| f64::from(train_state.stats().gradient(layer, r));
+        let opaque = |r: usize| opacity(train_state.scene(), layer, r);
         let (mean_gradient, mean_opacity) = (mean(&gradient), mean(&opaque));
         let share = if mean_gradient > 1e-29 { share } else { 0.0 };
         let mut total = 0.0;
@@ -153,8 +160,15 @@ impl Places {
 
 /// Moves the rows `moves` (increasing) onto drawn places of the same layer and adds `added` more there; those that share a
 /// place then look together as its one Gaussian did: [`relocated`].
-pub(super) fn join(learner: &mut Learner, limits: &Limits, places: &Places, moves: &[u32], added: usize, rng: Rng) {
-    let (scene, layer) = (learner.scene(), places.layer);
+pub(super) fn join(
+    train_state: &mut TrainState,
+    limits: &Limits,
+    places: &Places,
+    moves: &[u32],
+    added: usize,
+    rng: Rng,
+) {
+    let (scene, layer) = (train_state.scene(), places.layer);
     let rows = scene.layers[layer].params.len();
     let mut copies = vec![1usize; rows];
     let mut draws = 0;
@@ -179,8 +193,8 @@ pub(super) fn join(learner: &mut Learner, limits: &Limits, places: &Places, move
         }
     }
     let old: Vec<f64> = (0..rows).map(|r| opacity(scene, layer, r)).collect();
-    learner.apply(layer, &edit, &rng);
-    let layer = &mut learner.scene_mut().layers[layer];
+    train_state.apply(layer, &edit, &rng);
+    let layer = &mut train_state.scene_mut().layers[layer];
     for (j, &parent) in edit.parent.iter().enumerate() {
         let n = copies[parent as usize];
         if n > 1 {
@@ -216,14 +230,14 @@ mod tests {
     fn the_dead_move_counts_are_conserved_and_the_cap_holds() {
         let mut s = scene(100);
         (0..10).for_each(|r| s.layers[0].params[GEOMETRY].set(r, OPACITY, -9.0));
-        let mut learner = Learner::new(s);
+        let mut train_state = TrainState::new(s);
         let mut mcmc = Mcmc { settings: McmcSettings::default(), gradient_share: 0.5, steps: Every::NEVER };
         let limits = Limits { cap: 103, extent: 1.0, min_opacity: 0.005 };
-        let change = mcmc.run(&mut learner, &context(limits, 7, 0)).unwrap();
-        assert_eq!((change.added, change.moved, learner.scene().len()), (3, 10, 103));
-        assert_eq!(learner.moments()[0].table(GEOMETRY).rows(), 103);
-        assert!((0..103).all(|r| opacity(learner.scene(), 0, r) > 0.005));
-        let again = mcmc.run(&mut learner, &context(limits, 7, 1)).unwrap();
+        let change = mcmc.run(&mut train_state, &context(limits, 7, 0)).unwrap();
+        assert_eq!((change.added, change.moved, train_state.scene().len()), (3, 10, 103));
+        assert_eq!(train_state.moments()[0].table(GEOMETRY).rows(), 103);
+        assert!((0..103).all(|r| opacity(train_state.scene(), 0, r) > 0.005));
+        let again = mcmc.run(&mut train_state, &context(limits, 7, 1)).unwrap();
         assert_eq!(again, Change::default());
     }
 }

@@ -207,7 +207,7 @@ fn interval_buckets_lose_nothing() {
             for ((layer, buckets), tape) in s.layers.iter().zip(&buckets).zip(&mut tapes) {
                 let mut ids = Vec::new();
                 buckets.active(t, &mut ids);
-                tape.ask(Space::Gaussians, if all { Rows::All } else { Rows::Some(&ids) }, t);
+                tape.request(Space::Gaussians, if all { Rows::All } else { Rows::Some(&ids) }, t);
                 layer.at(&splat4d::motion::Cache::default(), tape);
             }
             let parts: Vec<Part<'_, f32>> = s.layers.iter().zip(&tapes).map(|(l, tape)| l.part(tape)).collect();

@@ -54,7 +54,7 @@ pub(crate) fn context(limits: Limits, seed: u64, iteration: usize) -> Context<'s
 }
 
 /// Steps of a stage of `steps` after which an operation is due.
-pub(crate) fn due_steps(operation: &dyn Upkeep, steps: usize) -> Vec<usize> {
+pub(crate) fn due_steps(operation: &dyn Maintenance, steps: usize) -> Vec<usize> {
     (1..=steps).filter(|&step| operation.due(&At { step, steps })).collect()
 }
 

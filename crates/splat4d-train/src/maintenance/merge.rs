@@ -1,10 +1,10 @@
 //! Too many Gaussians in one place: near pairs become one (merging), or the fainter of a pair goes (spatial-proximity
 //! pruning). Pairs are mutual nearest neighbours, so that no row takes part twice.
 
-use super::{At, Change, Context, Order, Upkeep, covariances, logit, opacity};
+use super::{At, Change, Context, Maintenance, RunOrder, covariances, logit, opacity};
 use crate::Result;
-use crate::learner::Learner;
 use crate::settings::{Choice, settings};
+use crate::train_state::TrainState;
 use splat4d::layers::Scene;
 use splat4d::math::knn::knn;
 use splat4d::math::sym3;
@@ -57,27 +57,27 @@ pub(crate) struct Merge {
     pub settings: MergeSettings,
 }
 
-impl Upkeep for Merge {
+impl Maintenance for Merge {
     fn name(&self) -> &str {
         "merge"
     }
 
-    fn order(&self) -> Order {
-        Order::Merge
+    fn order(&self) -> RunOrder {
+        RunOrder::Merge
     }
 
     fn due(&self, at: &At) -> bool {
         at.step.is_multiple_of(self.settings.interval) && at.step < at.steps
     }
 
-    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
-        let before = learner.scene().len();
-        for layer in learner.learning() {
-            if let Some(edit) = self.settings.edit(learner, layer) {
-                learner.apply(layer, &edit, &c.rng("crowding"));
+    fn run(&mut self, train_state: &mut TrainState, c: &Context<'_>) -> Result<Change> {
+        let before = train_state.scene().len();
+        for layer in train_state.learning() {
+            if let Some(edit) = self.settings.edit(train_state, layer) {
+                train_state.apply(layer, &edit, &c.rng("crowding"));
             }
         }
-        Ok(Change { removed: before - learner.scene().len(), ..Change::default() })
+        Ok(Change { removed: before - train_state.scene().len(), ..Change::default() })
     }
 }
 
@@ -90,13 +90,13 @@ impl Merge {
 
 impl MergeSettings {
     /// One round on one layer: changes the rows that stay, and says which do. `None`: there is no pair.
-    fn edit(&self, learner: &mut Learner, layer: usize) -> Option<RowEdit> {
-        let n = learner.scene().layers[layer].params.len();
-        let pairs = self.pairs(learner.scene(), layer);
+    fn edit(&self, train_state: &mut TrainState, layer: usize) -> Option<RowEdit> {
+        let n = train_state.scene().layers[layer].params.len();
+        let pairs = self.pairs(train_state.scene(), layer);
         if pairs.is_empty() {
             return None;
         }
-        let scene = learner.scene_mut();
+        let scene = train_state.scene_mut();
         let covs = covariances(scene, layer);
         let mut keep = vec![true; n];
         for &(a, b) in &pairs {
@@ -210,10 +210,10 @@ mod tests {
         for pair in [Pair::Merge, Pair::Prune] {
             let rule = MergeSettings { pair, distance: 0.5, interval: 1 };
             let before = twins();
-            let mut learner = Learner::new(twins());
-            let edit = rule.edit(&mut learner, 0).unwrap();
+            let mut train_state = TrainState::new(twins());
+            let edit = rule.edit(&mut train_state, 0).unwrap();
             assert_eq!(edit.parent, (0..50).collect::<Vec<u32>>(), "the fainter one goes");
-            let s = learner.scene();
+            let s = train_state.scene();
             let changed = s.layers[0].params[GEOMETRY] != before.layers[0].params[GEOMETRY];
             assert_eq!(changed, pair == Pair::Merge);
             if pair == Pair::Merge {
@@ -224,7 +224,7 @@ mod tests {
                 assert!(edit.born.iter().all(|b| *b == Born::Moved));
             }
             let far = MergeSettings { distance: 0.01, ..rule };
-            assert!(far.edit(&mut Learner::new(twins()), 0).is_none());
+            assert!(far.edit(&mut TrainState::new(twins()), 0).is_none());
         }
     }
 
@@ -233,10 +233,10 @@ mod tests {
         let settings = MergeSettings { pair: Pair::Prune, distance: 0.5, interval: 10 };
         let mut merge = Merge { settings };
         assert_eq!(due_steps(&merge, 30), [10, 20]);
-        let mut learner = Learner::new(twins());
+        let mut train_state = TrainState::new(twins());
         let limits = Limits { cap: 100, extent: 1.0, min_opacity: 0.0 };
-        let change = merge.run(&mut learner, &context(limits, 0, 0)).unwrap();
-        assert_eq!((change.removed, learner.scene().len()), (50, 50));
+        let change = merge.run(&mut train_state, &context(limits, 0, 0)).unwrap();
+        assert_eq!((change.removed, train_state.scene().len()), (50, 50));
     }
 
     #[test]
@@ -249,6 +249,6 @@ mod tests {
         for r in 75..100 {
             s.layers[0].params[GEOMETRY].write(r, LOG_SCALE, [-0.5; 3]);
         }
-        assert!(rule.edit(&mut Learner::new(s), 0).is_none());
+        assert!(rule.edit(&mut TrainState::new(s), 0).is_none());
     }
 }

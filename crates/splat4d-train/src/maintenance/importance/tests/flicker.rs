@@ -2,11 +2,11 @@
 
 use super::*;
 use crate::eval::metrics::psnr;
-use crate::learner::Learner;
+use crate::maintenance::{Limits, Prune, PruneSettings};
 use crate::methods::{Group, Rate, Stage};
 use crate::step::loss::TrainLoss;
 use crate::step::trainer::{Settings, Trainer};
-use crate::upkeep::{Limits, Prune, PruneSettings};
+use crate::train_state::TrainState;
 use std::sync::Arc;
 
 /// Gaussians of the truth, and for each of them so many that only flicker.
@@ -65,7 +65,7 @@ fn tune(scene: Scene<f32>, frames: Arc<Drawn>) -> Scene<f32> {
     while !t.is_done() {
         t.step().unwrap().expect("no fault");
     }
-    t.learner.into_scene()
+    t.train_state.into_scene()
 }
 
 fn quality(scene: &Scene<f32>, frames: &Drawn) -> f64 {
@@ -121,7 +121,7 @@ fn a_flickering_copy_of_the_backdrop_goes_and_the_image_stays() {
     assert_eq!(edits[0].len(), TRUTH);
     let lasting = edits[0].parent.iter().filter(|&&p| (p as usize) < TRUTH).count();
     assert!(lasting * 10 >= TRUTH * 9, "{lasting} of {TRUTH} that last are kept");
-    let mut pruned = Learner::new(trained.clone());
+    let mut pruned = TrainState::new(trained.clone());
     pruned.apply(0, &edits[0], &Rng::new(0, "prune", 0));
     let after = quality(&tune(pruned.into_scene(), frames.clone()), &frames);
     assert!(after >= before - BOUND, "{before} dB before, {after} dB with a fifth of the Gaussians");
@@ -159,11 +159,11 @@ fn rows_go_while_a_scene_is_trained_and_the_run_repeats() {
             }
             if resumed && t.progress.stage_step == 15 {
                 let old = std::mem::replace(&mut t, fresh());
-                t.restore(old.learner, old.progress);
+                t.restore(old.train_state, old.progress);
             }
         }
         assert_eq!(sizes, [(10, 140), (20, 98)], "none at step 30: too few steps are left");
-        assert_eq!(t.learner.stats().tables[0].rows(), 98);
+        assert_eq!(t.train_state.stats().tables[0].rows(), 98);
         let rows: Vec<[f32; 11]> = (0..98).map(|r| t.scene().layers[0].params[GEOMETRY].read::<11>(r, 0)).collect();
         rows
     };

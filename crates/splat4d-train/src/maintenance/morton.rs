@@ -1,9 +1,9 @@
 //! Morton order: after the last densification rows are sorted by the places of their means, for the rest of the run.
 //! Neighbours in space become neighbours in memory, which every later step reads faster.
 
-use super::{At, Change, Context, DensifySettings, Every, Order, Strategy, Upkeep};
+use super::{At, Change, Context, DensifySettings, Every, Maintenance, RunOrder, Strategy};
 use crate::Result;
-use crate::learner::Learner;
+use crate::train_state::TrainState;
 use splat4d::format::quant::{MORTON_BITS, morton};
 use splat4d::layers::Scene;
 use splat4d::scene::{Born, GEOMETRY, RowEdit, Space};
@@ -22,23 +22,23 @@ impl MortonOrder {
     }
 }
 
-impl Upkeep for MortonOrder {
+impl Maintenance for MortonOrder {
     fn name(&self) -> &str {
         "morton order"
     }
 
-    fn order(&self) -> Order {
-        Order::Sort
+    fn order(&self) -> RunOrder {
+        RunOrder::Sort
     }
 
     fn due(&self, at: &At) -> bool {
         self.densification.is_last(at.step)
     }
 
-    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
-        for layer in learner.learning() {
-            let edit = sorted(learner.scene(), layer);
-            learner.apply(layer, &edit, &c.rng("order"));
+    fn run(&mut self, train_state: &mut TrainState, c: &Context<'_>) -> Result<Change> {
+        for layer in train_state.learning() {
+            let edit = sorted(train_state.scene(), layer);
+            train_state.apply(layer, &edit, &c.rng("order"));
         }
         Ok(Change::default())
     }
@@ -92,11 +92,11 @@ mod tests {
             (1..500).map(|r| (g.get(r, 0) - g.get(r - 1, 0)).abs() + (g.get(r, 1) - g.get(r - 1, 1)).abs()).sum::<f32>()
         };
         let before = distance(&s);
-        let mut learner = Learner::new(s);
+        let mut train_state = TrainState::new(s);
         let limits = Limits { cap: 500, extent: 1.0, min_opacity: 0.0 };
         let mut order = MortonOrder { densification: Every { first: 1, last: 10, interval: 4 } };
-        order.run(&mut learner, &context(limits, 0, 0)).unwrap();
-        assert!(distance(learner.scene()) < 0.6 * before);
+        order.run(&mut train_state, &context(limits, 0, 0)).unwrap();
+        assert!(distance(train_state.scene()) < 0.6 * before);
         assert_eq!(due_steps(&order, 20), [8], "after the last densification");
     }
 }

@@ -1,4 +1,4 @@
-//! [`KeptMotion`]: whether a device can keep a layer, and how it sees it.
+//! [`ResidentMotion`]: whether a device can keep a layer, and how it sees it.
 
 use crate::layers::Layer;
 use crate::motion::{Polynomial, Slices};
@@ -7,14 +7,14 @@ use crate::scene::{GEOMETRY, Key, LIFE, LifeKind, SH, Time};
 
 /// What a device knows of a layer that it can keep: how it moves, and its tables in the order of [`KEPT`].
 #[derive(Clone, Debug, PartialEq)]
-pub struct KeptMotion {
+pub struct ResidentMotion {
     /// How its rows move.
     pub moves: Moves,
     /// Its tables.
     pub keys: [Option<Key>; KEPT],
 }
 
-impl KeptMotion {
+impl ResidentMotion {
     /// As all these times see it; none: no device knows such motion.
     pub fn new(layer: &Layer<f32>, times: &[Time]) -> Option<Self> {
         let life = (layer.life != LifeKind::Infinite).then_some(LIFE);

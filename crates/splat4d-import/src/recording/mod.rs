@@ -28,7 +28,7 @@ use crate::corrections::{self, Corrections};
 use crate::sfm::known::pixel_unit;
 use crate::sync::graph::Evidence;
 use crate::video::{self, Cropping, Selection, Source};
-use crate::write::{self, Clip, Format, Pictures, Take};
+use crate::write::{self, Clip, Format, Pictures, Recording};
 use crate::{Error, ErrorKind, Result};
 use splat4d_train::event::Progress;
 use std::path::{Path, PathBuf};
@@ -503,7 +503,7 @@ fn finish(
         splat4d_train::run::checkpoint::write_atomically(&folder.join(&file), &bytes)?;
         points = Some(file);
     }
-    let take = Take { name: None, up: Some(solved.up), points, ..Take::default() };
+    let take = Recording { name: None, up: Some(solved.up), points, ..Recording::default() };
     report.capture = write::capture(folder, &take, &placed)?;
     report.points = solved.points.len();
     report.write(folder)?;

@@ -1,4 +1,4 @@
-//! [`Learner`]: what learns, with all that is remembered of it from step to step, row by row.
+//! [`TrainState`]: what learns, with all that is remembered of it from step to step, row by row.
 //!
 //! A step changes numbers. Everything else that happens to a learner (rows come, go and change places, a hook replaces the
 //! scene, opacities are lowered) goes through the methods here, so that scene, moments and statistics cannot come apart,
@@ -91,7 +91,7 @@ pub(crate) enum Touched {
 }
 
 /// See the module's documentation.
-pub struct Learner {
+pub struct TrainState {
     scene: Scene<f32>,
     moments: Vec<Moments<f32>>,
     stats: Stats,
@@ -110,7 +110,7 @@ pub(crate) struct Parts<'a> {
     pub exposure: Option<&'a mut Exposure>,
 }
 
-impl Learner {
+impl TrainState {
     /// A scene that has learnt nothing yet.
     pub(crate) fn new(scene: Scene<f32>) -> Self {
         let moments = scene.layers.iter().map(|l| Moments::new(&l.params)).collect();
@@ -236,7 +236,7 @@ impl Learner {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::upkeep::tests::scene;
+    use crate::maintenance::tests::scene;
     use splat4d::scene::GEOMETRY;
 
     #[test]
@@ -254,41 +254,41 @@ mod tests {
 
     #[test]
     fn every_way_to_change_a_learner_is_noted_for_what_it_is() {
-        let mut learner = Learner::new(scene(20));
-        assert_eq!(learner.take_touched(), Touched::Values, "nothing has been copied of a new one");
-        assert_eq!(learner.take_touched(), Touched::Nothing);
-        learner.scene_mut().layers[0].params[GEOMETRY].set(3, 0, 1.0);
-        assert_eq!(learner.take_touched(), Touched::Values);
+        let mut train_state = TrainState::new(scene(20));
+        assert_eq!(train_state.take_touched(), Touched::Values, "nothing has been copied of a new one");
+        assert_eq!(train_state.take_touched(), Touched::Nothing);
+        train_state.scene_mut().layers[0].params[GEOMETRY].set(3, 0, 1.0);
+        assert_eq!(train_state.take_touched(), Touched::Values);
         let edit = RowEdit::prune(Space::Gaussians, (0..20).map(|r| r > 4));
-        learner.apply(0, &edit, &Rng::new(0, "prune", 0));
-        learner.scene_mut();
-        assert_eq!(learner.take_touched(), Touched::Rows, "the more counts");
-        assert_eq!([learner.scene().len(), learner.moments()[0].table(GEOMETRY).rows()], [15; 2]);
-        assert_eq!(learner.stats().tables[0].rows(), 15);
-        learner.rebuild(&|_, _| true, |_| Ok(())).unwrap();
-        assert_eq!(learner.take_touched(), Touched::Values);
+        train_state.apply(0, &edit, &Rng::new(0, "prune", 0));
+        train_state.scene_mut();
+        assert_eq!(train_state.take_touched(), Touched::Rows, "the more counts");
+        assert_eq!([train_state.scene().len(), train_state.moments()[0].table(GEOMETRY).rows()], [15; 2]);
+        assert_eq!(train_state.stats().tables[0].rows(), 15);
+        train_state.rebuild(&|_, _| true, |_| Ok(())).unwrap();
+        assert_eq!(train_state.take_touched(), Touched::Values);
         let halve = |s: &mut Scene<f32>| {
             s.layers[0].edit(&RowEdit::prune(Space::Gaussians, (0..15).map(|r| r < 7)), &Rng::new(0, "half", 0));
             Ok(())
         };
-        learner.rebuild(&|_, _| true, halve).unwrap();
-        assert_eq!(learner.take_touched(), Touched::Rows);
-        assert_eq!(learner.moments()[0].table(GEOMETRY).rows(), 7);
-        learner.neighbours_changed();
-        assert_eq!(learner.take_touched(), Touched::Rows);
+        train_state.rebuild(&|_, _| true, halve).unwrap();
+        assert_eq!(train_state.take_touched(), Touched::Rows);
+        assert_eq!(train_state.moments()[0].table(GEOMETRY).rows(), 7);
+        train_state.neighbours_changed();
+        assert_eq!(train_state.take_touched(), Touched::Rows);
     }
 
     #[test]
     fn moments_of_a_layer_outlive_a_rebuild_and_those_of_another_do_not() {
-        let mut learner = Learner::new(scene(20));
-        learner.tables_mut().1[0].table_mut(GEOMETRY).fill(2.0);
-        learner.rebuild(&|_, _| true, |_| Ok(())).unwrap();
-        assert_eq!(learner.moments()[0].table(GEOMETRY).get(3, 3), 2.0);
+        let mut train_state = TrainState::new(scene(20));
+        train_state.tables_mut().1[0].table_mut(GEOMETRY).fill(2.0);
+        train_state.rebuild(&|_, _| true, |_| Ok(())).unwrap();
+        assert_eq!(train_state.moments()[0].table(GEOMETRY).get(3, 3), 2.0);
         let rename = |s: &mut Scene<f32>| {
             s.layers[0].name = "another".into();
             Ok(())
         };
-        learner.rebuild(&|_, _| true, rename).unwrap();
-        assert_eq!(learner.moments()[0].table(GEOMETRY).get(3, 3), 0.0);
+        train_state.rebuild(&|_, _| true, rename).unwrap();
+        assert_eq!(train_state.moments()[0].table(GEOMETRY).get(3, 3), 0.0);
     }
 }

@@ -61,9 +61,9 @@ mod tests {
             camera.intrinsics.fy = 100.0;
             camera
         };
-        let lookout = Lookout::new(&[camera(-4.0), camera(10.0)], &[[0.0; 3]; 5]);
-        assert!((lookout.pixels([0.0; 3]) - 50.0).abs() < 1e-9);
-        assert!(lookout.pixels([0.0, 0.0, 10.0]) < 200.0, "nearness is bounded");
+        let sampling = Lookout::new(&[camera(-4.0), camera(10.0)], &[[0.0; 3]; 5]);
+        assert!((sampling.pixels([0.0; 3]) - 50.0).abs() < 1e-9);
+        assert!(sampling.pixels([0.0, 0.0, 10.0]) < 200.0, "nearness is bounded");
         assert!(Lookout::new(&[], &[[0.0; 3], [1.0, 0.0, 0.0]]).pixels([0.0; 3]).is_finite());
         assert!(Lookout::new(&[], &[]).pixels([0.0; 3]).is_finite());
     }

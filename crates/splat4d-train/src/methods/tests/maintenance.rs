@@ -2,9 +2,9 @@
 //! for.
 
 use super::*;
-use crate::upkeep::merge::Pair;
-use crate::upkeep::worth::Spatial;
-use crate::upkeep::{
+use crate::maintenance::importance::Spatial;
+use crate::maintenance::merge::Pair;
+use crate::maintenance::{
     AdaptNodes, Every, Guided, GuidedSettings, Merge, MergeSettings, NodeSettings, Once, Prune, PruneSettings,
     Relocate, RelocateSettings,
 };

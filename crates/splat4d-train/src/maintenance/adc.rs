@@ -10,12 +10,12 @@
 //! captures and nothing on an object (docs/suite.md).
 
 use super::{
-    At, Change, Context, DensifySettings, Every, Limits, Order, Strategy, Upkeep, covariances, grow, is_dead, logit,
-    opacity, sample,
+    At, Change, Context, DensifySettings, Every, Limits, Maintenance, RunOrder, Strategy, covariances, grow, is_dead,
+    logit, opacity, sample,
 };
 use crate::Result;
-use crate::learner::Learner;
 use crate::settings::settings;
+use crate::train_state::TrainState;
 use rayon::prelude::*;
 use splat4d::layers::{Layer, Scene};
 use splat4d::math::{Rng, sym3};
@@ -69,24 +69,24 @@ pub(crate) struct Adc {
     pub steps: Every,
 }
 
-impl Upkeep for Adc {
+impl Maintenance for Adc {
     fn name(&self) -> &str {
         "adc"
     }
 
-    fn order(&self) -> Order {
-        Order::Grow
+    fn order(&self) -> RunOrder {
+        RunOrder::Grow
     }
 
     fn due(&self, at: &At) -> bool {
         self.steps.is_due(at.step)
     }
 
-    fn run(&mut self, learner: &mut Learner, c: &Context<'_>) -> Result<Change> {
+    fn run(&mut self, train_state: &mut TrainState, c: &Context<'_>) -> Result<Change> {
         let settings = self.settings;
         let share = self.share(&c.at);
-        Ok(grow(learner, c, |learner, layer, spare, rng| {
-            settings.layer(learner, &c.limits, layer, (spare, share), rng)
+        Ok(grow(train_state, c, |train_state, layer, spare, rng| {
+            settings.layer(train_state, &c.limits, layer, (spare, share), rng)
         }))
     }
 
@@ -136,13 +136,13 @@ impl AdcSettings {
 
     fn layer(
         &self,
-        learner: &mut Learner,
+        train_state: &mut TrainState,
         limits: &Limits,
         layer: usize,
         (spare, share): (&mut usize, f64),
         rng: Rng,
     ) -> Change {
-        let (scene, stats) = (learner.scene(), learner.stats());
+        let (scene, stats) = (train_state.scene(), train_state.stats());
         let rows = scene.layers[layer].params.len();
         let covs = covariances(scene, layer);
         let spans = scene.layers[layer].spans();
@@ -173,8 +173,8 @@ impl AdcSettings {
             edit.push(r as u32, if splits[r] { Born::Split } else { Born::Clone });
         }
         let old_opacity: Vec<f64> = edit.parent.iter().map(|&r| opacity(scene, layer, r as usize)).collect();
-        learner.apply(layer, &edit, &rng);
-        let scene = learner.scene_mut();
+        train_state.apply(layer, &edit, &rng);
+        let scene = train_state.scene_mut();
         let clip = scene.clip;
         let layer = &mut scene.layers[layer];
         if self.retime_clones {
@@ -229,13 +229,13 @@ mod tests {
 
     /// Runs it on a scene whose rows `seen` have the gradient 0.5, 1, ….
     fn run(s: Scene<f32>, settings: AdcSettings, seen: std::ops::Range<usize>, limits: Limits) -> (Change, Scene<f32>) {
-        let mut learner = Learner::new(s);
+        let mut train_state = TrainState::new(s);
         for (k, row) in seen.enumerate() {
-            learner.stats_mut().tables[0].write(row, 0, [1.0 + k as f32, 2.0, 5.0]);
+            train_state.stats_mut().tables[0].write(row, 0, [1.0 + k as f32, 2.0, 5.0]);
         }
         let mut adc = Adc { settings, steps: Every::NEVER };
-        let change = adc.run(&mut learner, &context(limits, 1, 0)).unwrap();
-        (change, learner.into_scene())
+        let change = adc.run(&mut train_state, &context(limits, 1, 0)).unwrap();
+        (change, train_state.into_scene())
     }
 
     #[test]
@@ -348,15 +348,15 @@ mod tests {
 
     #[test]
     fn a_share_of_the_room_goes_to_those_with_the_largest_gradients() {
-        let mut learner = Learner::new(scene(20));
-        (0..20).for_each(|row| learner.stats_mut().tables[0].write(row, 0, [1.0 + row as f32, 2.0, 5.0]));
+        let mut train_state = TrainState::new(scene(20));
+        (0..20).for_each(|row| train_state.stats_mut().tables[0].write(row, 0, [1.0 + row as f32, 2.0, 5.0]));
         let settings = AdcSettings { grad_threshold: 0.1, percent_dense: 1.0, ..AdcSettings::default() };
         let mut adc = Adc { settings, steps: Every { first: 1, last: 9, interval: 1 } };
         let limits = Limits { cap: 45, extent: 4.0, min_opacity: 0.005 };
         // The first of five: 1 − (4/5)² of the room for 25.
-        let change = adc.run(&mut learner, &context(limits, 1, 0)).unwrap();
+        let change = adc.run(&mut train_state, &context(limits, 1, 0)).unwrap();
         assert_eq!(change.added, 9);
-        let s = learner.into_scene();
+        let s = train_state.into_scene();
         let opacity = |r: usize| s.layers[0].params[GEOMETRY].get(r, OPACITY);
         assert!((0..20).all(|r| (opacity(r) < 0.0) == (r >= 11)), "clones share what their parent had");
     }
