@@ -1,6 +1,6 @@
 //! The texts that people give to verbs, read: for the fuzz targets.
 
-use crate::compressing::Order;
+use crate::compressing::CompressJob;
 use crate::editor::Editor;
 use crate::source::Source;
 use crate::{camera_file, paths, point_queries};
@@ -28,7 +28,7 @@ pub fn points(text: &str) -> Result<()> {
 
 /// Reads the settings of an unfinished compression, as `compress --resume` does.
 pub fn compress_order(text: &str) -> Result<()> {
-    Order::read(text).map(drop)
+    CompressJob::read(text).map(drop)
 }
 
 /// Who answers the page of `view --edit`.
