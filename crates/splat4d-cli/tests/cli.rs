@@ -391,7 +391,8 @@ fn a_scene_becomes_a_page_alone_or_next_to_its_file() {
 /// Body of the answer of a server at `url`.
 fn get(url: &str, path: &str) -> Vec<u8> {
     use std::io::{Read, Write};
-    let address = url.strip_prefix("http://").unwrap().trim_end_matches('/');
+    // What follows # stays in the browser: the page's token.
+    let address = url.split('#').next().unwrap().strip_prefix("http://").unwrap().trim_end_matches('/');
     let mut stream = std::net::TcpStream::connect(address).unwrap();
     write!(stream, "GET {path} HTTP/1.1\r\nhost: {address}\r\nconnection: close\r\n\r\n").unwrap();
     let mut reply = Vec::new();

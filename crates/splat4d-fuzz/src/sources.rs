@@ -82,7 +82,6 @@ pub(crate) const SOURCES: &[(&str, Covered)] = &[
     ("recording/cache.rs", Not("values of an import, in plain data; what cannot be read is made again")),
     ("recording/colmap.rs", Not("a note of our own that is compared, masks that are copied and a log that is shown")),
     ("training.rs", By(&["scene"])),
-    ("verbs/eval.rs", By(&["results_json"])),
     ("verbs/export.rs", By(&["points"])),
     ("verbs/predict.rs", By(&["actions"])),
     ("verbs/train.rs", By(&["recipe"])),

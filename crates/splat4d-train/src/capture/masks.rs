@@ -40,6 +40,8 @@ pub(super) fn fill(take: &mut RawCapture) -> Result<()> {
             );
             take.account.add(Aspect::NotRead, Severity::Warning, what);
         }
+        let others: Vec<String> = folders.iter().filter(|n| *n != name).cloned().collect();
+        report_others(take, &others);
         return Ok(());
     }
     let stated: BTreeSet<PathBuf> = take.frames.iter().filter_map(|f| f.mask.clone()).collect();

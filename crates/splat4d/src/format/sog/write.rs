@@ -12,6 +12,7 @@ use crate::{Error, Result};
 use image_webp::{ColorType, WebPEncoder};
 use serde_json::{Value, json};
 use std::io::Write;
+use std::ops::Range;
 
 /// Sides of images are multiples of this, as PlayCanvas' own are.
 const SIDE: usize = 4;
@@ -24,8 +25,6 @@ const GAUSSIANS_PER_ENTRY: usize = 8;
 /// Rounds of k-means: of the palette, and of a codebook, whose numbers are sorted and cheap.
 const ROUNDS: usize = 8;
 const BOOK_ROUNDS: usize = 40;
-/// Bins of the histogram from which a codebook begins.
-const BINS: usize = 4096;
 /// Half of the codes of a part of a quaternion.
 const HALF: f32 = 127.5;
 
@@ -124,8 +123,7 @@ struct Book {
 }
 
 impl Book {
-    /// 256 numbers with a small sum of squared distances to `all`: as dense as the cube root of their density, which is optimal for
-    /// many (Panter and Dite 1951), then Lloyd's algorithm on sorted numbers.
+    /// 256 numbers with a small sum of squared distances to `all`: [`cells`], then Lloyd's algorithm on sorted numbers.
     fn of(all: impl Iterator<Item = f32>) -> Self {
         let mut sorted: Vec<f32> = all.collect();
         sorted.sort_by(f32::total_cmp);
@@ -133,7 +131,7 @@ impl Book {
         let mut sums = Vec::with_capacity(n + 1);
         sums.push(0.0f64);
         sorted.iter().for_each(|x| sums.push(sums[sums.len() - 1] + f64::from(*x)));
-        let mut values = spread(&sorted);
+        let mut values = cells(&sorted);
         for _ in 0..BOOK_ROUNDS {
             let mut first = 0;
             for i in 0..CODES {
@@ -158,27 +156,34 @@ impl Book {
     }
 }
 
-/// 256 rising numbers over the range of sorted ones, as dense as the cube root of their density.
-fn spread(sorted: &[f32]) -> Vec<f32> {
-    let (low, high) = (f64::from(sorted[0]), f64::from(sorted[sorted.len() - 1]));
-    let width = (high - low) / BINS as f64;
-    let mut counts = [0.0f64; BINS];
+/// 256 rising numbers: the cell with the largest sum of squares is cut at its mean, until there are so many. Lone numbers far from
+/// the others get a cell of their own, which Lloyd's algorithm would not give them.
+fn cells(sorted: &[f32]) -> Vec<f32> {
+    let mut sums = vec![[0.0f64; 2]];
     for x in sorted {
-        counts[(((f64::from(*x) - low) / width.max(f64::MIN_POSITIVE)) as usize).min(BINS - 1)] += 1.0;
+        let (x, [sum, squares]) = (f64::from(*x), sums[sums.len() - 1]);
+        sums.push([sum + x, squares + x * x]);
     }
-    let mass = counts.map(f64::cbrt);
-    let step = mass.iter().sum::<f64>() / CODES as f64;
-    let (mut bin, mut before) = (0, 0.0);
-    let place = |i: usize| {
-        let wanted = (i as f64 + 0.5) * step;
-        while bin < BINS - 1 && before + mass[bin] < wanted {
-            before += mass[bin];
-            bin += 1;
-        }
-        let share = ((wanted - before) / mass[bin].max(f64::MIN_POSITIVE)).clamp(0.0, 1.0);
-        (low + (bin as f64 + share) * width) as f32
+    let mean = |cell: &Range<usize>| (sums[cell.end][0] - sums[cell.start][0]) / cell.len() as f64;
+    let spread = |cell: &Range<usize>| {
+        let sum = sums[cell.end][0] - sums[cell.start][0];
+        sums[cell.end][1] - sums[cell.start][1] - sum * sum / cell.len() as f64
     };
-    (0..CODES).map(place).collect()
+    let (mut all, mut whole) = (vec![(spread(&(0..sorted.len())), 0..sorted.len())], Vec::new());
+    while all.len() + whole.len() < CODES {
+        let Some(widest) = (0..all.len()).max_by(|a, b| all[*a].0.total_cmp(&all[*b].0)) else { break };
+        let (_, cell) = all.swap_remove(widest);
+        let middle = mean(&cell) as f32;
+        let cut = cell.start + sorted[cell.clone()].partition_point(|x| *x <= middle);
+        match cut == cell.end {
+            true => whole.push(cell),
+            false => all.extend([cell.start..cut, cut..cell.end].map(|part| (spread(&part), part))),
+        }
+    }
+    let mut values: Vec<f32> = all.iter().map(|(_, cell)| cell).chain(&whole).map(|cell| mean(cell) as f32).collect();
+    values.sort_by(f32::total_cmp);
+    values.resize(CODES, *values.last().expect("there are numbers"));
+    values
 }
 
 /// The colours above degree 0: an image of entries, one of labels, and what `meta.json` says of them.
