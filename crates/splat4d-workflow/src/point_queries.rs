@@ -178,6 +178,11 @@ impl QueryResult {
         self.asked.len()
     }
 
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
     /// As CSV: `point,time,x,y,z,camera,u,v,visible`, a line for every moment at which a point is there. `point` counts the
     /// file's lines from 0; without a camera the last four are empty.
     pub fn to_csv(&self) -> String {

@@ -79,7 +79,7 @@ fn read(bytes: &[u8]) -> Result<(Scene<f32>, Warnings)> {
         params[GEOMETRY].set(row, OPACITY, opacities[row]);
         params[SH].write(row, 0, std::array::from_fn::<f32, 3, _>(|k| (colors[3 * row + k] - 0.5) / SH_C0));
     }
-    debug_assert!(QUAT == 3, "a pose is position and rotation");
+    const { assert!(QUAT == 3, "a pose is position and rotation") };
     let changes = |row: &usize| {
         (1..frames).any(|f| (0..3).any(|k| (colors[3 * (f * rows + row) + k] - colors[3 * row + k]).abs() > VISIBLE))
     };

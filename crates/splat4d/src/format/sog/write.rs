@@ -2,7 +2,7 @@
 
 use super::{CODES, LARGEST_W, META, ROW_OF_CENTROIDS, VERSION};
 use crate::format::bytes::{byte_of_logit, sound_rows};
-use crate::format::playback::cluster::cluster;
+use crate::format::playback::cluster::{Clusters, cluster};
 use crate::format::quant::{self, MORTON_BITS, morton};
 use crate::format::{Warnings, zip};
 use crate::math::Rng;
@@ -186,15 +186,22 @@ fn cells(sorted: &[f32]) -> Vec<f32> {
     values
 }
 
+/// A file of the archive: name and bytes.
+type NamedFile = (&'static str, Vec<u8>);
+
 /// The colours above degree 0: an image of entries, one of labels, and what `meta.json` says of them.
-fn palette(params: &Params, rows: &[usize]) -> Result<(Value, [(&'static str, Vec<u8>); 2])> {
+fn palette(params: &Params, rows: &[usize]) -> Result<(Value, [NamedFile; 2])> {
     let sh = &params[SH];
     let (width, coefficients) = (sh.width() - 3, sh.width() / 3 - 1);
     let mut points = Vec::with_capacity(rows.len() * width);
     rows.iter().for_each(|r| points.extend((0..width).map(|k| sh.get(*r, 3 + k))));
-    let most = (rows.len() / GAUSSIANS_PER_ENTRY).max(LEAST_ENTRIES).min(MOST_ENTRIES).min(rows.len());
-    let weighted = points.chunks_exact(width).map(|p| (p, 1.0));
-    let found = cluster(weighted, width, most, ROUNDS, Rng::new(0, "sog palette", 0));
+    let most = (rows.len() / GAUSSIANS_PER_ENTRY).clamp(LEAST_ENTRIES, MOST_ENTRIES);
+    let found = if rows.len() <= most {
+        Clusters { centroids: points, labels: (0..rows.len() as u32).collect() }
+    } else {
+        let weighted = points.chunks_exact(width).map(|p| (p, 1.0));
+        cluster(weighted, width, most, ROUNDS, Rng::new(0, "sog palette", 0))
+    };
     let book = Book::of(found.centroids.iter().copied());
     let entries = found.centroids.len() / width;
     let mut pixels = vec![[0, 0, 0, u8::MAX]; entries.next_multiple_of(ROW_OF_CENTROIDS) * coefficients];
