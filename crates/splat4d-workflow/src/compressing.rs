@@ -60,7 +60,7 @@ pub struct CompressJob {
 /// Default of [`CompressOptions::guard`], dB: less is not seen in a moving image.
 pub const GUARD: f64 = 0.5;
 
-/// Options of [`compress`].
+/// Options of [`compress()`].
 #[derive(Clone, Debug)]
 pub struct CompressOptions {
     /// Output folder. `None`: `RUN-compressed`, or `RUN-compressed-2` and so on if it exists.
@@ -173,7 +173,7 @@ pub fn compress(run: &Path, options: &CompressOptions, stop: &AtomicBool, listen
 
 /// Continues a compression from its newest checkpoint. Of the options only `eval`, `size`, `device` and `measure` count.
 ///
-/// Errors: the folder contains no compression; those of [`compress`].
+/// Errors: the folder contains no compression; those of [`compress()`].
 pub fn resume(dir: &Path, options: &CompressOptions, stop: &AtomicBool, listener: &dyn Listener) -> Result<PathBuf> {
     options.measure.check()?;
     let work = Work::reopen(dir)?.on(options.device).timed_at(options.size);

@@ -9,7 +9,7 @@ use std::io::Cursor;
 /// A format of arrays of numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RawFormat {
-    /// NumPy float32, [h,w,C], or [h,w] for one value
+    /// NumPy float32, `[h,w,C]`, or `[h,w]` for one value
     Npy,
     /// Middlebury .flo, for flow only; unknown pixels are 1e10
     Flo,

@@ -27,7 +27,7 @@ const NO_RANGE: [f32; 2] = [1.0, 2.0];
 /// What is composited behind a scene: red, green, blue.
 pub type Color = [f32; 3];
 
-/// Options of [`film`] and [`image`].
+/// Options of [`film`] and [`image()`].
 #[derive(Clone, Debug)]
 pub struct RenderOptions {
     /// The file, or a folder of PNGs. `None`: by the scene and the path.

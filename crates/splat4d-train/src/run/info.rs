@@ -15,7 +15,7 @@ pub(super) fn elsewhere(capture: &Capture) -> Vec<String> {
     capture.elsewhere.iter().map(|path| to_text(path)).collect()
 }
 
-/// What `run.json` records of [`elsewhere`]: known even if the capture can no longer be opened.
+/// What `run.json` records of `elsewhere`: known even if the capture can no longer be opened.
 pub fn recorded_elsewhere(info: &Value) -> BTreeSet<PathBuf> {
     info[ELSEWHERE].as_array().into_iter().flatten().filter_map(Value::as_str).map(of_text).collect()
 }

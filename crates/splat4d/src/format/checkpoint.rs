@@ -1,7 +1,7 @@
 //! Checkpoints of PyTorch with Gaussians in them, read: gsplat's trainer, nerfstudio's splatfacto, FreeTimeGsVanilla.
 //!
 //! gsplat: `splats` with means, quats (wxyz), scales (logarithms), opacities (logits), sh0 [N, 1, 3], shN [N, K, 3];
-//! FreeTimeGsVanilla adds times, durations and velocities ([`freetime`]). splatfacto: `pipeline` with
+//! FreeTimeGsVanilla adds times, durations and velocities (`freetime`). splatfacto: `pipeline` with
 //! `_model.gauss_params.` and the same names, but features_dc [N, 3], features_rest [N, K, 3].
 //! Sources: nerfstudio-project/gsplat, examples/simple_trainer.py; nerfstudio, models/splatfacto.py.
 
