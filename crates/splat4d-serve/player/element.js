@@ -130,7 +130,7 @@ export class Splat4D extends HTMLElement {
     const src = this.getAttribute('src');
     const source = this.#scene ?? (src ? new URL(src, document.baseURI).href : null);
     if (!source) {
-      // A page that sets the scene later must not flash a notice; one that is being written is told.
+      // A page that sets the scene later must not flash a notice; an element whose markup is still being read is not empty either.
       if (LOCAL.includes(location.hostname) && !this.hasAttribute('page')) ui.showNote('No scene: set the attribute src or the property scene.');
       return;
     }

@@ -215,7 +215,7 @@ mod tests {
             let form = (quat::product(q, *turn), axes.map(|a| s[a]));
             let apart = cov(q, s).iter().zip(cov(form.0, form.1)).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
             assert!(apart < 1e-12, "{turn:?}: {apart}");
-            // Whatever form it comes in, it is told as before.
+            // Whatever sign or order of axes it has in this frame, it is written as in the frame before.
             let (back, scales) = turns.nearest(form, (q, s));
             assert!(scales == s && back.iter().zip(q).all(|(a, b)| (a - b).abs() < 1e-9), "{turn:?}: {back:?}");
         }
