@@ -183,7 +183,7 @@ fn channel<'a>(
 /// use splat4d_workflow::events::ignore;
 /// use splat4d_workflow::rendering::{RenderOptions, film};
 ///
-/// # fn main() -> Result<()> {
+/// # fn main() -> splat4d_workflow::Result<()> {
 /// let options = RenderOptions {
 ///     output: Some("depth.mp4".into()),
 ///     channel: Channel::Depth,
