@@ -246,7 +246,7 @@ fn judge(
         train_views: 0,
         ..EvalOptions::default()
     };
-    let scores = assess(&scene, capture, &store, outcome.iteration, &options, &mut listen)?;
+    let scores = assess(&scene, capture, &store, outcome.iteration, &options, stop, &mut listen)?;
     let flow = flow::error(&scene, capture, truths, antialias(recipe.appearance.antialias))?;
     let [psnr, psnr_dynamic, ssim, flicker] = ["PSNR", "PSNR-dynamic", "SSIM", "flicker"].map(|name| scores.held(name));
     Ok(Some(FolderContent {

@@ -197,7 +197,7 @@ impl Trial {
         let options =
             EvalOptions { antialias: self.recipe.appearance.antialias, pictures: false, ..EvalOptions::default() };
         let mut listen = |event: &Event| console.event(event);
-        let scores = assess(scene, &self.capture, &self.store, cell.steps, &options, &mut listen)?;
+        let scores = assess(scene, &self.capture, &self.store, cell.steps, &options, stop, &mut listen)?;
         let antialias = antialias(self.recipe.appearance.antialias);
         let subjects = [&self.scene, scene].map(|s| Subject { what: What::Scene(s), antialias });
         let sides =

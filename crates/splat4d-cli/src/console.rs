@@ -8,7 +8,7 @@ use splat4d::text;
 use splat4d_train::event::Event;
 use splat4d_train::output::rfc3339;
 use splat4d_train::path_text::in_command;
-use splat4d_workflow::events::{Listener, linked};
+use splat4d_workflow::events::{Listener, flags, linked, rolled_back};
 use splat4d_workflow::files::{grouped, human_bytes, human_seconds};
 use std::borrow::Cow;
 use std::cell::RefCell;
@@ -62,7 +62,6 @@ struct State {
     last_line: Option<Instant>,
     /// The first iteration after a pause gets a plain line of its own.
     said_progress: bool,
-    warnings: Vec<String>,
     /// What `--json` would print, for a program that wants the objects themselves; none: it is printed.
     objects: Option<Vec<Value>>,
 }
@@ -117,14 +116,14 @@ impl Console {
     /// A result, on stdout; not with `--json`, not when quiet.
     pub fn say(&self, text: &str) {
         if !self.json && self.loudness > Loudness::Quiet {
-            self.above_bar(|| print(&stamped(text)));
+            self.above_bar(|| print(&stamped(&flags(text))));
         }
     }
 
     /// A detail, on stderr, with `-v`.
     pub(crate) fn detail(&self, text: &str) {
         if !self.json && self.loudness == Loudness::Verbose {
-            self.above_bar(|| eprint_line(text));
+            self.above_bar(|| eprint_line(&flags(text)));
         }
     }
 
@@ -169,10 +168,9 @@ impl Console {
         self.say(&format!("next: splat4d {verb} {}", in_command(path)));
     }
 
-    /// A warning: always said, and kept for the report.
+    /// A warning: always printed.
     pub(crate) fn warn(&self, message: &str) {
-        let message = &linked(message);
-        self.state.borrow_mut().warnings.push(message.to_owned());
+        let message = &flags(&linked(message));
         if self.json {
             self.emit(&json!({"type": "warning", "message": message}));
         } else {
@@ -192,15 +190,10 @@ impl Console {
         }
     }
 
-    /// The warnings so far.
-    pub(crate) fn warnings(&self) -> Vec<String> {
-        self.state.borrow().warnings.clone()
-    }
-
     /// The error that ends the program: one paragraph.
     pub(crate) fn error(&self, message: &str, code: u8) {
         self.clear();
-        let paragraph = linked(&message.split_whitespace().collect::<Vec<_>>().join(" "));
+        let paragraph = flags(&linked(&message.split_whitespace().collect::<Vec<_>>().join(" ")));
         let end = if paragraph.ends_with(['.', '?', '!']) { "" } else { "." };
         eprint_line(&format!("error: {paragraph}{end}"));
         self.emit(&json!({"type": "error", "message": paragraph, "code": code}));
@@ -279,10 +272,7 @@ impl Console {
             Event::Checkpoint { iteration, path } => {
                 self.detail(&format!("checkpoint of step {} in {}", grouped(*iteration), path.display()));
             }
-            Event::RolledBack { iteration, to, what } => self.warn(&format!(
-                "step {iteration} was not finite ({what}); training rolled back to step {to} and continues with \
-                 smaller steps"
-            )),
+            Event::RolledBack { .. } => self.warn(&rolled_back(event).unwrap_or_default()),
             Event::Finished { iteration, seconds, gaussians, peak_memory, advice } => {
                 self.clear();
                 let memory = match peak_memory {

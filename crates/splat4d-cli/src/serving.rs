@@ -5,10 +5,13 @@ use serde_json::{Value, json};
 use splat4d::{Error, Result};
 use splat4d_serve::{Config, EditAnswer, Editing, News, Running, Server};
 use splat4d_train::capture::Capture;
-use splat4d_train::event::Event;
+use splat4d_train::event::Event as Training;
 use splat4d_train::run::Stopwatch;
 use splat4d_workflow::editor::token;
+use splat4d_workflow::events::{Event, Listener};
+use splat4d_workflow::run_folder::Run;
 use splat4d_workflow::{capture_page, playable};
+use std::cell::{Cell, OnceCell};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -17,6 +20,8 @@ use std::time::{Duration, Instant};
 
 /// How often a waiting program looks whether Ctrl-C was pressed.
 const LOOK: Duration = Duration::from_millis(50);
+/// A new image of the scene in training about so often: sooner than anybody would reload, later than they could follow.
+const SNAPSHOT_INTERVAL: Duration = Duration::from_secs(3);
 /// Time for the last news to reach pages before the server ends.
 const FAREWELL: Duration = Duration::from_millis(250);
 
@@ -164,44 +169,53 @@ impl Control {
     }
 }
 
-/// A run that is watched while it trains. What goes wrong with watching never costs the run.
-pub(crate) struct Watch {
-    running: Option<Running>,
+/// A listener that passes events to the console and, with `--view`, to a page. What fails with the page never costs the run.
+pub(crate) struct Watched<'a> {
+    console: &'a Console,
+    place: Option<&'a Place>,
     control: Arc<Control>,
+    /// The page's server, once training has begun.
+    running: OnceCell<Running>,
     /// The held-out score of the newest snapshot, dB.
-    held_out: Mutex<Option<f64>>,
+    held_out: Cell<Option<f64>>,
 }
 
-impl Watch {
-    /// Starts to serve a run that is about to train; a server that cannot be started is a warning.
-    ///
-    /// `place`: none serves nothing. `capture`: its cameras and images are shown next to the render.
-    pub(crate) fn start(
-        title: &str,
-        capture: Option<Arc<Capture>>,
-        place: Option<&Place>,
-        control: &Arc<Control>,
-        console: &Console,
-    ) -> Self {
-        let running = place.and_then(|place| match Self::serve(title, capture, place, control, console) {
-            Ok(running) => Some(running),
-            Err(error) => {
-                console.warn(&format!("training continues without the page: {error}"));
-                None
-            }
-        });
-        Self { running, control: control.clone(), held_out: Mutex::new(None) }
+impl Listener for Watched<'_> {
+    fn on_event(&self, event: &Event<'_>) {
+        match event {
+            Event::Begun { title, run, capture } => self.begin(title, run, *capture),
+            Event::Warning(message) => self.publish(|| News::Note(json!({ "message": message }))),
+            Event::Training(event) => self.on_training(event),
+            _ => {}
+        }
+        self.console.on_event(event);
     }
 
-    fn serve(
-        title: &str,
-        capture: Option<Arc<Capture>>,
-        place: &Place,
-        control: &Arc<Control>,
-        console: &Console,
-    ) -> Result<Running> {
+    fn snapshots(&self) -> Option<Duration> {
+        self.is_on().then_some(SNAPSHOT_INTERVAL)
+    }
+}
+
+impl<'a> Watched<'a> {
+    /// `place`: where the page is served; none: nowhere.
+    pub(crate) fn new(place: Option<&'a Place>, control: &Arc<Control>, console: &'a Console) -> Self {
+        Self { console, place, control: control.clone(), running: OnceCell::new(), held_out: Cell::new(None) }
+    }
+
+    /// Starts to serve a run that is about to train; a server that cannot be started is a warning. The capture's cameras and images
+    /// are shown next to the render, where it can be opened.
+    fn begin(&self, title: &str, run: &Path, capture: Option<&Arc<Capture>>) {
+        let Some(place) = self.place else { return };
+        let of_run = || Some(Arc::new(Run::open(run).ok()?.open_capture().ok()?.0));
+        match self.serve(title, capture.cloned().or_else(of_run), place) {
+            Ok(running) => drop(self.running.set(running)),
+            Err(error) => self.console.warn(&format!("training continues without the page: {error}")),
+        }
+    }
+
+    fn serve(&self, title: &str, capture: Option<Arc<Capture>>, place: &Place) -> Result<Running> {
         let token = token()?;
-        let (asked, mut about) = (control.clone(), json!({ "title": title }));
+        let (asked, mut about) = (self.control.clone(), json!({ "title": title }));
         let photos = capture.map(|capture| {
             let (cameras, photos) = capture_page::cameras(capture);
             about["cameras"] = cameras;
@@ -209,27 +223,32 @@ impl Watch {
         });
         let control = Some(Editing::new(token.clone(), move |value| asked.answer(&value)));
         let config = Config { live: true, background: true, about, control, photos, ..Config::default() };
-        start_for(config, place, Some(&token), console)
+        start_for(config, place, Some(&token), self.console)
     }
 
     /// Whether the run is served.
     pub(crate) fn is_on(&self) -> bool {
-        self.running.is_some()
+        self.running.get().is_some()
     }
 
-    /// Passes an event on, and waits after a step while the page has paused the run.
-    pub(crate) fn on_event(&self, event: &Event) {
-        let Some(running) = &self.running else { return };
-        let score = || self.held_out.lock().unwrap_or_else(PoisonError::into_inner);
+    fn publish(&self, news: impl FnOnce() -> News) {
+        if let Some(running) = self.running.get() {
+            running.publish(&news());
+        }
+    }
+
+    /// Passes an event of training to the page, and waits after a step while the page has paused the run.
+    fn on_training(&self, event: &Training) {
+        let Some(running) = self.running.get() else { return };
         let state = |state: &str| running.publish(&News::Control(json!({ "state": state })));
         match event {
-            Event::Snapshot { iteration, bytes, held_out } => {
-                *score() = *held_out;
+            Training::Snapshot { iteration, bytes, held_out } => {
+                self.held_out.set(*held_out);
                 running.set_scene(bytes.clone(), &json!({ "iteration": iteration, "held_out": held_out }));
             }
-            Event::Progress { .. } => {
+            Training::Progress { .. } => {
                 let mut step = serde_json::to_value(event).expect("events are plain data");
-                step["held_out"] = json!(*score());
+                step["held_out"] = json!(self.held_out.get());
                 running.publish(&News::Step(step));
                 if self.control.is_paused() {
                     state("paused");
@@ -237,12 +256,11 @@ impl Watch {
                     state("training");
                 }
             }
-            Event::Warning { message } => running.publish(&News::Note(json!({ "message": message }))),
-            Event::RolledBack { iteration, to, what } => {
+            Training::RolledBack { iteration, to, what } => {
                 let message = format!("step {iteration} was not finite ({what}); rolled back to step {to}");
                 running.publish(&News::Note(json!({ "message": message })));
             }
-            Event::Finished { iteration, seconds, gaussians, .. } => running.publish(&News::Done(json!({
+            Training::Finished { iteration, seconds, gaussians, .. } => running.publish(&News::Done(json!({
                 "iteration": iteration, "seconds": seconds, "gaussians": gaussians,
             }))),
             _ => {}
@@ -251,14 +269,14 @@ impl Watch {
 
     /// The run was stopped and saved; `resume` continues it. The server may end after this.
     pub(crate) fn stopped(&self, iteration: usize, resume: &str) {
-        let Some(running) = &self.running else { return };
+        let Some(running) = self.running.get() else { return };
         running.publish(&News::Control(json!({ "state": "stopped", "iteration": iteration, "resume": resume })));
         std::thread::sleep(FAREWELL);
     }
 
     /// Shows a finished run's playback file, where there is one.
     pub(crate) fn show(&self, run: &Path, iteration: usize) {
-        let Some(running) = &self.running else { return };
+        let Some(running) = self.running.get() else { return };
         if let Ok(bytes) = splat4d_workflow::files::read(&playable::of_run(run)) {
             running.set_scene(bytes.into(), &json!({ "iteration": iteration }));
         }

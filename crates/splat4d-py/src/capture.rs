@@ -31,7 +31,7 @@ pub(crate) struct Capture {
 }
 
 /// A temporary folder (Python's), removed with what is in it when this goes.
-struct Temporary(Py<PyAny>);
+pub(crate) struct Temporary(Py<PyAny>);
 
 impl Drop for Temporary {
     fn drop(&mut self) {
@@ -41,7 +41,7 @@ impl Drop for Temporary {
 }
 
 impl Capture {
-    fn open(py: Python<'_>, path: PathBuf, recipe: &Recipe, temporary: Option<Temporary>) -> PyResult<Self> {
+    pub(crate) fn open(py: Python<'_>, path: PathBuf, recipe: &Recipe, temporary: Option<Temporary>) -> PyResult<Self> {
         let capture = Arc::new(py.detach(|| open_capture(&path, recipe)).or_raise()?);
         warn(py, &capture.warnings)?;
         let store = ImageStore::new(capture.clone(), STORE_BYTES);

@@ -13,7 +13,7 @@
 //! | `from_arrays.rs` | images in memory become a capture on disk |
 //! | `metrics.rs`, `loss.rs`, `motion.rs` | metrics; losses and motion models written in Python |
 //! | `rendering.rs`, `scene.rs` | renders with gradients, scenes |
-//! | `run.rs`, `capture.rs`, `train.rs` | runs, captures, training |
+//! | `run.rs`, `capture.rs`, `recording.rs`, `train.rs` | runs, captures, videos as captures, training |
 
 mod arrays;
 mod camera;
@@ -25,6 +25,7 @@ mod loss;
 mod metrics;
 mod motion;
 mod plain;
+mod recording;
 mod rendering;
 mod run;
 mod scene;
@@ -50,6 +51,8 @@ mod _native {
     use crate::loss::{View, photometric};
     #[pymodule_export]
     use crate::metrics::metrics;
+    #[pymodule_export]
+    use crate::recording::{import_videos, info};
     #[pymodule_export]
     use crate::rendering::Rendering;
     #[pymodule_export]

@@ -74,7 +74,7 @@ impl Run {
     #[pyo3(signature = (*, device="cpu", lpips_weights=None))]
     fn evaluate(&self, py: Python<'_>, device: &str, lpips_weights: Option<PathBuf>) -> PyResult<Py<PyAny>> {
         let measure = Measure { lpips_weights, device: named(device)? };
-        workflows::run(py, |listener, _| evaluating::evaluate(&self.path, &measure, listener))?;
+        workflows::run(py, |listener, stop| evaluating::evaluate(&self.path, &measure, stop, listener))?;
         self.results(py)
     }
 
@@ -130,7 +130,7 @@ impl Run {
     /// `capture`, another of the same cameras (docs/labels.md). `rounds`: passes over the images.
     #[pyo3(signature = (capture=None, *, rounds=None))]
     fn label(&self, py: Python<'_>, capture: Option<PathBuf>, rounds: Option<usize>) -> PyResult<()> {
-        workflows::run(py, |listener, _| labelling::label(&self.path, capture.as_deref(), rounds, listener))?;
+        workflows::run(py, |listener, stop| labelling::label(&self.path, capture.as_deref(), rounds, stop, listener))?;
         Ok(())
     }
 
@@ -155,7 +155,7 @@ impl Run {
         let training = Training { steps, seed: 0 };
         let options =
             PredictOptions { models, horizon, seeds, nodes, training, film, ..PredictOptions::new(&self.path) };
-        let (folder, _) = workflows::run(py, |listener, _| predicting::predict(options, listener))?;
+        let (folder, _) = workflows::run(py, |listener, stop| predicting::predict(options, stop, listener))?;
         let text = files::read_text(&folder.join("predict.json")).or_raise()?;
         plain(py, &serde_json::from_str(&text).unwrap_or(Value::Null))
     }

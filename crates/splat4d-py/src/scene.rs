@@ -5,6 +5,7 @@ use crate::camera::Camera;
 use crate::errors::{OrRaise, bad_input};
 use crate::gaussians::Gaussians;
 use crate::motion::{Hook, raise};
+use crate::plain::plain;
 use crate::rendering::{self, Rendering};
 use crate::scene_arrays::{self, About, Moving, Shapes};
 use pyo3::prelude::*;
@@ -20,8 +21,10 @@ use splat4d_workflow::converting::{self, Conversion};
 use splat4d_workflow::draw::{Channel, Painter, antialias};
 use splat4d_workflow::editing::{EditOptions, edit};
 use splat4d_workflow::events::{Event, Listener};
-use splat4d_workflow::exporting;
-use splat4d_workflow::paths::View;
+use splat4d_workflow::exporting::{self, Frames, TrackOptions};
+use splat4d_workflow::localising::{LocaliseOptions, localise};
+use splat4d_workflow::paths::{Route, View};
+use splat4d_workflow::rendering::{self as films, RenderOptions};
 use splat4d_workflow::sequence::timestamps;
 use splat4d_workflow::source::{Source, not_empty, read_scene};
 use std::cell::RefCell;
@@ -391,6 +394,145 @@ impl Scene {
         };
         let work = |file: &Path, _: &Path| listening(|listener| export(file, listener));
         crate::errors::warn(py, &self.with_file(py, work)?)
+    }
+
+    /// Writes a .ply per frame, `frame_00000.ply` and so on, into a folder; returns how many. `fps` [the scene's]; `start` and `end`
+    /// [the clip's] are seconds. `world`: in the capture's world, in double precision. `force` replaces such a sequence.
+    #[pyo3(signature = (folder, *, fps=None, start=None, end=None, world=false, force=false))]
+    #[allow(clippy::too_many_arguments)]
+    fn export_frames(
+        &self,
+        py: Python<'_>,
+        folder: PathBuf,
+        fps: Option<f64>,
+        start: Option<f64>,
+        end: Option<f64>,
+        world: bool,
+        force: bool,
+    ) -> PyResult<usize> {
+        let frames = Frames { fps, from: start, to: end };
+        let mut count = 0;
+        let work = |file: &Path, _: &Path| {
+            listening(|listener| {
+                let source = exporting::open(file, None)?;
+                count = exporting::frames(file, &source, &folder, &frames, [world, force], listener)?;
+                Ok(())
+            })
+        };
+        crate::errors::warn(py, &self.with_file(py, work)?)?;
+        Ok(count)
+    }
+
+    /// Writes positions over time to a .csv or .json file: of every n-th Gaussian, of the `count` ones nearest to `near` at the
+    /// first time, of those with a `label`, or of the points that the file `points` lists (docs/track-points.md), with their
+    /// visibility. Times as in `export_frames`.
+    #[pyo3(signature = (path, *, every=1, near=None, count=1, label=None, points=None, fps=None, start=None, end=None, world=false))]
+    #[allow(clippy::too_many_arguments)]
+    fn export_tracks(
+        &self,
+        py: Python<'_>,
+        path: PathBuf,
+        every: usize,
+        near: Option<[f64; 3]>,
+        count: usize,
+        label: Option<String>,
+        points: Option<PathBuf>,
+        fps: Option<f64>,
+        start: Option<f64>,
+        end: Option<f64>,
+        world: bool,
+    ) -> PyResult<()> {
+        if points.is_some() && (every != 1 || near.is_some() || label.is_some() || world) {
+            return Err(bad_input("points are tracked instead of Gaussians", "Leave every, near, label and world out"));
+        }
+        let frames = Frames { fps, from: start, to: end };
+        let options = TrackOptions { frames, every, near: near.map(|p| (p, count)), label, world };
+        let work = |file: &Path, _: &Path| {
+            listening(|listener| {
+                let source = exporting::open(file, None)?;
+                source.keep(file, &path, &points.iter().map(PathBuf::as_path).collect::<Vec<_>>())?;
+                match &points {
+                    Some(points) => exporting::points(&source, points, &frames, &path, listener),
+                    None => exporting::tracks(&source.scene, &options, &path, listener),
+                }
+            })
+        };
+        crate::errors::warn(py, &self.with_file(py, work)?)
+    }
+
+    /// Films a camera path through space and time (docs/render.md): an .mp4 where ffmpeg is installed, an animated .png, or a
+    /// folder of images. `route`: "orbit", "train", "test", "camera=NAME" or a key-frame file. `start` and `end` are seconds of the
+    /// scene; `freeze` stops time there.
+    #[pyo3(signature = (
+        path, *, route=None, size=None, start=None, end=None, freeze=None, slow_motion=None, seconds=None, fps=None,
+        channel="color", force=false, device="cpu"
+    ))]
+    #[allow(clippy::too_many_arguments)]
+    fn film(
+        &self,
+        py: Python<'_>,
+        path: PathBuf,
+        route: Option<&str>,
+        size: Option<[usize; 2]>,
+        start: Option<f64>,
+        end: Option<f64>,
+        freeze: Option<f64>,
+        slow_motion: Option<f64>,
+        seconds: Option<f64>,
+        fps: Option<f64>,
+        channel: &str,
+        force: bool,
+        device: &str,
+    ) -> PyResult<()> {
+        let numbers = [start, end, freeze, slow_motion, seconds, fps];
+        if numbers.into_iter().flatten().any(|v| !v.is_finite()) {
+            return Err(bad_input("a number is not finite", "Give seconds, a factor or frames per second"));
+        }
+        let channel = Channel::ALL.into_iter().find(|c| c.name() == channel).ok_or_else(|| {
+            let names = Channel::ALL.map(Channel::name).join(", ");
+            bad_input(format!("there is no channel `{channel}`"), &format!("Give one of {names}"))
+        })?;
+        let route = route.map(str::parse::<Route>).transpose();
+        let options = RenderOptions {
+            output: Some(path),
+            path: route.map_err(|what| bad_input(what, "docs/render.md lists camera paths"))?,
+            size,
+            from: start,
+            to: end,
+            freeze,
+            slow_motion,
+            seconds,
+            fps,
+            channel,
+            force,
+            device: named(device)?,
+            ..RenderOptions::default()
+        };
+        let work = |file: &Path, _: &Path| listening(|l| films::film(file, &options, l).map(drop));
+        crate::errors::warn(py, &self.with_file(py, work)?)
+    }
+
+    /// Pose and time of images (JPEG, PNG or WebP) of the scene: a dict per image, as in `cameras.json`. `start`: a camera file or
+    /// `cameras.json` near them [the run's cameras]; `lens`: also find the focal length.
+    #[pyo3(signature = (images, *, start=None, lens=false))]
+    fn localise(
+        &self,
+        py: Python<'_>,
+        images: Vec<PathBuf>,
+        start: Option<PathBuf>,
+        lens: bool,
+    ) -> PyResult<Py<PyAny>> {
+        let options = LocaliseOptions { start, lens, output: None };
+        let mut found = Vec::new();
+        let work = |file: &Path, _: &Path| {
+            listening(|listener| {
+                found = localise(file, &images, &options, listener)?;
+                Ok(())
+            })
+        };
+        let warnings = self.with_file(py, work)?;
+        crate::errors::warn(py, &warnings)?;
+        plain(py, &serde_json::Value::Array(found))
     }
 
     /// The scene with a list of edits replayed (docs/edit.md), in no file yet. `edits`: the text of a list, or the path of

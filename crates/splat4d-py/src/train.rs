@@ -1,4 +1,4 @@
-//! Training from Python: the command's `train` without its console. The same recipe gives the same bits.
+//! Training from Python: the workflow of the command's `train`. The same recipe gives the same bits.
 
 use crate::capture::Capture;
 use crate::errors::{OrRaise, in_python, warn};
@@ -12,12 +12,13 @@ use pyo3::prelude::*;
 use pyo3::types::{PyBool, PyDict};
 use splat4d::Result;
 use splat4d_train::event::Event;
-use splat4d_train::output::{FolderContent, OutputFolder};
 use splat4d_train::recipe::{MotionName, Quality, Recipe};
-use splat4d_train::run::{self, Outcome, Stopwatch, TrainOptions, open_capture};
-use splat4d_workflow::run_folder;
+use splat4d_workflow::events as workflow;
+use splat4d_workflow::training::{self, Finish, Trained, TrainingOptions};
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 /// Trains a scene of a capture (a Capture, or its path) into the folder `out` [runs/NAME] and returns the run.
 ///
@@ -26,12 +27,13 @@ use std::sync::Arc;
 /// decides. `progress` is called with every event, a dict as in docs/events.md; without one, a bar is shown on terminals and in
 /// notebooks, and with `progress=False` nothing is. `loss(image, truth, view)` gets arrays [h, w, 3] and returns (value,
 /// gradient), which are added to the recipe's losses; in the first 40 % of the steps the arrays have half of the size, with
-/// `half_size_until=0` always the full one. `force` replaces a run that is in `out` already. Ctrl-C, or an exception in a
+/// `half_size_until=0` always the full one. `evaluate`: afterwards bake the playback file, measure held-out views, film an orbit and
+/// write the report, as the command does; `minutes` includes it. `force` replaces a run that is in `out` already. Ctrl-C, or an exception in a
 /// function of yours, stops with a checkpoint; `resume` continues from there.
 #[pyfunction]
 #[pyo3(signature = (
-    capture, out=None, *, motion=None, progress=None, loss=None, minutes=None, quality=None, device="cpu", force=false,
-    **settings
+    capture, out=None, *, motion=None, progress=None, loss=None, minutes=None, quality=None, device="cpu", evaluate=false,
+    force=false, **settings
 ))]
 #[allow(clippy::too_many_arguments)]
 pub(crate) fn train(
@@ -44,6 +46,7 @@ pub(crate) fn train(
     minutes: Option<f64>,
     quality: Option<&str>,
     device: &str,
+    evaluate: bool,
     force: bool,
     settings: Option<&Bound<'_, PyDict>>,
 ) -> PyResult<Run> {
@@ -72,39 +75,27 @@ pub(crate) fn train(
     }
     let names = set(&mut recipe, settings)?;
     recipe.refuse_unused(names.iter().map(String::as_str)).or_raise()?;
-    let options =
-        TrainOptions { device: named(device)?, minutes, clock: Stopwatch::start(), ..TrainOptions::default() };
+    let options = TrainingOptions {
+        output: out,
+        force,
+        minutes,
+        device: named(device)?,
+        finish: finish(evaluate),
+        command: "train (Python)",
+        ..TrainingOptions::default()
+    };
     let listener = Listener::new(py, progress, loss, raised)?;
-    listener.drive(py, options, |options, listen| {
-        let capture = open_capture(&path, &recipe)?;
-        let run = out.unwrap_or_else(|| run_folder::free_folder(&run_folder::usual_folder(&capture.name)));
-        let asked = run_folder::RunRequest::of(&capture, &recipe, minutes, false);
-        let (folder, found) = asked.begin(&run, force, "train (Python)")?;
-        let stop = &listener.raised.stop;
-        let mut on_event = |event: &Event| {
-            run_folder::on_event(&folder, event);
-            listen(event);
-        };
-        let trained = if found == FolderContent::Unfinished {
-            run::resume_with(&run, options, stop, &mut on_event)
-        } else {
-            run::checkpoint::write_atomically(&run.join("recipe.toml"), recipe.to_toml().as_bytes())?;
-            let cameras = run_folder::cameras_json(&capture).to_string();
-            run::checkpoint::write_atomically(&run.join("cameras.json"), cameras.as_bytes())?;
-            run::train(Arc::new(capture), recipe, &run, options, stop, &mut on_event)
-        };
-        if let Some(folder) = run_folder::left(folder, &run, &trained)
-            && trained.as_ref().is_ok_and(|outcome| !outcome.interrupted)
-        {
-            folder.finished();
-        }
-        trained
-    })
+    listener.drive(py, options, |options, stop, listen| training::train(&path, &recipe, options, stop, listen))
+}
+
+fn finish(evaluate: bool) -> Finish {
+    if evaluate { Finish::All } else { Finish::Scene }
 }
 
 /// Continues the run in a folder from its newest checkpoint. A run that started with a `loss` or a `Motion` needs it again.
 #[pyfunction]
-#[pyo3(signature = (run, *, motion=None, progress=None, loss=None, device="cpu"))]
+#[pyo3(signature = (run, *, motion=None, progress=None, loss=None, device="cpu", evaluate=false))]
+#[allow(clippy::too_many_arguments)]
 pub(crate) fn resume(
     py: Python<'_>,
     run: &Bound<'_, PyAny>,
@@ -112,20 +103,21 @@ pub(crate) fn resume(
     progress: Option<Py<PyAny>>,
     loss: Option<Py<PyAny>>,
     device: &str,
+    evaluate: bool,
 ) -> PyResult<Run> {
     let path = match run.cast::<Run>() {
         Ok(run) => run.get().path.clone(),
         Err(_) => run.extract::<PathBuf>()?,
     };
-    let options = TrainOptions { device: named(device)?, clock: Stopwatch::start(), ..TrainOptions::default() };
+    let options = TrainingOptions {
+        device: named(device)?,
+        finish: finish(evaluate),
+        command: "resume (Python)",
+        ..TrainingOptions::default()
+    };
     let raised = motion.map(Hook::register).transpose()?.map_or_else(Arc::default, |hook| hook.raised.clone());
     let listener = Listener::new(py, progress, loss, raised)?;
-    listener.drive(py, options, |options, listen| {
-        // A folder that is no run is refused below, and nothing is written into it.
-        let is_run = path.join("recipe.toml").is_file();
-        let _folder = is_run.then(|| OutputFolder::amend(&path, "resume (Python)")).transpose()?;
-        run::resume_with(&path, options, &listener.raised.stop, listen)
-    })
+    listener.drive(py, options, |options, stop, listen| training::resume(&path, options, stop, listen))
 }
 
 /// Who hears of a run, and may end it.
@@ -154,26 +146,35 @@ impl Listener {
         Ok(Self { progress, told, loss, raised })
     }
 
-    /// Does the work without Python's lock, hears its events with it, and raises what was raised meanwhile.
+    /// Does the work without Python's lock, passes its events on with it, and raises what was raised meanwhile.
     fn drive(
         &self,
         py: Python<'_>,
-        options: TrainOptions,
-        work: impl FnOnce(&TrainOptions, &mut dyn FnMut(&Event)) -> Result<Outcome> + Send,
+        options: TrainingOptions,
+        work: impl FnOnce(&TrainingOptions, &AtomicBool, &dyn workflow::Listener) -> Result<Trained> + Send,
     ) -> PyResult<Run> {
         let own_loss = self.loss.as_ref().map(|f| own_loss(f.clone_ref(py), &self.raised));
-        let options = TrainOptions { own_loss, ..options };
+        let options = TrainingOptions { own_loss, ..options };
         let done = py.detach(|| {
-            work(&options, &mut |event| {
-                if let Err(error) = Python::attach(|py| self.on_event(py, event)) {
+            let listen = |event: &workflow::Event<'_>| {
+                let event = match event {
+                    workflow::Event::Training(event) => Cow::Borrowed(*event),
+                    workflow::Event::Warning(message) => Cow::Owned(Event::Warning { message: (*message).into() }),
+                    workflow::Event::Phase { name, done, total } => {
+                        Cow::Owned(Event::Phase { name: (*name).into(), done: *done, total: *total })
+                    }
+                    _ => return,
+                };
+                if let Err(error) = Python::attach(|py| self.on_event(py, &event)) {
                     self.raised.raise(error);
                 }
-            })
+            };
+            work(&options, &self.raised.stop, &listen)
         });
         match (done, self.raised.take()) {
-            (Ok(outcome), None) => Ok(Run { path: outcome.run }),
-            (Ok(outcome), Some(error)) => {
-                note(py, &error, &outcome.run);
+            (Ok(trained), None) => Ok(Run { path: trained.run }),
+            (Ok(trained), Some(error)) => {
+                note(py, &error, &trained.run);
                 Err(error)
             }
             (Err(_), Some(error)) => Err(error),

@@ -126,13 +126,13 @@ fn pass(
     capture: &Capture,
     frames: &[usize],
     s: f32,
-    progress: &mut dyn FnMut(usize),
+    progress: &mut dyn FnMut(usize) -> Result<()>,
 ) -> Result<(Vector, f64, usize)> {
     let channels = scene.feature_channels();
     let mut sum: Vector = scene.layers.iter().map(|l| Table::new(&[(FEATURES, channels)], l.params.len())).collect();
     let (mut loss, mut pixels, mut work) = (0.0, 0, Blended::default());
     for (i, &frame) in frames.iter().enumerate() {
-        progress(i);
+        progress(i)?;
         let truth = truth(capture, frame, Some(channels))?;
         work.draw(scene, capture, frame, |instant| feature_columns(scene, instant).expect("the scene has features"));
         let (values, weight) = divided(&work.image.extra);
@@ -148,14 +148,14 @@ fn pass(
 
 /// Learns the features of the capture's training images into the scene, in place of those it had. Returns the mean
 /// loss of a
-/// known pixel before each round and after the last. `progress` hears how many images of how many are done.
+/// known pixel before each round and after the last. `progress` receives how many images of how many are done, and may end the work.
 ///
-/// Errors: no training image has features; one that cannot be read, or of other channels than the first.
+/// Errors: those of `progress`; no training image has features; one that cannot be read, or of other channels than the first.
 pub fn learn(
     scene: &mut Scene<f32>,
     capture: &Capture,
     rounds: usize,
-    progress: &mut dyn FnMut(usize, usize),
+    progress: &mut dyn FnMut(usize, usize) -> Result<()>,
 ) -> Result<Vec<f64>> {
     let frames = featured(capture, &capture.train);
     let Some(&first) = frames.first() else {
@@ -198,7 +198,7 @@ pub fn learn(
         losses.push((start - 0.5 * (fb + fr)) / each);
     }
     show(scene, &found);
-    progress(total, total);
+    progress(total, total)?;
     Ok(losses)
 }
 
@@ -312,14 +312,14 @@ mod tests {
             let draw = |k: usize| 0.3 * rng.fork(row as u64).normal(k as u64) as f32;
             scene.layers[0].params[key].write(row, 0, [0, 1, 2].map(draw));
         }
-        let (d, loss, pixels) = pass(&scene, &capture, &capture.train, 1.0, &mut |_| {}).unwrap();
+        let (d, loss, pixels) = pass(&scene, &capture, &capture.train, 1.0, &mut |_| Ok(())).unwrap();
         assert!(loss > 1.0 && pixels > 1500 && pixels <= 2 * SIDE * (SIDE - 1), "{loss} {pixels}");
         for (row, k) in [(0, 0), (210, 0), (211, 1), (189, 2), (400, 1)] {
             // The loss is quadratic: differences over any step are exact but for rounding.
             let at = |h: f32| {
                 let mut moved = scene.clone();
                 *moved.layers[0].params[key].get_mut(row, k) += h;
-                pass(&moved, &capture, &capture.train, 1.0, &mut |_| {}).unwrap().1
+                pass(&moved, &capture, &capture.train, 1.0, &mut |_| Ok(())).unwrap().1
             };
             let fd = (at(0.5) - at(-0.5)) / 1.0;
             let got = d[0].get(row, k);
@@ -333,7 +333,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let (capture, mut scene) = (capture(folder.path()), wall());
         let before = scene.layers[0].params[GEOMETRY].clone();
-        let losses = learn(&mut scene, &capture, 6, &mut |_, _| {}).unwrap();
+        let losses = learn(&mut scene, &capture, 6, &mut |_, _| Ok(())).unwrap();
         assert!(losses.windows(2).all(|w| w[1] <= w[0] + 1e-9) && losses[6] < 0.03 * losses[0], "{losses:?}");
         assert_eq!(scene.layers[0].params[GEOMETRY], before, "shapes stay as they are");
         let key = features::key(&scene.layers[0].params).unwrap();
@@ -349,7 +349,7 @@ mod tests {
         let scores = measure(&scene, &capture, &capture.train).unwrap().unwrap();
         assert!(scores.explained > 0.93 && scores.cosine > 0.97 && scores.pictures == 2, "{scores:?}");
         // Learning again begins again.
-        let again = learn(&mut scene, &capture, 1, &mut |_, _| {}).unwrap();
+        let again = learn(&mut scene, &capture, 1, &mut |_, _| Ok(())).unwrap();
         assert!((again[0] - losses[0]).abs() < 1e-9);
     }
 
@@ -361,7 +361,7 @@ mod tests {
             let mut file = Vec::new();
             npy::write_f32(shape, values, &mut file).unwrap();
             std::fs::write(folder.path().join("f1.npy"), file).unwrap();
-            learn(&mut wall(), capture, 1, &mut |_, _| {}).unwrap_err().to_string()
+            learn(&mut wall(), capture, 1, &mut |_, _| Ok(())).unwrap_err().to_string()
         };
         let n = SIDE * SIDE;
         let sound = vec![0.25; 3 * n];
@@ -380,7 +380,7 @@ mod tests {
             }
         }
         capture.frames.iter_mut().for_each(|f| f.features = None);
-        let said = learn(&mut wall(), &capture, 1, &mut |_, _| {}).unwrap_err().to_string();
+        let said = learn(&mut wall(), &capture, 1, &mut |_, _| Ok(())).unwrap_err().to_string();
         assert!(said.contains("no training image") && said.contains("docs/labels.md"), "{said}");
     }
 }

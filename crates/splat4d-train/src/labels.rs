@@ -57,14 +57,14 @@ fn labelled(capture: &Capture, frames: &[usize], most: usize) -> Vec<usize> {
 }
 
 /// Learns the labels of the capture's training images into the scene, in place of those it had. Returns the mean
-/// cross-entropy of a pixel before each round, nats. `progress` hears how many images of how many are done.
+/// cross-entropy of a pixel before each round, nats. `progress` receives how many images of how many are done, and may end the work.
 ///
-/// Errors: no training image has labels; a mask that cannot be read.
+/// Errors: those of `progress`; no training image has labels; a mask that cannot be read.
 pub fn learn(
     scene: &mut Scene<f32>,
     capture: &Capture,
     rounds: usize,
-    progress: &mut dyn FnMut(usize, usize),
+    progress: &mut dyn FnMut(usize, usize) -> Result<()>,
 ) -> Result<Vec<f64>> {
     let frames = labelled(capture, &capture.train, MOST_PICTURES);
     if frames.is_empty() || capture.labels.is_empty() {
@@ -92,7 +92,7 @@ pub fn learn(
             scene.layers.iter().map(|l| Table::new(&[(LABEL_LOGITS, count)], l.params.len())).collect();
         let (mut loss, mut pixels) = (0.0, 0usize);
         for (i, &frame) in frames.iter().enumerate() {
-            progress(round * frames.len() + i, total);
+            progress(round * frames.len() + i, total)?;
             let truth = read(&capture.frames[frame], capture)?.expect("only frames with labels were chosen");
             let (sum, seen) = vote(&mut work, scene, capture, frame, &truth, &mut votes);
             (loss, pixels) = (loss + sum, pixels + seen);
@@ -110,7 +110,7 @@ pub fn learn(
             }
         }
     }
-    progress(total, total);
+    progress(total, total)?;
     Ok(losses)
 }
 
@@ -264,7 +264,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let (capture, mut scene) = (capture(folder.path()), wall());
         let before = scene.layers[0].params[GEOMETRY].clone();
-        let losses = learn(&mut scene, &capture, 4, &mut |_, _| {}).unwrap();
+        let losses = learn(&mut scene, &capture, 4, &mut |_, _| Ok(())).unwrap();
         assert!((losses[0] - std::f64::consts::LN_2).abs() < 1e-3, "at first all is as likely: {losses:?}");
         assert!(losses.windows(2).all(|w| w[1] <= w[0] + 1e-6) && losses[3] < 0.3, "{losses:?}");
         assert_eq!(scene.layers[0].params[GEOMETRY], before, "shapes stay as they are");
@@ -283,7 +283,7 @@ mod tests {
         assert!(scores.accuracy > 0.92 && scores.mean_iou() > 0.85, "{scores:?}");
         assert_eq!(scores.names, ["left", "right"]);
         // Learning again begins again.
-        let again = learn(&mut scene, &capture, 1, &mut |_, _| {}).unwrap();
+        let again = learn(&mut scene, &capture, 1, &mut |_, _| Ok(())).unwrap();
         assert!((again[0] - losses[0]).abs() < 1e-9);
         let mut other = scene.clone();
         other.labels = vec!["a".into(), "b".into()];
@@ -295,7 +295,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let mut capture = capture(folder.path());
         capture.frames.iter_mut().for_each(|f| f.labels = None);
-        let error = learn(&mut wall(), &capture, 1, &mut |_, _| {}).unwrap_err().to_string();
+        let error = learn(&mut wall(), &capture, 1, &mut |_, _| Ok(())).unwrap_err().to_string();
         assert!(error.contains("no training image") && error.contains("docs/labels.md"), "{error}");
     }
 }

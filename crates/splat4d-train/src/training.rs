@@ -95,7 +95,8 @@ impl Trained {
             pictures: false,
             ..EvalOptions::default()
         };
-        evaluate(&self.scene()?, &self.capture, &store, self.outcome.iteration, &options, &mut |_| {})
+        let (scene, never) = (self.scene()?, AtomicBool::new(false));
+        evaluate(&scene, &self.capture, &store, self.outcome.iteration, &options, &never, &mut |_| {})
     }
 }
 

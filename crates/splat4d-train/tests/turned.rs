@@ -83,7 +83,7 @@ fn psnr(scene: &Scene<f32>, capture: &Path, recipe: &Recipe) -> f64 {
     let capture = Arc::new(open_capture(capture, recipe).unwrap());
     let store = Arc::new(ImageStore::new(capture.clone(), usize::MAX));
     let options = EvalOptions { pictures: false, train_views: 0, ..EvalOptions::default() };
-    assess(scene, &capture, &store, 0, &options, &mut |_| {}).unwrap().held("PSNR").unwrap()
+    assess(scene, &capture, &store, 0, &options, &AtomicBool::new(false), &mut |_| {}).unwrap().held("PSNR").unwrap()
 }
 
 /// The scene with `g` in its tables of Gaussians and nodes, and nowhere else.

@@ -243,7 +243,9 @@ fn mse(psnr: f64) -> f64 {
 /// Errors: a name that is not one of a playback file; no scene; an empty one; files of the input in the place of outputs.
 pub fn bake(from: &Path, out: &Path, report: Option<&Path>, baking: &Baking, listener: &dyn Listener) -> Result<Value> {
     if !files::is_playback(out) && !out.starts_with("/dev") {
-        return Err(Error::input("the name does not end in .s4d").at(out.display()).remedy("Use -o NAME.s4d."));
+        return Err(Error::input("the name does not end in .s4d")
+            .at(out.display())
+            .remedy("Use option `output` NAME.s4d."));
     }
     let source = Source::open(from)?;
     not_empty(&source.scene, from)?;
@@ -313,7 +315,7 @@ impl Needs {
     fn in_words(self, psnr: f64, bytes: u64) -> String {
         let more = if self.more { "more than" } else { "about" };
         format!(
-            "{psnr:.1} dB against the model at {}; {} dB needs {more} {} (--size)",
+            "{psnr:.1} dB against the model at {}; {} dB needs {more} {} (option `size`)",
             human_bytes(bytes),
             self.psnr,
             human_bytes(self.bytes)
@@ -431,7 +433,7 @@ fn compare(
     console: &dyn Listener,
 ) -> Result<Option<bake::Likeness>> {
     if deadline.left() <= 0.0 {
-        console.say("the file is not compared with its model: no time is left of --minutes");
+        console.say("the file is not compared with its model: no time is left of option `minutes`");
         return Ok(None);
     }
     likeness(scene, &playback::read(bytes)?, &shots(scene, stage, views), antialias, &mut |done, total| {

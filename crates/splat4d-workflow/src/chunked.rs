@@ -139,7 +139,7 @@ pub fn join(
             ("join_peak_memory".into(), json!(run::peak_memory())),
         ],
     )?;
-    if no_eval { Ok(()) } else { evaluating::all(run, measure, deadline, console) }
+    if no_eval { Ok(()) } else { evaluating::all(run, measure, deadline, stop, console) }
 }
 
 /// How chunks meet, at as many cuts as the time allows: the next one takes about as long as the last one.
@@ -158,7 +158,7 @@ fn seams(chunked: &Chunked, deadline: &Deadline, console: &dyn Listener) -> Resu
     )?;
     if let Some(done) = ended {
         console.say(&format!(
-            "flicker at chunk boundaries is measured at {done} of them: --minutes leaves no time for more"
+            "flicker at chunk boundaries is measured at {done} of them: option `minutes` leaves no time for more"
         ));
     }
     Ok(found)

@@ -24,7 +24,9 @@ impl Form {
             Some("csv") => Ok(Self::Csv),
             Some("md") => Ok(Self::Markdown),
             Some("html" | "htm") => Ok(Self::Html),
-            _ => Err(Error::input("unknown kind of table").at(path.display()).remedy("Use -o NAME.csv, .md or .html")),
+            _ => Err(Error::input("unknown kind of table")
+                .at(path.display())
+                .remedy("Use option `output` NAME.csv, .md or .html")),
         }
     }
 }

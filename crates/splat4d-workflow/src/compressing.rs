@@ -121,8 +121,8 @@ impl CompressOptions {
         let mut settings = Compression::level(Level::new(self.level)?, iterations);
         if let Some(share) = self.prune {
             if self.level < 2 {
-                return Err(Error::input(format!("--prune belongs to level 2, not to level {}", self.level))
-                    .remedy("Leave --level out."));
+                return Err(Error::input(format!("option `prune` belongs to level 2, not to level {}", self.level))
+                    .remedy("Leave option `level` out."));
             }
             settings.prune = share;
         }
@@ -133,10 +133,10 @@ impl CompressOptions {
             settings.quantise = steps - settings.fine_tune;
         }
         if let Some(name) = &self.score {
-            settings.set(&format!("spatial={name}")).map_err(|e| e.at("--score"))?;
+            settings.set(&format!("spatial={name}")).map_err(|e| e.at("option `score`"))?;
         }
         for assignment in &self.set {
-            settings.set(assignment).map_err(|e| e.at("--set"))?;
+            settings.set(assignment).map_err(|e| e.at("option `set`"))?;
         }
         if !settings.codec {
             return Err(
@@ -320,7 +320,7 @@ impl Work {
         console.phase("reading the capture", 0, 0);
         let (capture, recipe) = run.open_capture()?;
         let original = Original { scene: &source.scene, recipe, capture: Arc::new(capture) };
-        let before = if eval { Some(original.scores(original.scene, console)?) } else { None };
+        let before = if eval { Some(original.scores(original.scene, stop, console)?) } else { None };
         self.choose_size(&original, console)?;
         let (file, after) = loop {
             console.stop_polled(SAVING);
@@ -329,7 +329,7 @@ impl Work {
             let file = self.write_file(&compressed, console)?;
             let Some(before) = &before else { break (file, None) };
             let scene = read_scene(&self.dir.join("scene.safetensors"))?;
-            let after = evaluating::scores(&self.dir, &scene, measure, console)?;
+            let after = evaluating::scores(&self.dir, &scene, measure, stop, console)?;
             if !self.refused(before, &after, file.bytes, console)? {
                 break (file, Some(after));
             }
@@ -431,7 +431,7 @@ impl Work {
             return Err(self.interrupted(done.outcome.iteration));
         }
         let scene = read_scene(&folder.join("scene.safetensors"))?;
-        let scores = original.scores(&scene, console)?;
+        let scores = original.scores(&scene, stop, console)?;
         Ok((scene, scores))
     }
 
@@ -532,7 +532,7 @@ impl Work {
         if next == prune || self.order.tried.len() + 1 >= MOST_TRIES {
             if let Some(most) = large {
                 let over = format!("the file has {bytes} bytes, more than {most}");
-                return Err(Error::input(over).remedy("Give a smaller --max-mb."));
+                return Err(Error::input(over).remedy("Give a smaller option `max_mb`."));
             }
             return Ok(false);
         }
@@ -558,11 +558,11 @@ impl Original<'_> {
     }
 
     /// The scores of a scene of this capture, without a trace in any folder.
-    fn scores(&self, scene: &Scene<f32>, console: &dyn Listener) -> Result<Scores> {
+    fn scores(&self, scene: &Scene<f32>, stop: &AtomicBool, console: &dyn Listener) -> Result<Scores> {
         let store = Arc::new(ImageStore::new(self.capture.clone(), self.recipe.run.image_memory as usize));
         let options =
             EvalOptions { antialias: self.recipe.appearance.antialias, pictures: false, ..EvalOptions::default() };
-        let scores = assess(scene, &self.capture, &store, 0, &options, &mut |event| console.event(event))?;
+        let scores = assess(scene, &self.capture, &store, 0, &options, stop, &mut |event| console.event(event))?;
         console.clear();
         Ok(scores)
     }

@@ -180,17 +180,19 @@ fn asked(args: &Conversion) -> Result<(Option<(Pattern, PathBuf)>, Target)> {
     let pattern = frames_pattern(args)?;
     let target = Target::of(pattern.as_ref().map_or(&args.output, |p| p.1.as_path()))?;
     if args.time.is_some_and(|t| !t.is_finite()) || args.fps.is_some_and(|f| !(0.01..=1000.0).contains(&f)) {
-        return Err(Error::input("--time or --fps is out of range").remedy("Give a plain, sensible number."));
+        return Err(
+            Error::input("option `time` or option `fps` is out of range").remedy("Give a plain, sensible number.")
+        );
     }
     if args.world && !matches!(target, Target::Dialect(_)) {
         return Err(Error::input(format!("a {} stores the offset separately from its positions", target.name()))
             .at(args.output.display())
-            .remedy("Leave --world out, or write .ply."));
+            .remedy("Leave option `world` out, or write .ply."));
     }
     if target == Target::Playback && (args.time.is_some() || args.frames) {
         return Err(Error::input("a playback file contains the whole clip")
             .at(args.output.display())
-            .remedy("Leave --time or --frames out."));
+            .remedy("Leave option `time` or option `frames` out."));
     }
     Ok((pattern, target))
 }
@@ -231,7 +233,7 @@ pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> R
     if matches!(target, Target::Dialect(_)) && !args.world && scene.offset != [0.0; 3] {
         let [x, y, z] = scene.offset;
         console.warn(&format!(
-            "positions are relative to the scene's offset ({x} {y} {z}); .ply can store world positions: --world."
+            "positions are relative to the scene's offset ({x} {y} {z}); .ply can store world positions: option `world`."
         ));
     }
     if let Some((pattern, _)) = pattern {
@@ -243,9 +245,9 @@ pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> R
         None => {
             let start = scene.clip[0];
             console.warn(&format!(
-                "{} stores one time: {start} s, the start of the clip. Choose another with --time, or use {}.",
+                "{} stores one time: {start} s, the start of the clip. Choose another with option `time`, or use {}.",
                 target.name(),
-                either(&[&["--frames"], &written(|d| d.moves)[..]].concat())
+                either(&[&["option `frames`"], &written(|d| d.moves)[..]].concat())
             ));
             Some(start)
         }
@@ -262,7 +264,7 @@ pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> R
     if whole.is_empty() {
         return Err(Error::input("no Gaussian is active at that time: the file would be empty")
             .at(args.input.display())
-            .remedy(format!("Choose a --time from {} to {} s.", scene.clip[0], scene.clip[1])));
+            .remedy(format!("Choose option `time` from {} to {} s.", scene.clip[0], scene.clip[1])));
     }
     let (bytes, warnings) = writer.bytes(whole).map_err(|e| e.at(args.input.display()))?;
     warnings.lines().iter().for_each(|w| console.warn(&format!("{w}.")));
@@ -324,14 +326,14 @@ fn frames_pattern(args: &Conversion) -> Result<Option<(Pattern, PathBuf)>> {
         return match Pattern::of(&args.output) {
             Some(_) => Err(Error::input("is a pattern for many files")
                 .at(args.output.display())
-                .remedy("Add --frames, or give the name of one file.")),
+                .remedy("Add option `frames`, or give the name of one file.")),
             None => Ok(None),
         };
     }
     let pattern = match Pattern::of(&args.output) {
         Some(pattern) => pattern,
         None if Target::of(&args.output).is_ok() => {
-            return Err(Error::input("is one file, but --frames writes many")
+            return Err(Error::input("is one file, but option `frames` writes many")
                 .at(args.output.display())
                 .remedy("Give a folder, or a pattern such as frames/f_%04d.spz."));
         }
@@ -406,7 +408,7 @@ fn rotate(scene: &mut Scene<f32>, up: Up, target: Target, console: &dyn Listener
     let axis = |v: [f64; 3]| format!("({:.3} {:.3} {:.3})", v[0], v[1], v[2]);
     let old = axis(scene.up);
     scene.rotate(&r);
-    console.say(&format!("axes turned: up was {old}, is now {}; --up keep does not turn them", axis(wanted)));
+    console.say(&format!("axes turned: up was {old}, is now {}; option `up` keep does not turn them", axis(wanted)));
     r
 }
 

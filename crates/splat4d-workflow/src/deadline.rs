@@ -1,6 +1,16 @@
-//! [`Deadline`]: what is left of `--minutes` for what follows training.
+//! [`Deadline`]: what is left of `--minutes` for what follows training; and whether work was stopped.
 
+use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::run::Stopwatch;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// An error where `stop` was raised.
+pub(crate) fn unless_stopped(stop: &AtomicBool) -> Result<()> {
+    if stop.load(Ordering::SeqCst) {
+        return Err(Error::new(ErrorKind::Interrupted, "stopped").remedy("The same command begins again."));
+    }
+    Ok(())
+}
 
 /// When a command is to be done.
 #[derive(Clone, Debug)]

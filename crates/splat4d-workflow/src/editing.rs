@@ -99,9 +99,7 @@ pub fn edit(options: &EditOptions, console: &dyn Listener) -> Result<()> {
     let title = title(&source, &options.scene);
     edits.check(&title)?;
     if edits.steps.is_empty() && options.count.is_none() {
-        return Err(
-            Error::input("nothing to do").remedy("Give a list of edits, or an option such as --delete; see --help.")
-        );
+        return Err(Error::input("nothing to do").remedy("Give a list of edits, or one edit such as option `delete`."));
     }
     let bring = Bring::new(&source, options.list.as_deref(), console)?;
     let before = source.scene.len();

@@ -2,7 +2,7 @@
 //! left of `--minutes`.
 
 use crate::baking::{Baking, bake_into};
-use crate::deadline::Deadline;
+use crate::deadline::{Deadline, unless_stopped};
 use crate::draw::{Channel, Painter};
 use crate::events::Listener;
 use crate::files::{self, human_seconds};
@@ -16,7 +16,7 @@ use serde_json::{Value, json};
 use splat4d::bake;
 use splat4d::device::Device;
 use splat4d::layers::Scene;
-use splat4d::{Error, Result};
+use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::capture::{Capture, CaptureKind, CaptureOptions, ImageStore, Timing};
 use splat4d_train::eval::Align;
 use splat4d_train::eval::flow::flow_error;
@@ -24,6 +24,7 @@ use splat4d_train::eval::points::point_errors;
 use splat4d_train::eval::run::{self as eval, EvalOptions, Measured, Scores};
 use splat4d_train::eval::tracks::track_error;
 use splat4d_train::eval::trajectory::trajectory_error;
+use splat4d_train::event::Event;
 use splat4d_train::output::OutputFolder;
 use splat4d_train::path_text::in_command;
 use splat4d_train::recipe::{MotionName, Recipe};
@@ -33,6 +34,7 @@ use splat4d_train::{features, labels};
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 /// Frames a second of the orbit film: cinema's, and a fifth less work than 30.
 const ORBIT_FPS: f64 = 24.0;
@@ -94,30 +96,40 @@ impl Measure {
         match &self.lpips_weights {
             Some(path) if !path.is_file() => Err(Error::input("there is no such file")
                 .at(path.display())
-                .remedy("Name the LPIPS weights as a .safetensors file, or leave --lpips-weights out.")),
+                .remedy("Name the LPIPS weights as a .safetensors file, or leave option `lpips_weights` out.")),
             _ => Ok(()),
         }
     }
 }
 
 /// Scores, playback file, film and report, as far as the time allows: the file always, within what is left.
-pub fn all(run: &Path, measure: &Measure, deadline: &Deadline, console: &dyn Listener) -> Result<()> {
+///
+/// Errors: the run has no scene; files that cannot be written; `stop` was raised.
+pub fn all(
+    run: &Path,
+    measure: &Measure,
+    deadline: &Deadline,
+    stop: &AtomicBool,
+    console: &dyn Listener,
+) -> Result<()> {
     let opened = Run::open(run)?;
     let scene = read_scene(&opened.scene_file()?)?;
     let time = Times::estimate(&opened, &scene, deadline)?;
     if Times::leaves("the held-out views are not scored", [time.scores, time.playback], run, deadline, console) {
         let started = deadline.now();
-        scores(run, &scene, measure, console)?;
+        scores(run, &scene, measure, stop, console)?;
         amend(run, [("evaluation_seconds".into(), json!(deadline.now() - started))])?;
     }
+    unless_stopped(stop)?;
     playback_by(run, deadline, console)?;
     if Times::leaves("the orbit film is missing", [time.film, 0.0], run, deadline, console) {
         let started = deadline.now();
-        match orbit(run, &scene, console) {
+        match orbit(run, &scene, stop, console) {
             Ok(film) => {
                 console.written(&film);
                 amend(run, [("orbit_seconds".into(), json!(deadline.now() - started))])?;
             }
+            Err(error) if error.kind() == ErrorKind::Interrupted => return Err(error),
             // The scene and its scores stand without the film.
             Err(error) => console.warn(&format!("the orbit film was not written: {error}")),
         }
@@ -181,7 +193,7 @@ impl Times {
             return true;
         }
         console.warn(&format!(
-            "{missing}: it takes about {}, and {} are left of --minutes. `splat4d eval {}` does it later.",
+            "{missing}: it takes about {}, and {} are left of option `minutes`. `splat4d eval {}` does it later.",
             human_seconds(seconds),
             human_seconds(left - kept),
             in_command(run)
@@ -228,42 +240,50 @@ pub fn playback_by(run: &Path, deadline: &Deadline, console: &dyn Listener) -> R
 /// Measures a run on its held-out views again: renders and scores them, and writes `results.json`, `per_view.json`, the images and
 /// the report.
 ///
-/// Errors: no scene yet; the capture has moved; another command writes the run.
+/// Errors: no scene yet; the capture has moved; another command writes the run; `stop` was raised.
 ///
 /// ```no_run
 /// use splat4d_workflow::evaluating::{Measure, evaluate};
+/// use std::sync::atomic::AtomicBool;
 ///
 /// # fn main() -> splat4d::Result<()> {
-/// let scores = evaluate("runs/knight".as_ref(), &Measure::default(), &splat4d_workflow::events::ignore)?;
+/// let (measure, stop) = (Measure::default(), AtomicBool::new(false));
+/// let scores = evaluate("runs/knight".as_ref(), &measure, &stop, &splat4d_workflow::events::ignore)?;
 /// println!("{:?} dB", scores.held("PSNR"));
 /// # Ok(())
 /// # }
 /// ```
-pub fn evaluate(run: &Path, measure: &Measure, console: &dyn Listener) -> Result<Scores> {
+pub fn evaluate(run: &Path, measure: &Measure, stop: &AtomicBool, console: &dyn Listener) -> Result<Scores> {
     measure.check()?;
     let scene = read_scene(&Run::open(run)?.scene_file()?)?;
     let _folder = OutputFolder::amend(run, "eval")?;
-    let scores = scores(run, &scene, measure, console)?;
+    let scores = scores(run, &scene, measure, stop, console)?;
     write_report(run, console)?;
     Ok(scores)
 }
 
 /// Renders and scores the held-out views. The caller holds the run.
-pub fn scores(run: &Path, scene: &Scene<f32>, measure: &Measure, console: &dyn Listener) -> Result<Scores> {
+pub fn scores(
+    run: &Path,
+    scene: &Scene<f32>,
+    measure: &Measure,
+    stop: &AtomicBool,
+    console: &dyn Listener,
+) -> Result<Scores> {
     let opened = Run::open(run)?;
     let (mut capture, recipe) = opened.open_capture()?;
     capture.coarse().into_iter().for_each(|w| console.warn(w));
     corrected::apply(&mut capture, run)?;
     let capture = Arc::new(capture);
-    let measuring = Measuring { opened: &opened, recipe: &recipe, measure };
+    let measuring = Measuring { opened: &opened, recipe: &recipe, measure, stop };
     let evaluation = measuring.evaluate(scene, &capture, Measured::Test, None, console)?;
     amend(run, [("lives".into(), json!(lives(scene)))])?;
     tracks(run, scene, &capture, console)?;
     flow(run, scene, &capture, &recipe, console)?;
     if capture.held.is_empty() {
         console.warn(
-            "no view was held out, so quality on new views is not measured. Hold out a camera (--hold-out camera=0) \
-             or every 8th image (--hold-out every=8).",
+            "no view was held out, so quality on new views is not measured. Hold out a camera (option `hold_out` camera=0) \
+             or every 8th image (option `hold_out` every=8).",
         );
     }
     Ok(evaluation)
@@ -279,6 +299,7 @@ pub fn scores_on(
     measured: Measured,
     backgrounds: &[(&str, [f32; 3])],
     measure: &Measure,
+    stop: &AtomicBool,
     console: &dyn Listener,
 ) -> Result<()> {
     let opened = Run::open(run)?;
@@ -295,11 +316,11 @@ pub fn scores_on(
     if !backgrounds.is_empty() && capture.background.is_none() {
         return Err(Error::input("the run's images have no transparent pixels, so there is no background to choose")
             .at(run.display())
-            .remedy("Leave --background out."));
+            .remedy("Leave option `background` out."));
     }
     let own = capture.background;
     let all = on_backgrounds(own, backgrounds);
-    let measuring = Measuring { opened: &opened, recipe: &recipe, measure };
+    let measuring = Measuring { opened: &opened, recipe: &recipe, measure, stop };
     for (name, background) in all {
         let place = if background == own { split.to_owned() } else { format!("{split}-{name}") };
         let judged = measured == Measured::Test && background == own;
@@ -374,6 +395,7 @@ struct Measuring<'a> {
     opened: &'a Run,
     recipe: &'a Recipe,
     measure: &'a Measure,
+    stop: &'a AtomicBool,
 }
 
 impl Measuring<'_> {
@@ -400,7 +422,8 @@ impl Measuring<'_> {
             ..EvalOptions::default()
         };
         let iteration = self.opened.iteration().unwrap_or(0);
-        let scores = eval::evaluate(scene, capture, &store, iteration, &options, &mut |event| console.event(event))?;
+        let mut listen = |event: &Event| console.event(event);
+        let scores = eval::evaluate(scene, capture, &store, iteration, &options, self.stop, &mut listen)?;
         console.clear();
         Ok(scores)
     }
@@ -571,7 +594,7 @@ fn say_scores(run: &Run, console: &dyn Listener) {
 }
 
 /// Films an orbit through space and time: mp4 where ffmpeg is found, an animated PNG otherwise.
-fn orbit(run: &Path, scene: &Scene<f32>, console: &dyn Listener) -> Result<PathBuf> {
+fn orbit(run: &Path, scene: &Scene<f32>, stop: &AtomicBool, console: &dyn Listener) -> Result<PathBuf> {
     let opened = Run::open(run)?;
     let views = opened.views()?;
     let stage = Stage::of_views(&views, scene.up);
@@ -587,6 +610,7 @@ fn orbit(run: &Path, scene: &Scene<f32>, console: &dyn Listener) -> Result<PathB
     let first = &shots[0].camera;
     let mut film = Film::create(&path, [first.width, first.height], fps, shots.len())?;
     for (i, shot) in shots.iter().enumerate() {
+        unless_stopped(stop)?;
         painter.draw(&shot.camera, shot.time);
         film.frame(&painter.rgb(Channel::Color, [0.0, 1.0]))?;
         console.phase("rendering the orbit film", i + 1, shots.len());

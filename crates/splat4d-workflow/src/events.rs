@@ -1,9 +1,12 @@
 //! What workflows report while they work, and who listens.
 
 use serde_json::Value;
+use splat4d_train::capture::Capture;
 use splat4d_train::event::Event as Training;
 use std::cell::RefCell;
 use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
 
 /// A report of a workflow.
 #[derive(Clone, Copy, Debug)]
@@ -30,6 +33,15 @@ pub enum Event<'a> {
     Warning(&'a str),
     /// A file was written.
     Written(&'a Path),
+    /// A training begins or continues in its folder.
+    Begun {
+        /// The capture's name.
+        title: &'a str,
+        /// The run.
+        run: &'a Path,
+        /// The capture; none: that of the run, which is continued.
+        capture: Option<&'a Arc<Capture>>,
+    },
     /// An event of training or evaluation. Its warnings come as [`Warning`](Self::Warning).
     Training(&'a Training),
     /// From here on the workflow polls its stop flag; the sentence says what it does when the flag is raised.
@@ -43,6 +55,11 @@ pub enum Event<'a> {
 pub trait Listener {
     /// Takes an event.
     fn on_event(&self, event: &Event<'_>);
+
+    /// How often it wants the scene during training ([`Training::Snapshot`]); none: never. Asked after [`Event::Begun`].
+    fn snapshots(&self) -> Option<Duration> {
+        None
+    }
 }
 
 impl<F: Fn(&Event<'_>)> Listener for F {
@@ -118,11 +135,43 @@ impl<'a> Recorded<'a> {
 
 impl Listener for Recorded<'_> {
     fn on_event(&self, event: &Event<'_>) {
-        if let Event::Warning(text) = event {
-            self.warnings.borrow_mut().push(linked(text));
-        }
+        let text = match event {
+            Event::Warning(text) => Some(flags(&linked(text))),
+            Event::Training(event) => rolled_back(event),
+            _ => None,
+        };
+        self.warnings.borrow_mut().extend(text);
         self.listener.on_event(event);
     }
+
+    fn snapshots(&self) -> Option<Duration> {
+        self.listener.snapshots()
+    }
+}
+
+/// A sentence on a training that rolled back; none: another event.
+pub fn rolled_back(event: &Training) -> Option<String> {
+    let Training::RolledBack { iteration, to, what } = event else { return None };
+    Some(format!(
+        "step {iteration} was not finite ({what}); training rolled back to step {to} and continues with smaller steps"
+    ))
+}
+
+/// The text with options of a function (`` option `max_mb` ``) as flags of the command (`--max-mb`).
+pub fn flags(text: &str) -> String {
+    const OPTION: &str = "option `";
+    let mut out = String::with_capacity(text.len());
+    let mut rest = text;
+    while let Some((before, after)) = rest.split_once(OPTION) {
+        let is_name = |name: &str| !name.is_empty() && name.bytes().all(|b| b.is_ascii_lowercase() || b == b'_');
+        out += before;
+        match after.split_once('`').filter(|(name, _)| is_name(name)) {
+            Some(("output", behind)) => (out, rest) = (out + "-o", behind),
+            Some((name, behind)) => (out, rest) = (out + "--" + &name.replace('_', "-"), behind),
+            None => (out, rest) = (out + OPTION, after),
+        }
+    }
+    out + rest
 }
 
 /// The text with pages of the documentation, of which an installed program has no copy, as links.
@@ -155,6 +204,12 @@ mod tests {
         let wanted =
             format!("docs/a.json: is no list ({pages}capture-format.md). See {pages}edit.md, my/docs/edit.md or docs/");
         assert_eq!(linked(text), wanted);
+    }
+
+    #[test]
+    fn options_are_flags_of_the_command() {
+        let text = "Add option `size`, or option `output` DIR; option `max_mb` 2 [option `A b` stays, and option `";
+        assert_eq!(flags(text), "Add --size, or -o DIR; --max-mb 2 [option `A b` stays, and option `");
     }
 
     #[test]

@@ -1,15 +1,182 @@
-//! A scene as files for others to open: one time as a 3DGS .ply, the whole as a page with its player.
+//! A scene as files for others to open: one time or each frame as a 3DGS .ply, the whole as a page with its player, and paths of
+//! its Gaussians, or of requested points, as JSON or CSV.
 
 use crate::events::Listener;
 use crate::files;
 use crate::playable::Playable;
+use crate::point_queries::{self, QueryResult};
 use crate::run_folder::Run;
-use crate::source::keep;
+use crate::sequence;
+use crate::source::{Source, keep, not_empty};
+use serde_json::json;
+use splat4d::flow::tracks::{Tracks, every, nearest};
 use splat4d::layers::{Scene, freeze};
-use splat4d::scene::Time;
+use splat4d::math::Rng;
+use splat4d::scene::{RowEdit, Space, Time, labels};
 use splat4d::{Error, Result, format};
 use splat4d_serve::{Page, SceneIn};
 use std::path::{Path, PathBuf};
+
+/// Numbers of a file of tracks, at most: three for a Gaussian and a time. As text they are some gigabytes.
+const MOST_NUMBERS: usize = 300_000_000;
+/// Fainter Gaussians than this are not near anything.
+const LEAST_OPACITY: f64 = 0.1;
+
+/// Times of a sequence of files or of tracks.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Frames {
+    /// Times per second; none: the scene's frame rate.
+    pub fps: Option<f64>,
+    /// First second; none: the clip's.
+    pub from: Option<f64>,
+    /// Last second; none: the clip's.
+    pub to: Option<f64>,
+}
+
+impl Frames {
+    fn of(&self, scene: &Scene<f32>) -> Result<(f64, Vec<f64>)> {
+        sequence::timestamps(scene, self.fps, [self.from, self.to])
+    }
+}
+
+/// Which Gaussians are tracked.
+#[derive(Clone, Debug, Default)]
+pub struct TrackOptions {
+    /// The times.
+    pub frames: Frames,
+    /// Every so many Gaussians; 0 counts as 1.
+    pub every: usize,
+    /// Only the Gaussians nearest to this point at the first time, and how many.
+    pub near: Option<([f64; 3], usize)>,
+    /// Only Gaussians with this label.
+    pub label: Option<String>,
+    /// Positions in the capture's world, in double precision.
+    pub world: bool,
+}
+
+/// Opens what `path` names; with `label`, only the Gaussians that have it.
+///
+/// Errors: it cannot be read; no Gaussian; no such label.
+pub fn open(path: &Path, label: Option<&str>) -> Result<Source> {
+    let mut source = Source::open(path)?;
+    if let Some(name) = label {
+        let wanted = Some(labels::named(&source.scene.labels, name).map_err(|e| e.at(path.display()))?);
+        for layer in &mut source.scene.layers {
+            let of = labels::of(&layer.params);
+            layer.edit(&RowEdit::prune(Space::Gaussians, of.iter().map(|l| *l == wanted)), &Rng::new(0, "export", 0));
+        }
+    }
+    not_empty(&source.scene, path)?;
+    Ok(source)
+}
+
+/// Writes a file per frame, `frame_00000.ply` and so on, into a folder; returns how many. `force` replaces a sequence of ours.
+///
+/// Errors: times outside the clip; a folder with other files; a file cannot be written.
+pub fn frames(
+    path: &Path,
+    source: &Source,
+    folder: &Path,
+    frames: &Frames,
+    [world, force]: [bool; 2],
+    listener: &dyn Listener,
+) -> Result<usize> {
+    let (fps, times) = frames.of(&source.scene)?;
+    let pattern = sequence::Pattern::in_folder(folder);
+    let read = sequence::Read { path, run: source.run.as_ref() };
+    let owned = sequence::take(&[&pattern], times.len(), &read, "export", force)?;
+    for (i, &time) in times.iter().enumerate() {
+        moment(&source.scene, time, world, &pattern.file(i))?;
+        listener.phase("exporting", i + 1, times.len());
+    }
+    owned.finished();
+    listener.clear();
+    let (from, to) = (times[0], times[times.len() - 1]);
+    listener.say(&format!("{} files, {fps} per second, from {from} to {to} s", times.len()));
+    listener.written(folder);
+    Ok(times.len())
+}
+
+/// Whether tracks are written as JSON. Errors: neither that nor CSV.
+fn is_json(out: &Path) -> Result<bool> {
+    match out.extension().map(|e| e.to_ascii_lowercase()) {
+        Some(e) if e == "json" => Ok(true),
+        Some(e) if e == "csv" => Ok(false),
+        _ => Err(Error::input("tracks are written as .csv or .json")
+            .at(out.display())
+            .remedy("Use option `tracks` NAME.csv or option `tracks` NAME.json.")),
+    }
+}
+
+/// Writes positions over time of points that the file `points` lists (pixels of cameras, or positions), and their visibility.
+///
+/// Errors: a list that cannot be read; more numbers than a file should have.
+pub fn points(source: &Source, points: &Path, frames: &Frames, out: &Path, listener: &dyn Listener) -> Result<()> {
+    let (scene, json) = (&source.scene, is_json(out)?);
+    let (_, times) = frames.of(scene)?;
+    let views = source.views()?;
+    let asked =
+        point_queries::read(&files::read_text(points)?, &views, scene.clip).map_err(|e| e.at(points.display()))?;
+    if asked.len().saturating_mul(times.len()).saturating_mul(3) > MOST_NUMBERS {
+        return Err(Error::input(format!("{} points at {} times are too many", asked.len(), times.len()))
+            .remedy("Give fewer points, or fewer times with option `fps`, option `from` or option `to`."));
+    }
+    let result = QueryResult::of(scene, asked, &views, &times, &mut |done, of| listener.phase("following", done, of));
+    listener.clear();
+    if result.missing() > 0 {
+        listener.warn(&format!(
+            "{} of {} points are not on any Gaussian: they are left out",
+            result.missing(),
+            result.len()
+        ));
+    }
+    files::write(out, if json { result.to_json() } else { result.to_csv() }.as_bytes())?;
+    listener.say(&format!("{} points at {} times", files::grouped(result.len()), times.len()));
+    listener.emit(&json!({
+        "type": "exported", "points": result.len(), "moments": times.len(), "missing": result.missing(),
+    }));
+    listener.written(out);
+    Ok(())
+}
+
+/// Writes positions of Gaussians over time.
+///
+/// Errors: no such label; more numbers than a file should have.
+pub fn tracks(scene: &Scene<f32>, options: &TrackOptions, out: &Path, listener: &dyn Listener) -> Result<()> {
+    let json = is_json(out)?;
+    let (_, times) = options.frames.of(scene)?;
+    let mut members = match options.near {
+        None => every(scene, options.every.max(1)),
+        Some((point, count)) if point.iter().all(|v| v.is_finite()) => {
+            nearest(scene, Time(times[0]), &[point], count, LEAST_OPACITY).remove(0)
+        }
+        Some(_) => {
+            return Err(Error::input("option `near` is not a point")
+                .remedy("Give three numbers in scene units, for instance option `near` 0.3,1.2,-0.5"));
+        }
+    };
+    if let Some(name) = &options.label {
+        let wanted = Some(labels::named(&scene.labels, name)?);
+        let of: Vec<Vec<Option<usize>>> = scene.layers.iter().map(|l| labels::of(&l.params)).collect();
+        members.retain(|m| of[m.layer][m.row as usize] == wanted);
+    }
+    if members.len().saturating_mul(times.len()).saturating_mul(3) > MOST_NUMBERS {
+        return Err(Error::input(format!("{} tracks of {} times are too many", members.len(), times.len())).remedy(
+            "Select fewer with option `every` N, option `near` X,Y,Z, option `fps`, option `from` or option `to`.",
+        ));
+    }
+    if members.is_empty() {
+        listener.warn(&format!("no Gaussian is active at {} s: the file has no tracks", times[0]));
+    }
+    let followed = Tracks::follow(scene, &members, &times);
+    let offset = if options.world { scene.offset } else { [0.0; 3] };
+    let text = if json { followed.to_json(scene, offset) } else { followed.to_csv(scene, offset) };
+    files::write(out, text.as_bytes())?;
+    listener.say(&format!("{} tracks of {} times", files::grouped(members.len()), times.len()));
+    listener.emit(&json!({"type": "exported", "tracks": members.len(), "moments": times.len()}));
+    listener.written(out);
+    Ok(())
+}
 
 /// Writes the Gaussians alive at a time, seconds of the scene, as a 3DGS .ply; returns how many. `world`: in the capture's world,
 /// in double precision.
@@ -36,12 +203,16 @@ pub fn page(path: &Path, out: &Path, link: Option<&Path>, listener: &dyn Listene
     if !["html", "htm"].iter().any(|e| out.extension().is_some_and(|own| own.eq_ignore_ascii_case(e)))
         && !out.starts_with("/dev")
     {
-        return Err(Error::input("a page's name ends in .html").at(out.display()).remedy("Use -o NAME.html."));
+        return Err(Error::input("a page's name ends in .html")
+            .at(out.display())
+            .remedy("Use option `output` NAME.html."));
     }
     let run = Run::is(path).then(|| Run::open(path)).transpose()?;
     keep(path, run.as_ref(), out, &[])?;
     if let Some(link) = link.filter(|link| !files::is_playback(link)) {
-        return Err(Error::input("the name does not end in .s4d").at(link.display()).remedy("Use --link NAME.s4d."));
+        return Err(Error::input("the name does not end in .s4d")
+            .at(link.display())
+            .remedy("Use option `link` NAME.s4d."));
     }
     // A playback file may lie beside its page as it is.
     let is_read = |link: &&Path| link.canonicalize().ok().is_some_and(|l| path.canonicalize().is_ok_and(|p| p == l));
@@ -76,7 +247,7 @@ fn address(link: &Path, page: &Path) -> Result<String> {
     let (Ok(below), Some(name)) = (below.strip_prefix(&at), link.file_name()) else {
         return Err(Error::input("is not in the page's folder")
             .at(link.display())
-            .remedy("Give --link a file in the page's folder or below it."));
+            .remedy("Give option `link` a file in the page's folder or below it."));
     };
     let parts = below.iter().chain([name]).map(|part| percent(&part.to_string_lossy()));
     Ok(format!("./{}", parts.collect::<Vec<_>>().join("/")))

@@ -13,6 +13,7 @@ use splat4d_train::recipe::Recipe;
 use splat4d_train::run::open_capture;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 /// Options of [`score`].
 #[derive(Clone, Debug)]
@@ -39,12 +40,13 @@ impl Default for ForeignOptions<'_> {
 
 /// Scores any scene (a file, numbered files, a run) on the views of a capture.
 ///
-/// Errors: the capture has no such views; images without alpha, which are composited on nothing; no scene.
+/// Errors: the capture has no such views; images without alpha, which are composited on nothing; no scene; `stop` was raised.
 pub fn score(
     path: &Path,
     capture: &Path,
     options: &ForeignOptions<'_>,
     measure: &Measure,
+    stop: &AtomicBool,
     console: &dyn Listener,
 ) -> Result<()> {
     let mut recipe = Recipe::default();
@@ -81,6 +83,7 @@ pub fn score(
         options.measured,
         options.backgrounds,
         measure,
+        stop,
         console,
     )?;
     if let Some(folder) = folder {
@@ -101,6 +104,7 @@ fn foreign_scores(
     measured: Measured,
     backgrounds: &[(&str, [f32; 3])],
     measure: &Measure,
+    stop: &AtomicBool,
     console: &dyn Listener,
 ) -> Result<()> {
     let mut capture = capture.clone();
@@ -110,11 +114,11 @@ fn foreign_scores(
     }
     if measured.frames(&capture).is_empty() {
         return Err(Error::input(format!("the capture has no views of the split `{}`", measured.name()))
-            .remedy("Choose them with --hold-out, for instance --hold-out every=8, or measure --split train."));
+            .remedy("Choose them with option `hold_out`, for instance option `hold_out` every=8, or measure option `split` train."));
     }
     if !backgrounds.is_empty() && capture.background.is_none() {
         return Err(Error::input("the capture's images have no transparent pixels, and so no background to choose")
-            .remedy("Leave --background out."));
+            .remedy("Leave option `background` out."));
     }
     for (name, background) in on_backgrounds(capture.background, backgrounds) {
         scene.background = background.unwrap_or(scene.background);
@@ -134,8 +138,8 @@ fn foreign_scores(
         };
         let mut listen = |event: &Event| console.event(event);
         let scores = match out {
-            Some(_) => evaluate(&scene, &capture, &store, 0, &options, &mut listen)?,
-            None => assess(&scene, &capture, &store, 0, &options, &mut listen)?,
+            Some(_) => evaluate(&scene, &capture, &store, 0, &options, stop, &mut listen)?,
+            None => assess(&scene, &capture, &store, 0, &options, stop, &mut listen)?,
         };
         console.clear();
         say_split(&scores, measured, name, console);

@@ -161,7 +161,9 @@ fn append_to(
         meta = Some(next);
     }
     console.clear();
-    meta.ok_or_else(|| Error::input("no chunk is finished").at(run.display()).remedy("Train --chunk shared first"))
+    meta.ok_or_else(|| {
+        Error::input("no chunk is finished").at(run.display()).remedy("Train option `chunk` shared first")
+    })
 }
 
 /// A scene of the run.

@@ -1,6 +1,7 @@
 //! The work behind `label`, which `train` does too where a capture has labels or features: both learnt into a run's scene, and
 //! measured.
 
+use crate::deadline::unless_stopped;
 use crate::evaluating::{self, amend};
 use crate::events::Listener;
 use crate::files;
@@ -16,6 +17,7 @@ use splat4d_train::labels::{self, LabelScores, ROUNDS, learn, measure};
 use splat4d_train::output::OutputFolder;
 use splat4d_train::run::{capture_options, corrected};
 use std::path::Path;
+use std::sync::atomic::AtomicBool;
 
 /// Whether any image of a run's capture has a mask of labels or an image of features.
 pub fn has_any(capture: &Capture) -> bool {
@@ -25,26 +27,40 @@ pub fn has_any(capture: &Capture) -> bool {
 /// Learns a label and features of each Gaussian of a run from the masks and feature images of its capture, or of `from`, another
 /// capture of the same cameras; bakes and reports again. `rounds`: passes over the images.
 ///
-/// Errors: no training image has either; files that cannot be read; another command writes the run.
+/// Errors: no training image has either; files that cannot be read; another command writes the run; `stop` was raised.
 ///
 /// ```no_run
+/// use std::sync::atomic::AtomicBool;
+///
 /// # fn main() -> splat4d::Result<()> {
-/// let listen = &splat4d_workflow::events::ignore;
-/// splat4d_workflow::labelling::label("runs/take".as_ref(), Some("segmented".as_ref()), None, listen)
+/// let (listen, stop) = (&splat4d_workflow::events::ignore, AtomicBool::new(false));
+/// splat4d_workflow::labelling::label("runs/take".as_ref(), Some("segmented".as_ref()), None, &stop, listen)
 /// # }
 /// ```
-pub fn label(run: &Path, from: Option<&Path>, rounds: Option<usize>, console: &dyn Listener) -> Result<()> {
+pub fn label(
+    run: &Path,
+    from: Option<&Path>,
+    rounds: Option<usize>,
+    stop: &AtomicBool,
+    console: &dyn Listener,
+) -> Result<()> {
     Run::open(run)?;
     let _folder = OutputFolder::amend(run, "label")?;
-    learn_into(run, from, rounds, console)?;
+    learn_into(run, from, rounds, stop, console)?;
     evaluating::playback(run, console)?;
     evaluating::write_page(run, console)
 }
 
 /// Learns labels and features into the run's `scene.safetensors`, and nothing else. The caller holds the run.
 ///
-/// Errors: no training image has either; files that cannot be read.
-pub fn learn_into(run: &Path, from: Option<&Path>, rounds: Option<usize>, console: &dyn Listener) -> Result<()> {
+/// Errors: no training image has either; files that cannot be read; `stop` was raised.
+pub fn learn_into(
+    run: &Path,
+    from: Option<&Path>,
+    rounds: Option<usize>,
+    stop: &AtomicBool,
+    console: &dyn Listener,
+) -> Result<()> {
     let opened = Run::open(run)?;
     let file = opened.scene_file()?;
     let mut scene = read_scene(&file)?;
@@ -57,10 +73,10 @@ pub fn learn_into(run: &Path, from: Option<&Path>, rounds: Option<usize>, consol
     let there = |which: fn(&Frame) -> bool| capture.train.iter().any(|&i| which(&capture.frames[i]));
     let (labelled, featured) = (there(|f| f.labels.is_some()), there(|f| f.features.is_some()));
     if featured {
-        learn_features(run, &mut scene, &capture, rounds, console)?;
+        learn_features(run, &mut scene, &capture, rounds, stop, console)?;
     }
     if labelled || !featured {
-        learn_labels(run, &mut scene, &capture, rounds, console)?;
+        learn_labels(run, &mut scene, &capture, rounds, stop, console)?;
     }
     let mut bytes = Vec::new();
     format::scene::write(&scene, &mut bytes)?;
@@ -74,9 +90,13 @@ fn learn_features(
     scene: &mut Scene<f32>,
     capture: &Capture,
     rounds: Option<usize>,
+    stop: &AtomicBool,
     console: &dyn Listener,
 ) -> Result<()> {
-    let mut phase = |done, of| console.phase("learning features", done, of);
+    let mut phase = |done, of| {
+        console.phase("learning features", done, of);
+        unless_stopped(stop)
+    };
     let losses = features::learn(scene, capture, rounds.unwrap_or(features::ROUNDS), &mut phase)?;
     console.clear();
     let list: Vec<String> = losses.iter().map(|l| format!("{l:.4}")).collect();
@@ -108,9 +128,13 @@ fn learn_labels(
     scene: &mut Scene<f32>,
     capture: &Capture,
     rounds: Option<usize>,
+    stop: &AtomicBool,
     console: &dyn Listener,
 ) -> Result<()> {
-    let mut phase = |done, of| console.phase("learning labels", done, of);
+    let mut phase = |done, of| {
+        console.phase("learning labels", done, of);
+        unless_stopped(stop)
+    };
     let losses = learn(scene, capture, rounds.unwrap_or(ROUNDS), &mut phase)?;
     console.clear();
     let list: Vec<String> = losses.iter().map(|l| format!("{l:.4}")).collect();

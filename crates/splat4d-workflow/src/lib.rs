@@ -1,5 +1,5 @@
-//! What the `splat4d` command does beyond parsing and printing, as functions for Rust and Python: open runs and scenes, render
-//! their channels, bake, convert, export, evaluate, compress, label, predict, edit and report. Functions take typed options, report
+//! What the `splat4d` command does beyond parsing and printing, as functions for Rust and Python: import, inspect, train, open runs
+//! and scenes, render their channels, bake, convert, export, localise, evaluate, compress, label, predict, edit and report. Functions take typed options, report
 //! [`events::Event`]s and print nothing.
 //!
 //! ```no_run
@@ -34,10 +34,13 @@
 //! | `measure.rs`, `measure/` | how scenes and files play: frames per second, bytes, Gaussians alive |
 //! | `baking.rs`, `baking/` | a scene as a playback file, within bytes and likeness |
 //! | `playable.rs`, `growing.rs` | anything that plays as a playback file; that of a long capture, which grows during training |
-//! | `converting.rs`, `exporting.rs` | formats of other programs; one time as .ply, the whole as a page |
+//! | `converting.rs`, `exporting.rs` | formats of other programs; .ply files, a page, tracks |
+//! | `localising.rs` | pose and time of images |
 //! | `comparing.rs`, `report/`, `comparison.rs` | scores of several runs; `report.html`, drawn without a library; tables |
 //! | `evaluating.rs`, `foreign.rs`, `still_baseline.rs` | what follows training: scores, playback file, film, report; scores of any scene; of a static one |
 //! | `labelling.rs`, `chunked.rs`, `compressing.rs` | labels, long captures in chunks, compression with a guard |
+//! | `training.rs` | a capture becomes a run, which is measured, filmed and reported |
+//! | `importing.rs`, `inspecting.rs`, `inspecting/` | videos become a capture; what a capture, run or file contains |
 //! | `predicting.rs`, `predicting/` | forecasts, compared with what came |
 //! | `editing.rs`, `picking.rs`, `editor.rs` | lists of edits; edits from a page of the player |
 //! | `texts.rs` | texts that users write, for the fuzz targets |
@@ -63,7 +66,10 @@ pub mod exporting;
 pub mod files;
 pub mod foreign;
 pub mod growing;
+pub mod importing;
+pub mod inspecting;
 pub mod labelling;
+pub mod localising;
 pub mod measure;
 pub mod paths;
 mod picking;
@@ -79,6 +85,7 @@ pub mod source;
 pub mod status;
 pub mod still_baseline;
 pub mod texts;
+pub mod training;
 pub mod video;
 
 pub use splat4d::{Error, ErrorKind, Result};

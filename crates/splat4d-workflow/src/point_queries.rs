@@ -100,7 +100,8 @@ pub fn read(text: &str, views: &[View], clip: [f64; 2]) -> Result<Vec<PointQuery
                 if !inside {
                     let what = format!("pixel ({x}, {y}) is outside the image of {}x{}", camera.width, camera.height);
                     return Err(place(
-                        Error::input(what).remedy("Pixels are those of the run's images (divided by its --downscale)."),
+                        Error::input(what)
+                            .remedy("Pixels are those of the run's images (divided by its option `downscale`)."),
                     ));
                 }
                 Place::Pixel(Box::new(camera.clone()), [x, y])

@@ -8,6 +8,7 @@ mod write;
 
 use score::{Views, scores};
 
+use crate::deadline::unless_stopped;
 use crate::events::Listener;
 use crate::files::human_seconds;
 use crate::report::predict::Summary;
@@ -27,6 +28,7 @@ use splat4d_train::capture::{Capture, ImageStore};
 use splat4d_train::output::OutputFolder;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
 /// Shares of the observed ticks from which forecasts are tried to choose a model by, and how far these go. Models are fitted to
@@ -91,23 +93,25 @@ impl PredictOptions {
 /// the forecasts and the predicted scene.
 ///
 /// Errors: a run that is unfinished or was trained on its whole clip; too few observed frames; actions that are too short; nothing
-/// moves; another command writes the run.
+/// moves; another command writes the run; `stop` was raised, which is checked between models and images.
 ///
 /// ```no_run
 /// use splat4d_workflow::events::ignore;
 /// use splat4d_workflow::predicting::{PredictOptions, predict};
+/// use std::sync::atomic::AtomicBool;
 ///
 /// # fn main() -> splat4d::Result<()> {
-/// let folder = predict(PredictOptions { horizon: Some(90), ..PredictOptions::new("runs/seen") }, &ignore)?;
+/// let options = PredictOptions { horizon: Some(90), ..PredictOptions::new("runs/seen") };
+/// let folder = predict(options, &AtomicBool::new(false), &ignore)?;
 /// println!("{}", folder.join("report.html").display());
 /// # Ok(())
 /// # }
 /// ```
-pub fn predict(options: PredictOptions, listener: &dyn Listener) -> Result<PathBuf> {
+pub fn predict(options: PredictOptions, stop: &AtomicBool, listener: &dyn Listener) -> Result<PathBuf> {
     Run::open(&options.run)?;
     let _folder = OutputFolder::amend(&options.run, "predict")?;
     let folder = options.run.join(FOLDER);
-    Work::open(options, listener)?.run(listener)?;
+    Work::open(options, listener)?.run(stop, listener)?;
     Ok(folder)
 }
 
@@ -177,7 +181,7 @@ impl Work {
         Ok(Self { order, run, antialias, capture, store, scene, clock, horizon, ticks, observed })
     }
 
-    fn run(&self, console: &dyn Listener) -> Result<()> {
+    fn run(&self, stop: &AtomicBool, console: &dyn Listener) -> Result<()> {
         let folder = self.order.run.join(FOLDER);
         files::make_folder(&folder)?;
         console.say(&format!(
@@ -194,6 +198,7 @@ impl Work {
         let mut forecasts: Vec<Forecast> = Vec::new();
         for (i, &model) in models.iter().enumerate() {
             console.phase(&format!("forecasting: {}", model.name()), i, models.len());
+            unless_stopped(stop)?;
             forecasts.push(self.forecast(model)?);
         }
         console.clear();
@@ -201,7 +206,7 @@ impl Work {
         let mut cases = Vec::new();
         for (i, f) in forecasts.iter().enumerate() {
             console.phase("comparing with images", i, forecasts.len());
-            cases.push(views.cases(self, &f.scene)?);
+            cases.push(views.cases(self, &f.scene, stop)?);
         }
         console.clear();
         let mut told = Vec::new();
@@ -219,7 +224,7 @@ impl Work {
         }
         let oracle = match &oracle {
             Some(scene) => {
-                let own = views.cases(self, scene)?;
+                let own = views.cases(self, scene, stop)?;
                 let mut model_scores = scores("oracle", &own, [&cases[0], &cases[1]], self.horizon);
                 model_scores.track_error = truth.as_ref().and_then(|t| views.track_errors(self, t));
                 Some(model_scores)
@@ -228,7 +233,7 @@ impl Work {
         };
         let best = self.chosen(&forecasts);
         let assimilated = match self.order.assimilate {
-            true => Some(assimilate::run(self, best, &views, [&cases[0], &cases[1]], console)?),
+            true => Some(assimilate::run(self, best, &views, [&cases[0], &cases[1]], stop, console)?),
             false => None,
         };
         let told = Summary {
@@ -250,7 +255,7 @@ impl Work {
             scene: best.model.name(),
         };
         write::all(self, &folder, &told, &forecasts, best, console)?;
-        let films = if self.order.film { views.films(self, &folder, best, console)? } else { Vec::new() };
+        let films = if self.order.film { views.films(self, &folder, best, stop, console)? } else { Vec::new() };
         let page = report::predict::write(&folder, &self.run.name(), &told, &films)?;
         say(&told, console);
         console.written(&page);
@@ -345,7 +350,7 @@ impl Work {
                 "invalid oracle: expected a run of the same capture that was trained on more of it",
             )
             .at(path.display())
-            .remedy("Train it on the same capture with the same recipe, without --observe"));
+            .remedy("Train it on the same capture with the same recipe, without option `observe`"));
         }
         Ok(Some(scene))
     }

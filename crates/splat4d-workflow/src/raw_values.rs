@@ -48,7 +48,7 @@ impl RawFormat {
     pub fn suits(self, channel: Channel) -> Result<()> {
         if self == Self::Flo && channel != Channel::Flow {
             return Err(Error::input(format!(".flo stores flow, not {}", channel.name()))
-                .remedy("Add --channel flow, or use --raw-format npy or exr."));
+                .remedy("Add option `channel` flow, or use option `raw_format` npy or exr."));
         }
         Ok(())
     }
@@ -84,7 +84,7 @@ fn open_exr(channel: Channel, raw: &Planes<f32>) -> Result<Vec<u8>> {
     let layer = Layer::new((raw.width, raw.height), LayerAttributes::default(), Encoding::UNCOMPRESSED, channels);
     let mut out = Cursor::new(Vec::new());
     Image::from_layer(layer).write().non_parallel().to_buffered(&mut out).map_err(|e| {
-        Error::input(format!("an image cannot be written as OpenEXR ({e})")).remedy("Use --raw-format npy.")
+        Error::input(format!("an image cannot be written as OpenEXR ({e})")).remedy("Use option `raw_format` npy.")
     })?;
     Ok(out.into_inner())
 }

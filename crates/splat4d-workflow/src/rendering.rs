@@ -90,10 +90,14 @@ impl Default for RenderOptions {
 pub fn image(path: &Path, camera: &Path, args: &RenderOptions, console: &dyn Listener) -> Result<()> {
     let (camera, background) = camera_file::read(camera)?;
     let Some(output) = args.output.as_ref().or(args.raw.as_ref()) else {
-        return Err(Error::input("no output was given").remedy("Add -o NAME.png, --raw NAME or both."));
+        return Err(
+            Error::input("no output was given").remedy("Add option `output` NAME.png, option `raw` NAME or both.")
+        );
     };
     if args.output.as_ref().is_some_and(|o| o.extension().is_none_or(|e| !e.eq_ignore_ascii_case("png"))) {
-        return Err(Error::input("one image is written as .png").at(output.display()).remedy("Use -o NAME.png."));
+        return Err(Error::input("one image is written as .png")
+            .at(output.display())
+            .remedy("Use option `output` NAME.png."));
     }
     args.raw_format.suits(args.channel)?;
     let source = Source::open(path)?;
@@ -235,7 +239,7 @@ pub fn film(path: &Path, args: &RenderOptions, console: &dyn Listener) -> Result
             "the views have several sizes ({}x{} and {}x{}), a film needs one",
             size[0], size[1], other.camera.width, other.camera.height
         ))
-        .remedy("Add --size, or write a folder of images (-o FOLDER)."));
+        .remedy("Add option `size`, or write a folder of images (option `output` FOLDER)."));
     }
     let background = args.background.unwrap_or(scene.background);
     let depth = args.channel == Channel::Depth;

@@ -202,7 +202,7 @@ fn open_sequence(path: &Path, fps: f64) -> Result<Source> {
         if *up.get_or_insert(opened.scene.up) != opened.scene.up {
             return Err(Error::input("the frame's axes differ from those of the previous frames")
                 .at(file.display())
-                .remedy("Convert all frames with the same --up."));
+                .remedy("Convert all frames with the same option `up`."));
         }
         let mut params = std::mem::take(&mut opened.scene.layers[0].params);
         let first = *offset.get_or_insert(opened.scene.offset);

@@ -50,7 +50,7 @@ pub fn baseline(
         console.stop_not_polled("the still scene is kept, and the same command makes what is missing");
     }
     let scene = read_scene(&Run::open(&folder)?.scene_file()?)?;
-    let evaluation = evaluating::scores(&folder, &scene, measure, console)?;
+    let evaluation = evaluating::scores(&folder, &scene, measure, stop, console)?;
     let scores: Value = evaluation.report.results()[evaluation.report.method()].clone();
     let results = path.join("results.json");
     let mut all = if results.is_file() {

@@ -15,8 +15,7 @@ const CRF: &str = "18";
 const ENDINGS: &str =
     "Use .mp4, .mkv or .mov (needs ffmpeg), .png (animated), or a name without extension for a folder of images.";
 /// Remedy where ffmpeg is missing.
-const INSTEAD: &str =
-    "Install ffmpeg, or write an animated .png or a folder of images instead (-o NAME.png, -o FOLDER).";
+const INSTEAD: &str = "Install ffmpeg, or write an animated .png or a folder of images instead (option `output` NAME.png, option `output` FOLDER).";
 /// Most bytes kept of what ffmpeg says.
 const STDERR_BYTES: usize = 64 << 10;
 

@@ -118,10 +118,10 @@ fn workflows_of_runs_refuse_what_is_no_run() {
     let folder = tempfile::tempdir().unwrap();
     let (run, stop) = (folder.path(), AtomicBool::new(false));
     let errors = [
-        evaluate(run, &Measure::default(), &ignore).err(),
+        evaluate(run, &Measure::default(), &stop, &ignore).err(),
         compress(run, &CompressOptions::default(), &stop, &ignore).err(),
-        label(run, None, None, &ignore).err(),
-        predict(PredictOptions::new(run), &ignore).err(),
+        label(run, None, None, &stop, &ignore).err(),
+        predict(PredictOptions::new(run), &stop, &ignore).err(),
     ];
     for error in errors {
         let error = error.expect("an empty folder is no run");

@@ -385,14 +385,14 @@ impl Judge {
 
     /// PSNR of the same few training views every time.
     fn training(&self, scene: &Path, step: usize) -> Result<Option<f64>> {
-        let options = EvalOptions { train_views: PROBE_VIEWS, ..self.options() };
-        let scores = assess(&read_scene(scene)?, &self.training, &self.store, step, &options, &mut |_| {})?;
+        let (options, stop) = (EvalOptions { train_views: PROBE_VIEWS, ..self.options() }, AtomicBool::new(false));
+        let scores = assess(&read_scene(scene)?, &self.training, &self.store, step, &options, &stop, &mut |_| {})?;
         Ok(scores.train("PSNR"))
     }
 
     fn scores(&self, scene: &Path, step: usize, console: &Console) -> Result<Scores> {
-        let mut listen = |event: &Event| console.event(event);
-        assess(&read_scene(scene)?, &self.capture, &self.store, step, &self.options(), &mut listen)
+        let (stop, mut listen) = (AtomicBool::new(false), |event: &Event| console.event(event));
+        assess(&read_scene(scene)?, &self.capture, &self.store, step, &self.options(), &stop, &mut listen)
     }
 }
 

@@ -123,6 +123,8 @@ pub(crate) struct Args {
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     args.measure.check()?;
+    let stop = interrupt::flag("stopping");
+    interrupt::stop_not_polled("the same command begins again");
     let measure = Measure { device: chosen(args.device.into(), "measuring", console), ..args.measure.options() };
     let path = args.run.as_ref().or(args.model.as_ref()).expect("clap asks for a run");
     if let Some(capture) = &args.capture {
@@ -134,7 +136,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             measured: args.split.unwrap_or(Split::Test).measured(),
             backgrounds: args.background.map_or(&[][..], Background::colors),
         };
-        return Ok(foreign::score(path, capture, &options, &measure, console)?);
+        return Ok(foreign::score(path, capture, &options, &measure, &stop, console)?);
     }
     let run = Run::open(path)?;
     run.scene_file()?;
@@ -145,18 +147,16 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     if args.split.is_some() || args.background.is_some() {
         let split = args.split.unwrap_or(Split::Test).measured();
         let backgrounds = args.background.map_or(&[][..], Background::colors);
-        evaluating::scores_on(path, split, backgrounds, &measure, console)?;
+        evaluating::scores_on(path, split, backgrounds, &measure, &stop, console)?;
         return Ok(evaluating::write_page(path, console)?);
     }
     if args.baseline {
-        let stop = interrupt::flag("stopping");
-        interrupt::stop_not_polled("the same command begins again");
         baseline(&folder, &run, &measure, &stop, console)?;
     }
     if args.no_film {
         let scene = read_scene(&run.scene_file()?)?;
-        evaluating::scores(path, &scene, &measure, console)?;
+        evaluating::scores(path, &scene, &measure, &stop, console)?;
         return Ok(evaluating::write_report(path, console)?);
     }
-    Ok(evaluating::all(path, &measure, &Deadline::default(), console)?)
+    Ok(evaluating::all(path, &measure, &Deadline::default(), &stop, console)?)
 }

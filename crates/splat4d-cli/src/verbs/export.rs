@@ -4,16 +4,9 @@
 use crate::console::Console;
 use serde_json::json;
 use splat4d::Error;
-use splat4d::flow::tracks::{Tracks, every, nearest};
-use splat4d::layers::Scene;
-use splat4d::math::Rng;
-use splat4d::scene::{RowEdit, Space, Time, labels};
-use splat4d_workflow::exporting;
+use splat4d_workflow::exporting::{self, Frames, TrackOptions};
 use splat4d_workflow::files;
-use splat4d_workflow::point_queries::{self, QueryResult};
-use splat4d_workflow::sequence;
-use splat4d_workflow::source::{Source, not_empty};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -136,40 +129,20 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     if args.link.is_some() {
         return Err(Error::input("--link needs a page").remedy("Add -o NAME.html.").into());
     }
-    let mut source = Source::open(path)?;
-    if let Some(name) = args.label.as_ref().filter(|_| args.tracks.is_none()) {
-        let wanted = Some(labels::named(&source.scene.labels, name).map_err(|e| e.at(path.display()))?);
-        for layer in &mut source.scene.layers {
-            let of = labels::of(&layer.params);
-            layer.edit(&RowEdit::prune(Space::Gaussians, of.iter().map(|l| *l == wanted)), &Rng::new(0, "export", 0));
-        }
-    }
+    let source = exporting::open(path, args.label.as_deref().filter(|_| args.tracks.is_none()))?;
     for file in args.output.iter().chain(&args.tracks) {
         source.keep(path, file, &args.points.iter().map(PathBuf::as_path).collect::<Vec<_>>())?;
     }
     let scene = &source.scene;
-    not_empty(scene, path)?;
-    let write = |time: f64, out: &Path| exporting::moment(scene, time, args.world, out);
+    let frames = Frames { fps: args.fps, from: args.from, to: args.to };
     if let Some(out) = &args.tracks {
-        return match &args.points {
-            Some(points) => followed(&source, args, [points, out], console),
-            None => tracks(scene, args, out, console),
-        };
+        return Ok(match &args.points {
+            Some(points) => exporting::points(&source, points, &frames, out, console)?,
+            None => exporting::tracks(scene, &tracks(args, frames)?, out, console)?,
+        });
     }
     if let Some(folder) = &args.sequence {
-        let (fps, times) = sequence::timestamps(scene, args.fps, [args.from, args.to])?;
-        let pattern = sequence::Pattern::in_folder(folder);
-        let read = sequence::Read { path, run: source.run.as_ref() };
-        let owned = sequence::take(&[&pattern], times.len(), &read, "export", args.force)?;
-        for (i, &time) in times.iter().enumerate() {
-            write(time, &pattern.file(i))?;
-            console.phase("exporting", i + 1, times.len());
-        }
-        owned.finished();
-        console.clear();
-        let (from, to) = (times[0], times[times.len() - 1]);
-        console.say(&format!("{} files, {fps} per second, from {from} to {to} s", times.len()));
-        console.written(folder);
+        exporting::frames(path, &source, folder, &frames, [args.world, args.force], console)?;
         return Ok(());
     }
     let out = args.output.as_ref().expect("clap asks for an output");
@@ -180,7 +153,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             .into());
     }
     let time = args.time.unwrap_or(scene.clip[0]);
-    let n = write(time, out)?;
+    let n = exporting::moment(scene, time, args.world, out)?;
     exporting::warn_of_empty(scene, time, n, console);
     console.say(&format!("{} Gaussians at {time} s", files::grouped(n)));
     console.emit(&json!({"type": "exported", "gaussians": n, "time": time}));
@@ -188,87 +161,16 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Numbers of a file of tracks, at most: three for a Gaussian and a moment. As text they are some gigabytes.
-const MOST_NUMBERS: usize = 300_000_000;
-/// Fainter Gaussians than this are not near anything.
-const LEAST_OPACITY: f64 = 0.1;
-
-/// Whether tracks are written as JSON. Errors: neither that nor CSV.
-fn is_json(out: &Path) -> splat4d::Result<bool> {
-    match out.extension().map(|e| e.to_ascii_lowercase()) {
-        Some(e) if e == "json" => Ok(true),
-        Some(e) if e == "csv" => Ok(false),
-        _ => Err(Error::input("tracks are written as .csv or .json")
-            .at(out.display())
-            .remedy("Use --tracks NAME.csv or --tracks NAME.json.")),
-    }
-}
-
-/// Writes where points of a file go, and who sees them.
-fn followed(source: &Source, args: &Args, [points, out]: [&PathBuf; 2], console: &Console) -> anyhow::Result<()> {
-    let (scene, json) = (&source.scene, is_json(out)?);
-    let (_, times) = sequence::timestamps(scene, args.fps, [args.from, args.to])?;
-    let views = source.views()?;
-    let asked =
-        point_queries::read(&files::read_text(points)?, &views, scene.clip).map_err(|e| e.at(points.display()))?;
-    if asked.len().saturating_mul(times.len()).saturating_mul(3) > MOST_NUMBERS {
-        return Err(Error::input(format!("{} points at {} times are too many", asked.len(), times.len()))
-            .remedy("Give fewer points, or fewer times with --fps, --from or --to.")
-            .into());
-    }
-    let answer = QueryResult::of(scene, asked, &views, &times, &mut |done, of| console.phase("following", done, of));
-    console.clear();
-    if answer.missing() > 0 {
-        console.warn(&format!(
-            "{} of {} points are not on any Gaussian: they are left out",
-            answer.missing(),
-            answer.len()
-        ));
-    }
-    files::write(out, if json { answer.to_json() } else { answer.to_csv() }.as_bytes())?;
-    console.say(&format!("{} points at {} times", files::grouped(answer.len()), times.len()));
-    console.emit(&json!({
-        "type": "exported", "points": answer.len(), "moments": times.len(), "missing": answer.missing(),
-    }));
-    console.written(out);
-    Ok(())
-}
-
-/// Writes where Gaussians are over time.
-fn tracks(scene: &Scene<f32>, args: &Args, out: &Path, console: &Console) -> anyhow::Result<()> {
-    let json = is_json(out)?;
-    let (_, times) = sequence::timestamps(scene, args.fps, [args.from, args.to])?;
-    let mut members = match args.near[..] {
-        [] => every(scene, args.every.unwrap_or(1) as usize),
-        [x, y, z] if [x, y, z].iter().all(|v| v.is_finite()) => {
-            let count = args.count.unwrap_or(1) as usize;
-            nearest(scene, Time(times[0]), &[[x, y, z]], count, LEAST_OPACITY).remove(0)
-        }
+fn tracks(args: &Args, frames: Frames) -> anyhow::Result<TrackOptions> {
+    let near = match args.near[..] {
+        [] => None,
+        [x, y, z] => Some(([x, y, z], args.count.unwrap_or(1) as usize)),
         _ => {
             return Err(Error::input("--near is not a point")
                 .remedy("Give three numbers in scene units, for instance --near 0.3,1.2,-0.5")
                 .into());
         }
     };
-    if let Some(name) = &args.label {
-        let wanted = Some(labels::named(&scene.labels, name)?);
-        let of: Vec<Vec<Option<usize>>> = scene.layers.iter().map(|l| labels::of(&l.params)).collect();
-        members.retain(|m| of[m.layer][m.row as usize] == wanted);
-    }
-    if members.len().saturating_mul(times.len()).saturating_mul(3) > MOST_NUMBERS {
-        return Err(Error::input(format!("{} tracks of {} times are too many", members.len(), times.len()))
-            .remedy("Select fewer with --every N, --near X,Y,Z, --fps, --from or --to.")
-            .into());
-    }
-    if members.is_empty() {
-        console.warn(&format!("no Gaussian is active at {} s: the file has no tracks", times[0]));
-    }
-    let followed = Tracks::follow(scene, &members, &times);
-    let offset = if args.world { scene.offset } else { [0.0; 3] };
-    let text = if json { followed.to_json(scene, offset) } else { followed.to_csv(scene, offset) };
-    files::write(out, text.as_bytes())?;
-    console.say(&format!("{} tracks of {} times", files::grouped(members.len()), times.len()));
-    console.emit(&json!({"type": "exported", "tracks": members.len(), "moments": times.len()}));
-    console.written(out);
-    Ok(())
+    let every = args.every.unwrap_or(1) as usize;
+    Ok(TrackOptions { frames, every, near, label: args.label.clone(), world: args.world })
 }

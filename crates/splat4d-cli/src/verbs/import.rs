@@ -2,27 +2,12 @@
 
 use crate::console::Console;
 use crate::interrupt;
-use serde_json::json;
-use splat4d::{Error, ErrorKind};
 use splat4d_import::board::Board;
-use splat4d_import::corrections;
-use splat4d_import::doctor::{Grade, Report as Looked};
-use splat4d_import::recording::{self, CameraReport, Report, Request, Rig};
+use splat4d_import::recording::{FPS, Request, Rig, SIZE};
 use splat4d_import::video::{Crop, Cropping, Selection};
 use splat4d_import::write::Format;
-use splat4d_train::event::Progress;
-use splat4d_train::output::{Input, OutputFolder, check_apart, written};
-use splat4d_train::recipe::Recipe;
-use splat4d_train::run::open_capture;
-use splat4d_workflow::report::doctor;
-use std::fmt::Write;
-use std::path::{Path, PathBuf};
-use std::sync::atomic::Ordering;
-
-/// The file by which a capture is recognised.
-const CAPTURE: &str = "capture.json";
-/// What an import writes into its folder, in addition to its corrections.
-const WRITTEN: [&str; 5] = [CAPTURE, "points.ply", "images", "masks", "import"];
+use splat4d_workflow::importing::import;
+use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -35,13 +20,6 @@ Examples:
 
 my-take/import.toml contains the result of every camera: correct an offset or a lens, or leave a camera out, and run \
 the same command again. Then: splat4d train my-take. How to record: docs/filming.md.";
-
-/// Pixels of the shorter side that images get: training on a CPU sees no more.
-const SIZE: usize = 1080;
-/// Findings of the doctor that are printed; its page has all.
-const MOST: usize = 6;
-/// Frames per second of folders of images.
-const FPS: f64 = 30.0;
 
 /// Make a capture from videos: frames, synchronization, poses, lenses and points
 #[derive(Debug, clap::Args)]
@@ -144,32 +122,10 @@ fn height(text: &str) -> Result<(String, f64), String> {
     Ok((name.trim().to_owned(), metres))
 }
 
-/// Refuses a folder that holds what an import writes, but no import: images, masks or points of other origin are never replaced.
-fn check_ours(folder: &Path) -> splat4d::Result<()> {
-    if folder.join(corrections::FILE).is_file() {
-        return Ok(());
-    }
-    let listed = written(folder);
-    let foreign = |name: &&&str| folder.join(name).exists() && !listed.iter().any(|file| file.starts_with(name));
-    let Some(name) = WRITTEN.iter().find(foreign) else { return Ok(()) };
-    let what = match *name {
-        CAPTURE => "the folder contains a capture of another program".to_owned(),
-        name => format!("holds {name}, and there is no record that splat4d wrote it"),
-    };
-    Err(Error::input(what).at(folder.display()).remedy("Give another folder with -o."))
-}
-
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
-    let folder = &args.output;
-    check_ours(folder)?;
-    let read = args.videos.iter().chain(&args.masks).map(|v| Input::new(v, "what is imported,"));
-    // A capture may lie next to the videos, in the folder of their calibration.
-    let calibration = args.calibration.iter().map(|c| Input { may_hold: true, ..Input::new(c, "the calibration") });
-    check_apart(folder, &read.chain(calibration).collect::<Vec<_>>())?;
-    let _owned = OutputFolder::amend(folder, "import")?;
     let request = Request {
         inputs: args.videos.clone(),
-        folder: folder.clone(),
+        folder: args.output.clone(),
         selection: Selection {
             every: args.every,
             from: args.from,
@@ -196,102 +152,15 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         synchronous: args.synchronous,
     };
     let stop = interrupt::flag("stopping: stored results are kept");
-    interrupt::stop_not_polled("stored results are kept, and the same command continues from there");
-    let mut tell = |event: &splat4d_train::event::Event| console.event(event);
-    let made = recording::import(&request, &mut Progress(&mut tell), &|| stop.load(Ordering::SeqCst));
-    console.clear();
-    let report = made.map_err(|e| match e.kind() {
-        ErrorKind::Interrupted => e,
-        _ => e.at("import"),
-    })?;
-    let looked = if args.no_doctor {
-        None
+    let imported = import(&request, !args.no_doctor, &stop, console)?;
+    if console.json() {
+        console.emit(&imported.json());
     } else {
-        let capture = open_capture(folder, &Recipe::default())?;
-        Some(doctor::made(&capture, &folder.join("import"), console)?)
-    };
-    told(&report, looked.as_ref(), console);
-    if report.cameras.len() > 1 && args.rig != "moving" {
+        console.result(&imported.in_words());
+    }
+    if imported.report.cameras.len() > 1 && args.rig != "moving" {
         console.say("all cameras train; to measure new views, hold one out: --hold-out camera=NAME");
     }
-    console.next("train", folder);
+    console.next("train", &args.output);
     Ok(())
-}
-
-fn told(report: &Report, looked: Option<&(Looked, PathBuf)>, console: &Console) {
-    for camera in &report.cameras {
-        for warning in &camera.warnings {
-            console.warn(&format!("camera {}: {warning}", camera.name));
-        }
-        if let Some(trouble) = &camera.trouble {
-            console.warn(&format!("camera {} is left out: {trouble}", camera.name));
-        }
-    }
-    for line in &report.refused {
-        console.warn(line);
-    }
-    let guess = |c: &&CameraReport| c.by == ["motion"];
-    let guessed: Vec<&str> = report.cameras.iter().filter(guess).map(|c| c.name.as_str()).collect();
-    if !guessed.is_empty() {
-        console.warn(&format!(
-            "the time offsets of these cameras are guessed from the amount of motion and not confirmed: {} (correct them in {})",
-            guessed.join(", "),
-            corrections::FILE
-        ));
-    }
-    let silent: Vec<&str> = report.cameras.iter().filter(|c| c.offset.is_none()).map(|c| c.name.as_str()).collect();
-    if report.cameras.len() > 1 && !silent.is_empty() && !report.still {
-        console.warn(&format!(
-            "the time offsets of these cameras are unknown, those of their files are used: {} (correct them in {})",
-            silent.join(", "),
-            corrections::FILE
-        ));
-    }
-    if console.json() {
-        console.emit(&json!({"type": "imported", "report": report, "doctor": looked.map(|l| &l.0)}));
-        return;
-    }
-    let mut text =
-        String::from("camera              frames  offset ms     ±  by                     points   error px  focal px");
-    let given = report.cameras.iter().any(|c| c.calibration.is_some());
-    text += if given { "  calibration px\n" } else { "\n" };
-    for camera in &report.cameras {
-        let off = camera.calibration.map_or_else(|| "-".to_owned(), |v| format!("{v:.2}"));
-        let _ = writeln!(text, "{}{}", row(camera), if given { format!("{off:>16}") } else { String::new() });
-    }
-    if !report.gaps.is_empty() {
-        let each = report.gaps.iter().map(|g| format!("{}-{} {:.0}", g.cameras[0], g.cameras[1], g.degrees));
-        let _ = writeln!(text, "degrees between neighbours: {}", each.collect::<Vec<_>>().join(", "));
-    }
-    for guess in &report.guesses {
-        let _ = writeln!(text, "{guess}");
-    }
-    let _ = write!(text, "{} points; wrote {}", report.points, report.capture.display());
-    if let Some((findings, page)) = looked {
-        let _ = write!(text, "\ndoctor: {}; wrote {}", doctor::summary(findings), page.display());
-        for f in findings.findings.iter().filter(|f| f.grade > Grade::Note).take(MOST) {
-            let _ = write!(text, "\n! {}", doctor::sentence(f));
-        }
-        if !findings.leave_out.is_empty() {
-            let _ = write!(text, "\nleave out: {}", findings.leave_out.join(", "));
-        }
-    }
-    console.result(&text);
-}
-
-fn row(camera: &CameraReport) -> String {
-    let number = |v: Option<f64>, scale: f64, digits: usize| {
-        v.map_or_else(|| "-".to_owned(), |v| format!("{:.digits$}", v * scale))
-    };
-    format!(
-        "{:<20}{:>6}{:>11}{:>6}  {:<22}{:>7}{:>11}{:>10}",
-        camera.name,
-        camera.frames,
-        number(camera.offset, 1e3, 1),
-        number(camera.sigma, 1e3, 1),
-        if camera.by.is_empty() { "its file".to_owned() } else { camera.by.join(", ") },
-        camera.sightings,
-        number(camera.error, 1.0, 2),
-        number(camera.focal, 1.0, 0),
-    )
 }

@@ -1,6 +1,7 @@
 //! `label`: labels and features learnt into a trained run from masks and images of features.
 
 use crate::console::Console;
+use crate::interrupt;
 use splat4d_workflow::labelling;
 use std::path::PathBuf;
 
@@ -29,5 +30,8 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
-    Ok(labelling::label(&args.run, args.from.as_deref(), args.rounds.map(usize::from), console)?)
+    let stop = interrupt::flag("stopping");
+    interrupt::stop_not_polled("the same command begins again");
+    let rounds = args.rounds.map(usize::from);
+    Ok(labelling::label(&args.run, args.from.as_deref(), rounds, &stop, console)?)
 }

@@ -1,21 +1,8 @@
 //! `localise`: from where and when images of a scene were taken.
 
 use crate::console::Console;
-use serde_json::{Value, json};
-use splat4d::render::Antialias;
-use splat4d::scene::{Camera, Intrinsics, Planes};
-use splat4d::{Error, Result};
-use splat4d_train::capture::Rgb8;
-use splat4d_train::eval::localise::{Located, Question, SURE, localise};
-use splat4d_workflow::camera_file;
-use splat4d_workflow::files;
-use splat4d_workflow::paths::View;
-use splat4d_workflow::run_folder::{view_json, views_in};
-use splat4d_workflow::source::{Source, not_empty};
-use std::path::{Path, PathBuf};
-
-/// Largest difference of the shapes (width over height) of an image and a start's.
-const SHAPE: f64 = 0.02;
+use splat4d_workflow::localising::{LocaliseOptions, localise};
+use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -49,132 +36,7 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
-    let source = Source::open(&args.scene)?;
-    not_empty(&source.scene, &args.scene)?;
-    if let Some(output) = &args.output {
-        let read: Vec<&Path> = args.pictures.iter().chain(&args.start).map(PathBuf::as_path).collect();
-        source.keep(&args.scene, output, &read)?;
-    }
-    let starts = starts(args, &source)?;
-    let recipe = source.run.as_ref().and_then(|run| run.recipe().ok());
-    let antialias = if recipe.is_some_and(|r| r.appearance.antialias) { Antialias::On } else { Antialias::Off };
-    let question = Question { antialias, lens: args.lens };
-    let (mut found, mut lost): (Vec<Value>, Vec<String>) = (Vec::new(), Vec::new());
-    for path in &args.pictures {
-        let picture = read(path)?;
-        let cameras = resized(&starts, &picture).map_err(|e| e.at(path.display()))?;
-        let name = path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned());
-        let located = localise(&source.scene, &picture, &cameras, question, &mut |done, all| {
-            console.phase(&format!("localising {name}"), done, all);
-        })?;
-        console.clear();
-        let row = row(&located, &name, found.len());
-        if located.is_sure() {
-            console.say(&in_words(&located, &name));
-            console.emit(&json!({"type": "located", "picture": path.to_string_lossy(), "camera": row}));
-            found.push(row);
-        } else {
-            console
-                .emit(&json!({"type": "not_located", "picture": path.to_string_lossy(), "residual": located.residual,
-                "share": located.share()}));
-            lost.push(format!("{name} ({:.0} % of a plain colour's difference)", 100.0 * located.share()));
-        }
-    }
-    if let (Some(output), false) = (&args.output, found.is_empty()) {
-        files::write(output, serde_json::to_string_pretty(&found)?.as_bytes())?;
-        console.written(output);
-    }
-    if lost.is_empty() {
-        return Ok(());
-    }
-    Err(Error::input(format!(
-        "not found: {}; at most {:.0} % of a plain colour's difference may be left",
-        lost.join(", "),
-        100.0 * SURE
-    ))
-    .at(args.scene.display())
-    .remedy("Give a camera nearer to it with --start.")
-    .into())
-}
-
-/// Where to begin.
-fn starts(args: &Args, source: &Source) -> Result<Vec<View>> {
-    let mut views = match (&args.start, &source.run) {
-        (Some(path), _) => match views_in(path)? {
-            Some(views) => views,
-            None => {
-                let (camera, _) = camera_file::read(path)?;
-                vec![View { camera, name: "start".into(), time: 0.0, held: false }]
-            }
-        },
-        (None, Some(run)) => run.views()?,
-        (None, None) => {
-            return Err(Error::input("a scene file has no start camera")
-                .at(args.scene.display())
-                .remedy("Add --start CAMERA.json, or give the run folder."));
-        }
-    };
-    // A fixed camera's frames are one start.
-    let mut seen: Vec<Camera> = Vec::new();
-    views.retain(|view| {
-        let new = !seen.contains(&view.camera);
-        if new {
-            seen.push(view.camera.clone());
-        }
-        new
-    });
-    Ok(views)
-}
-
-/// The starts with the image's size. Errors: none has its shape.
-fn resized(starts: &[View], picture: &Planes<f32>) -> Result<Vec<Camera>> {
-    let shape = |w: usize, h: usize| w as f64 / h as f64;
-    let of_shape = |c: &&View| {
-        (shape(c.camera.width, c.camera.height) / shape(picture.width, picture.height) - 1.0).abs() <= SHAPE
-    };
-    let sized = |view: &View| {
-        let (k, c) = (view.camera.intrinsics, &view.camera);
-        let (x, y) = (picture.width as f64 / c.width as f64, picture.height as f64 / c.height as f64);
-        let intrinsics = Intrinsics { fx: k.fx * x, fy: k.fy * y, cx: k.cx * x, cy: k.cy * y };
-        Camera { intrinsics, width: picture.width, height: picture.height, ..c.clone() }
-    };
-    let cameras: Vec<Camera> = starts.iter().filter(of_shape).map(sized).collect();
-    if cameras.is_empty() {
-        let other = starts.first().map(|v| format!("{}x{}", v.camera.width, v.camera.height)).unwrap_or_default();
-        return Err(Error::input(format!(
-            "the image is {}x{}, and no start camera has that aspect ratio (such as {other})",
-            picture.width, picture.height
-        ))
-        .remedy("Crop or scale the image, or give its own camera with --start."));
-    }
-    Ok(cameras)
-}
-
-fn read(path: &Path) -> Result<Planes<f32>> {
-    let picture = Rgb8::read(path)?;
-    let data: Vec<f32> = picture.data.iter().map(|&b| f32::from(b) / 255.0).collect();
-    Ok(Planes::from_interleaved(3, picture.height, picture.width, &data))
-}
-
-fn row(located: &Located, name: &str, id: usize) -> Value {
-    let view = View { camera: located.camera.clone(), name: name.to_owned(), time: located.time.0, held: false };
-    let mut row = view_json(id, &view);
-    row["residual"] = json!(located.residual);
-    row["share"] = json!(located.share());
-    row
-}
-
-fn in_words(located: &Located, name: &str) -> String {
-    let [x, y, z] = located.camera.center();
-    let axis = located.camera.cam_from_world.rotation[2];
-    format!(
-        "{name}: at ({x:.4}, {y:.4}, {z:.4}), looking along ({:.4}, {:.4}, {:.4}), at {:.3} s; residual {:.4}, {:.0} \
-         % of that of a plain colour",
-        axis[0],
-        axis[1],
-        axis[2],
-        located.time.0,
-        located.residual,
-        100.0 * located.share()
-    )
+    let options = LocaliseOptions { start: args.start.clone(), lens: args.lens, output: args.output.clone() };
+    localise(&args.scene, &args.pictures, &options, console)?;
+    Ok(())
 }

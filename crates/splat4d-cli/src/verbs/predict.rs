@@ -1,6 +1,7 @@
 //! `predict`: how a run that saw a part of its take goes on, compared with the part that it did not see.
 
 use crate::console::Console;
+use crate::interrupt;
 use splat4d::{Error, Result};
 use splat4d_dynamics::actions::Actions;
 use splat4d_dynamics::learnt::Training;
@@ -89,6 +90,8 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         oracle: args.oracle.clone(),
         film: !args.no_film,
     };
-    predict(options, console)?;
+    let stop = interrupt::flag("stopping");
+    interrupt::stop_not_polled("the same command begins again");
+    predict(options, &stop, console)?;
     Ok(())
 }

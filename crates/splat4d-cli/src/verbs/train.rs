@@ -4,38 +4,19 @@ use crate::console::Console;
 use crate::device::Device;
 use crate::interrupt;
 use crate::measuring::MeasureArgs;
-use crate::serving::{self, Control, Place, Watch};
+use crate::serving::{self, Control, Place, Watched};
 use serde_json::json;
 use splat4d::{Error, ErrorKind};
-use splat4d_import::shipped;
-use splat4d_train::capture::{Capture, Lenses, Severity, Timing};
-use splat4d_train::event::{Event, Progress};
-use splat4d_train::output::{FolderContent, OutputFolder, Owner};
 use splat4d_train::path_text::in_command;
 use splat4d_train::recipe::{MotionName, Quality, Recipe};
-use splat4d_train::run::chunks::{ChunkEstimate, Chunked, look_ahead};
-use splat4d_train::run::{self, Outcome, Stopwatch, TrainOptions};
-use splat4d_train::run::{memory_estimate, open_capture, open_frames};
 use splat4d_train::settings::{Setting, nearest};
-use splat4d_workflow::chunked::{self, ChunkSelection};
-use splat4d_workflow::deadline::Deadline;
-use splat4d_workflow::device::chosen;
-use splat4d_workflow::files::{self, human_bytes, parse_bytes};
-use splat4d_workflow::run_folder::{self, Run, RunRequest, write_cameras};
-use splat4d_workflow::{evaluating, labelling};
-use std::path::{Path, PathBuf};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use splat4d_workflow::chunked::ChunkSelection;
+use splat4d_workflow::files::{self, parse_bytes};
+use splat4d_workflow::training::{self, Finish, TrainingOptions};
+use std::path::PathBuf;
 
-/// A new image of the learning scene about so often: sooner than anybody would reload, later than they could follow.
-const SNAPSHOT_INTERVAL: Duration = Duration::from_secs(3);
-
-/// Time between two looks whether the worker that begins a long take is done with that.
-const WAIT: Duration = Duration::from_millis(200);
-/// What an owner's record calls this verb, and `join`.
-const TRAIN: &str = "train";
-const JOIN: &str = "join";
+/// What a run's lock names as its owner while it is continued.
+const RESUME: &str = "train --resume";
 /// What the first Ctrl-C is answered with in training.
 const SAVING: &str = "stopping: a checkpoint is being saved";
 
@@ -189,238 +170,56 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     }
     let stop = interrupt::flag(SAVING);
     let control = Control::new(stop.clone());
-    let clock = control.clock();
     args.measure.check()?;
     if !args.view && args.place.is_told() {
         return Err(Error::input("--port, --host and --no-open need --view").remedy("Add --view.").into());
     }
-    interrupt::stop_not_polled("training had not begun, and the same command begins it");
-    let watch = |title: &str, capture: Option<&Arc<Capture>>| {
-        Watch::start(title, capture.cloned(), args.view.then_some(&args.place), &control, console)
-    };
-    // The images of a run that is continued; without its capture the resume itself reports the reason.
-    let images = |run: &Run| args.view.then(|| run.open_capture().ok()).flatten().map(|(capture, _)| Arc::new(capture));
-    let snapshots = |watch: &Watch| watch.is_on().then_some(SNAPSHOT_INTERVAL);
-    let listen = |event: &Event, watch: &Watch| {
-        watch.on_event(event);
-        console.event(event);
-    };
-    if let Some(run) = args.resume.as_ref().filter(|run| Chunked::is(run)) {
-        let opened = Run::open(run)?;
-        let watch = watch(&opened.name(), images(&opened).as_ref());
-        let _folder = OutputFolder::shared(run)?;
-        let chunked = Chunked::open(run)?;
-        return in_chunks(args, run, &chunked, clock, &stop, &watch, console);
-    }
-    // A run that ended before its first checkpoint begins again, as it was asked for.
-    let again = args.resume.as_ref().and_then(|run| Some((run.clone(), RunRequest::unbegun(run)?)));
-    let (folder, run, watch, trained) = if let Some(run) = args.resume.as_ref().filter(|_| again.is_none()) {
-        let opened = Run::open(run)?;
-        let watch = watch(&opened.name(), images(&opened).as_ref());
-        let folder = OutputFolder::amend(run, "train --resume")?;
-        let device = chosen(args.device.into(), "training", console);
-        let clock = clock.clone();
-        let options = TrainOptions { device, snapshots: snapshots(&watch), clock, ..TrainOptions::default() };
-        interrupt::stop_polled(SAVING);
-        let trained = run::resume_with(run, &options, &stop, &mut |event| listen(event, &watch));
-        (folder, run.clone(), watch, trained)
-    } else {
-        let (source, recipe, minutes, predict) = match &again {
-            Some((_, asked)) => (asked.capture.clone(), asked.recipe()?, asked.minutes, asked.predict),
-            None => {
-                let source = args.capture.as_ref().or(args.source.as_ref()).expect("clap asks for a capture");
-                (source.clone(), recipe(args)?, args.minutes, args.quality.is_some())
-            }
-        };
-        let typed = args.set.iter().filter_map(|a| Some(a.split_once('=')?.0));
-        recipe.refuse_unused(typed).map_err(|e| e.at("--set"))?;
-        if again.is_none() {
-            extract(&source, &stop, console)?;
-        }
-        console.phase("reading the capture", 0, 0);
-        // Of a long take no more is listed than tells that it is one.
-        let capture = Arc::new(open_frames(&source, &recipe, look_ahead(&recipe), &Lenses::default())?);
-        let output = again.as_ref().map(|(run, _)| run).or(args.output.as_ref());
-        let asked = RunRequest::of(&capture, &recipe, minutes, predict);
-        let place = || place(args, output, &capture, &asked, console);
-        // A take that is not told to be cut keeps to its minutes at once.
-        let at_once = minutes.is_some() && recipe.chunks.frames == 0;
-        let is_begun = || output.filter(|run| Chunked::is(run) && !args.force);
-        // Steps that were fitted to minutes are those of the worker that began.
-        let (recipe, minutes) = match is_begun().filter(|_| minutes.is_some() && !at_once) {
-            None => (recipe, minutes),
-            Some(run) => {
-                let steps = Chunked::open(run)?.recipe().run.iterations;
-                (recipe.unresolved().with(|r| r.run.iterations = steps), None)
-            }
-        };
-        let outlook = match at_once {
-            true => None,
-            false => {
-                let finish = evaluating::steps(&capture, &recipe, args.no_eval);
-                let listen = &mut |event: &Event| console.event(event);
-                ChunkEstimate::new(&capture, &recipe, minutes, finish, false, &clock, listen)?
-            }
-        };
-        console.clear();
-        if let Some(outlook) = outlook {
-            // Of workers that start at the same time one begins, and the others find it begun.
-            let busy = |run: &Path| Owner::holder(run).flatten().is_some_and(|who| who.command == TRAIN);
-            let folder = loop {
-                if let Some(run) = is_begun() {
-                    break Err(OutputFolder::shared(run)?);
-                }
-                match place() {
-                    Ok((folder, _)) => break Ok(folder),
-                    Err(_) if output.is_some_and(|run| busy(run)) && !args.force => std::thread::sleep(WAIT),
-                    Err(error) => return Err(error),
-                }
-            };
-            let run = folder.as_ref().unwrap_or_else(|shared| shared).path().to_owned();
-            describe(&capture, outlook.memory, console);
-            console.say(&chunked::in_words(&outlook));
-            let watch = watch(&capture.name, Some(&capture));
-            let begun = Chunked::begin(&capture, &outlook.recipe, &run, &mut |event| listen(event, &watch))?;
-            let chunked = begun.expect("a take that has a plan is learnt by it").paced(outlook.pacing);
-            let _folder = match folder {
-                Ok(own) => {
-                    write_cameras(&run, &once(&capture))?;
-                    own.share()
-                }
-                Err(shared) => shared,
-            };
-            return in_chunks(args, &run, &chunked, clock, &stop, &watch, console);
-        }
-        let whole = match capture.frames.len() < capture.take.pictures {
-            true => Arc::new(open_capture(&source, &recipe)?),
-            false => capture.clone(),
-        };
-        if args.chunk.is_some() {
-            return Err(Error::input("the capture fits into one chunk")
-                .at("--chunk")
-                .remedy("Train it without --chunk, or set shorter chunks with --chunk-frames")
-                .into());
-        }
-        let (folder, found) = place()?;
-        let run = folder.path().to_owned();
-        describe(&whole, memory_estimate(&whole, &recipe), console);
-        let watch = watch(&whole.name, Some(&whole));
-        let options = TrainOptions {
-            device: chosen(args.device.into(), "training", console),
-            minutes,
-            finish: evaluating::steps(&whole, &recipe, args.no_eval),
-            predict,
-            clock: clock.clone(),
-            own_loss: None,
-            snapshots: snapshots(&watch),
-        };
-        let mut on_event = |event: &Event| {
-            run_folder::on_event(&folder, event);
-            listen(event, &watch);
-        };
-        interrupt::stop_polled(SAVING);
-        let trained = if found == FolderContent::Unfinished {
-            console.say(&format!("{} contains an unfinished run of the same command: it is continued", run.display()));
-            run::resume_with(&run, &options, &stop, &mut on_event)
-        } else {
-            // The recipe first: whatever comes to pass from here on, the folder is known for what it is.
-            files::write(&run.join("recipe.toml"), recipe.to_toml().as_bytes())?;
-            write_cameras(&run, &whole)?;
-            run::train(whole, recipe, &run, &options, &stop, &mut on_event)
-        };
-        match run_folder::left(folder, &run, &trained) {
-            Some(folder) => (folder, run, watch, trained),
-            None => {
-                console.clear();
-                return Err(trained.expect_err("only what failed leaves nothing").into());
-            }
-        }
-    };
-    console.clear();
-    let outcome: Outcome = trained?;
-    evaluating::amend(&run, [("notes".into(), json!(console.warnings()))])?;
-    if outcome.interrupted {
-        let resume = format!("splat4d train --resume {}", in_command(&run));
-        watch.stopped(outcome.iteration, &resume);
-        return Err(Error::new(
-            ErrorKind::Interrupted,
-            format!("training was stopped after step {} and saved", outcome.iteration),
-        )
-        .remedy(format!("Continue with: {resume}"))
-        .into());
-    }
-    let name = in_command(&run);
-    interrupt::stop_not_polled(format!(
-        "the scene is trained and saved: splat4d eval {name} makes the scores, the film and the report"
-    ));
-    console.say(&format!("wrote {}", run.join("scene.safetensors").display()));
-    evaluating::say_refined(&run, console)?;
-    if labelling::has_any(&Run::open(&run)?.open_capture()?.0) {
-        labelling::learn_into(&run, None, None, console)?;
-    }
-    let deadline = match &args.resume {
-        Some(run) => evaluating::rest_of(&Run::open(run)?, clock),
-        None => Deadline::of(clock, args.minutes),
-    };
-    if args.no_eval {
-        evaluating::playback_by(&run, &deadline, console)?;
-    } else {
-        evaluating::all(&run, &args.measure.options(), &deadline, console)?;
-    }
-    folder.finished();
-    watch.show(&run, outcome.iteration);
-    console.next("view", &run);
-    console.emit(&json!({"type": "done", "run": run.to_string_lossy()}));
-    if watch.is_on() && console.terminal() {
-        console.say("the player keeps running until Ctrl-C");
-        interrupt::stop_polled("stopping");
-        serving::wait(&stop);
-    }
-    Ok(())
-}
-
-/// Does what is wanted of a long take, and joins it where that is all.
-fn in_chunks(
-    args: &Args,
-    run: &Path,
-    chunked: &Chunked,
-    clock: Stopwatch,
-    stop: &AtomicBool,
-    watch: &Watch,
-    console: &Console,
-) -> anyhow::Result<()> {
-    let options = TrainOptions {
-        device: chosen(args.device.into(), "training", console),
-        clock: clock.clone(),
+    let watched = Watched::new(args.view.then_some(&args.place), &control, console);
+    let options = TrainingOptions {
+        output: args.output.clone(),
+        force: args.force,
         minutes: args.minutes,
-        snapshots: watch.is_on().then_some(SNAPSHOT_INTERVAL),
-        ..TrainOptions::default()
+        predict: args.quality.is_some(),
+        chunk: args.chunk,
+        device: args.device.into(),
+        measure: args.measure.options(),
+        finish: if args.no_eval { Finish::Playback } else { Finish::All },
+        clock: control.clock(),
+        ..TrainingOptions::default()
     };
-    let wanted = args.chunk.unwrap_or(ChunkSelection::All);
-    interrupt::stop_polled(SAVING);
-    let outcome = chunked::work(run, chunked, wanted, &options, stop, console, &mut |event| {
-        watch.on_event(event);
-        console.event(event);
-    });
-    console.clear();
-    if outcome?.is_some_and(|o| o.interrupted) {
+    let trained = match &args.resume {
+        Some(run) => {
+            let options = TrainingOptions { command: RESUME, ..options };
+            training::resume(run, &options, &stop, &watched)?
+        }
+        None => {
+            let source = args.capture.as_ref().or(args.source.as_ref()).expect("clap asks for a capture");
+            let recipe = recipe(args)?;
+            let typed = args.set.iter().filter_map(|a| Some(a.split_once('=')?.0));
+            recipe.refuse_unused(typed).map_err(|e| e.at("--set"))?;
+            training::train(source, &recipe, &options, &stop, &watched)?
+        }
+    };
+    let run = &trained.run;
+    if trained.interrupted {
         let resume = format!("splat4d train --resume {}", in_command(run));
-        watch.stopped(0, &resume);
-        return Err(Error::new(ErrorKind::Interrupted, "training was stopped and saved")
+        watched.stopped(trained.iteration.unwrap_or(0), &resume);
+        let after = trained.iteration.map_or_else(String::new, |n| format!(" after step {n}"));
+        return Err(Error::new(ErrorKind::Interrupted, format!("training was stopped{after} and saved"))
             .remedy(format!("Continue with: {resume}"))
             .into());
     }
-    match args.chunk {
-        Some(_) => console.emit(&json!({"type": "done", "run": run.to_string_lossy()})),
-        None => {
-            interrupt::stop_not_polled(format!("all parts are kept: splat4d join {} joins them", in_command(run)));
-            // The other workers are done with it, or wait for the same.
-            let _owner = Owner::wait(run, JOIN, &mut |_| !stop.load(Ordering::Relaxed))?;
-            let deadline = Deadline::of(clock, args.minutes);
-            chunked::join(run, chunked, args.no_eval, &args.measure.options(), &deadline, stop, console)?;
-            console.next("view", run);
-            console.emit(&json!({"type": "done", "run": run.to_string_lossy()}));
-        }
+    if let Some(iteration) = trained.iteration {
+        watched.show(run, iteration);
+    }
+    if args.chunk.is_none() {
+        console.next("view", run);
+    }
+    console.emit(&json!({"type": "done", "run": run.to_string_lossy()}));
+    if trained.iteration.is_some() && watched.is_on() && console.terminal() {
+        console.say("the player keeps running until Ctrl-C");
+        interrupt::stop_polled("stopping");
+        serving::wait(&stop);
     }
     Ok(())
 }
@@ -463,99 +262,6 @@ fn recipe(args: &Args) -> anyhow::Result<Recipe> {
         recipe.set(assignment).map_err(|e| e.at("--set"))?;
     }
     Ok(recipe)
-}
-
-/// Extracts the frames of a capture that is shipped as videos with poses.
-fn extract(source: &Path, stop: &AtomicBool, console: &Console) -> anyhow::Result<()> {
-    let root = if source.is_file() { source.parent().unwrap_or(Path::new(".")) } else { source };
-    if shipped::videos(root).is_empty() {
-        return Ok(());
-    }
-    let mut tell = |event: &Event| console.event(event);
-    let found = shipped::extract(root, &mut Progress(&mut tell), &|| stop.load(Ordering::SeqCst))?;
-    console.clear();
-    let Some(found) = found else { return Ok(()) };
-    found.warnings.iter().for_each(|w| console.warn(w));
-    console.say(&format!(
-        "frames of {} videos are in {}: {} of {}x{}",
-        found.cameras,
-        root.join("images").display(),
-        files::grouped(found.frames),
-        found.size[0],
-        found.size[1]
-    ));
-    Ok(())
-}
-
-/// Takes the folder of the run. One that the user named is never silently taken over.
-fn place(
-    args: &Args,
-    output: Option<&PathBuf>,
-    capture: &Capture,
-    asked: &RunRequest,
-    console: &Console,
-) -> anyhow::Result<(OutputFolder, FolderContent)> {
-    if let Some(run) = output {
-        return Ok(asked.begin(run, args.force, TRAIN)?);
-    }
-    let wanted = run_folder::usual_folder(&capture.name);
-    let run = run_folder::free_folder(&wanted);
-    if run != wanted {
-        let hint = if Run::is(&wanted) && !Run::is_finished(&wanted) {
-            format!(" (it is unfinished: --resume {} would continue it)", in_command(&wanted))
-        } else {
-            String::new()
-        };
-        console.say(&format!("{} exists{hint}: this run is written to {}", wanted.display(), run.display()));
-    }
-    Ok(asked.begin(&run, args.force, TRAIN)?)
-}
-
-/// Every fixed camera once: a long take has too many images to name them all.
-fn once(capture: &Capture) -> Capture {
-    let mut seen = vec![false; capture.cameras.len()];
-    let mut new = |i: &usize| {
-        let camera = capture.frames[*i].camera;
-        !(capture.cameras[camera].fixed && std::mem::replace(&mut seen[camera], true))
-    };
-    let train = capture.train.iter().copied().filter(&mut new).collect();
-    let held = capture.held.iter().copied().filter(&mut new).collect();
-    Capture { train, held, ..capture.clone() }
-}
-
-fn describe(capture: &Capture, memory: u64, console: &Console) {
-    let in_part = capture.frames.len() < capture.take.pictures;
-    let (first, last) = match capture.time_range() {
-        (first, _) if in_part => (first, first + (capture.take.frames.len() as f64 - 1.0) / capture.fps),
-        whole => whole,
-    };
-    let size = capture.frames.first().map_or([0, 0], |f| [f.view.width, f.view.height]);
-    let span = match capture.timing {
-        Timing::Moment => "at one time".to_owned(),
-        _ => format!("over {:.2} s", last - first),
-    };
-    console.say(&format!(
-        "{}: {} camera{}, {} images of {}x{} {span}{}",
-        capture.name,
-        capture.cameras.len(),
-        if capture.cameras.len() == 1 { "" } else { "s" },
-        capture.take.pictures,
-        size[0],
-        size[1],
-        match in_part {
-            true => String::new(),
-            false => format!("; {} train, {} held out", capture.train.len(), capture.held.len()),
-        }
-    ));
-    console.detail(&format!("memory estimate: {}", human_bytes(memory)));
-    let poses = capture.check_poses();
-    for finding in capture.preflight().into_iter().chain([poses.finding]).chain(poses.more) {
-        let text = format!("{} {}", finding.what, finding.remedy).trim_end().to_owned();
-        match finding.severity {
-            Severity::Warning => console.warn(&text),
-            Severity::Note => console.detail(&text),
-        }
-    }
 }
 
 fn minutes(text: &str) -> Result<f64, String> {

@@ -80,6 +80,34 @@ pub struct Request {
     pub synchronous: bool,
 }
 
+/// Pixels of the shorter side that images get: training on a CPU resolves no more.
+pub const SIZE: usize = 1080;
+/// Frames per second of folders of images.
+pub const FPS: f64 = 30.0;
+
+impl Request {
+    /// Makes a capture in `folder` of these videos, or folders of images, with all frames and the usual size.
+    pub fn new(inputs: Vec<PathBuf>, folder: PathBuf) -> Self {
+        Self {
+            inputs,
+            folder,
+            selection: Selection { size: Some(SIZE), ..Selection::default() },
+            crop: None,
+            fps: FPS,
+            rig: Rig::Auto,
+            sound: true,
+            format: Format::default(),
+            apart: None,
+            board: None,
+            camera_height: None,
+            calibration: None,
+            colmap: false,
+            masks: None,
+            synchronous: false,
+        }
+    }
+}
+
 /// Frames of a moving camera that are placed at most: every one is a camera of its own to the solver.
 const MOST_WALKING: usize = 150;
 

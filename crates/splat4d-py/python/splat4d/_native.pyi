@@ -188,6 +188,47 @@ class Scene:
     def tracks(self, every: int = 1, times: ArrayLike | None = None) -> Tracks: ...
     def bake(self, path: _Path, *, tolerance: float | None = None) -> None: ...
     def export(self, path: _Path, t: float | None = None) -> None: ...
+    def export_frames(
+        self,
+        folder: _Path,
+        *,
+        fps: float | None = None,
+        start: float | None = None,
+        end: float | None = None,
+        world: bool = False,
+        force: bool = False,
+    ) -> int: ...
+    def export_tracks(
+        self,
+        path: _Path,
+        *,
+        every: int = 1,
+        near: Sequence[float] | None = None,
+        count: int = 1,
+        label: str | None = None,
+        points: _Path | None = None,
+        fps: float | None = None,
+        start: float | None = None,
+        end: float | None = None,
+        world: bool = False,
+    ) -> None: ...
+    def film(
+        self,
+        path: _Path,
+        *,
+        route: str | None = None,
+        size: tuple[int, int] | None = None,
+        start: float | None = None,
+        end: float | None = None,
+        freeze: float | None = None,
+        slow_motion: float | None = None,
+        seconds: float | None = None,
+        fps: float | None = None,
+        channel: str = "color",
+        force: bool = False,
+        device: _Device = "cpu",
+    ) -> None: ...
+    def localise(self, images: Sequence[_Path], *, start: _Path | None = None, lens: bool = False) -> list[dict[str, Any]]: ...
     def edit(self, edits: str | _Path) -> Scene: ...
     def __len__(self) -> int: ...
 
@@ -294,6 +335,30 @@ class Run:
     ) -> dict[str, Any]: ...
 
 def open(path: _Path, *, motion: Motion | None = None) -> Scene: ...
+def import_videos(
+    videos: Sequence[_Path],
+    out: _Path,
+    *,
+    rig: Literal["auto", "fixed", "moving"] = "auto",
+    every: int = 1,
+    start: float | None = None,
+    end: float | None = None,
+    size: int = 1080,
+    fps: float = 30.0,
+    sound: bool = True,
+    synchronous: bool = False,
+    crop: Literal["auto"] | tuple[int, int, int, int] | None = None,
+    apart: tuple[str, str, float] | None = None,
+    board: str | None = None,
+    camera_height: tuple[str, float] | None = None,
+    calibration: _Path | None = None,
+    colmap: bool = False,
+    masks: _Path | None = None,
+    deinterlace: bool = False,
+    png: bool = False,
+    check: bool = True,
+) -> Capture: ...
+def info(path: _Path, *, doctor: _Path | None = None, **settings: Any) -> dict[str, Any]: ...
 def compare(runs: Sequence[_Path], outputs: Sequence[_Path] = ()) -> list[dict[str, Any]]: ...
 def metrics(render: ArrayLike, truth: ArrayLike) -> dict[str, float]: ...
 def photometric(render: ArrayLike, truth: ArrayLike, lambda_dssim: float = 0.2) -> tuple[float, _F32]: ...
@@ -307,6 +372,7 @@ def train(
     minutes: float | None = None,
     quality: Literal["draft", "standard", "best"] | None = None,
     device: _Device = "cpu",
+    evaluate: bool = False,
     force: bool = False,
     **settings: Any,
 ) -> Run: ...
@@ -317,6 +383,7 @@ def resume(
     progress: _Progress | Literal[False] | None = None,
     loss: _Loss | None = None,
     device: _Device = "cpu",
+    evaluate: bool = False,
 ) -> Run: ...
 def command(*words: _Path) -> list[dict[str, Any]]: ...
 def main(words: Sequence[str]) -> int: ...

@@ -24,10 +24,10 @@ use super::colour::{ColourSums, IDENTITY};
 use super::metrics::{self, Flicker, TemporalMean};
 use super::report::METHOD;
 use super::{CameraScores, Conditions, InputScaling, Lpips, Report, Score, Split, View, ViewContext, score_view};
-use crate::Result;
 use crate::capture::{Capture, ImageStore, StoredPicture};
 use crate::event::Event;
 use crate::run::checkpoint::write_atomically;
+use crate::{Error, ErrorKind, Result};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 use rayon::prelude::*;
@@ -39,6 +39,7 @@ use splat4d::render::{Antialias, Backend, Image, RenderConfig, Shot, Simd};
 use splat4d::scene::Planes;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Training views that are measured: their mean moves by less than 0.1 dB beyond that.
 const TRAIN_VIEWS: usize = 24;
@@ -167,16 +168,18 @@ enum Views<'a> {
 
 /// Draws and measures the held-out views of `capture` (and a few training views), and writes the files above.
 ///
-/// Errors: an image that cannot be read, weights that do not fit, a folder that cannot be written.
+/// Errors: an image that cannot be read, weights that do not fit, a folder that cannot be written; `stop` was raised, which is
+/// checked before each view.
 pub fn evaluate(
     scene: &Scene<f32>,
     capture: &Capture,
     store: &Arc<ImageStore>,
     iteration: usize,
     options: &EvalOptions,
+    stop: &AtomicBool,
     listen: &mut dyn FnMut(&Event),
 ) -> Result<Scores> {
-    let evaluation = assess(scene, capture, store, iteration, options, listen)?;
+    let evaluation = assess(scene, capture, store, iteration, options, stop, listen)?;
     let Scores { report, dynamic_share, aligned } = &evaluation;
     let (mut results, mut views) = (report.results(), report.per_view());
     let (ours, frames) = (report.method(), options.measured.frames(capture));
@@ -205,12 +208,13 @@ pub fn assess(
     store: &Arc<ImageStore>,
     iteration: usize,
     options: &EvalOptions,
+    stop: &AtomicBool,
     listen: &mut dyn FnMut(&Event),
 ) -> Result<Scores> {
     let lpips = options.lpips_weights.as_deref().map(load_lpips).transpose()?;
     let place = options.place.as_deref().unwrap_or(Measured::Test.name());
     let folder = options.folder.join(place).join(format!("ours_{iteration}"));
-    let mut judge = Judge::new(scene, capture, store, lpips, options, listen);
+    let mut judge = Judge::new(scene, capture, store, lpips, options, stop, listen);
     let whole = Views::Whole(options.pictures.then_some(folder.as_path()));
     let name = match options.measured {
         Measured::Test => "evaluating held-out views",
@@ -243,6 +247,7 @@ struct Judge<'a> {
     capture: &'a Capture,
     store: &'a Arc<ImageStore>,
     lpips: Option<Lpips>,
+    stop: &'a AtomicBool,
     backend: Box<dyn Backend>,
     /// It in words.
     device: String,
@@ -259,6 +264,7 @@ impl<'a> Judge<'a> {
         store: &'a Arc<ImageStore>,
         lpips: Option<Lpips>,
         options: &EvalOptions,
+        stop: &'a AtomicBool,
         listen: &mut dyn FnMut(&Event),
     ) -> Self {
         let antialias = if options.antialias { Antialias::On } else { Antialias::Off };
@@ -276,6 +282,7 @@ impl<'a> Judge<'a> {
             capture,
             store,
             lpips,
+            stop,
             backend,
             device: if on_cpu { DEVICE.into() } else { name },
             instant: Evaluation::default(),
@@ -308,6 +315,10 @@ impl<'a> Judge<'a> {
             let (mut changes, mut colours) = (Flicker::default(), Vec::with_capacity(camera.places.len()));
             self.store.prefetch(&camera.places.iter().map(|&p| frames[p]).collect::<Vec<_>>());
             for &place in &camera.places {
+                if self.stop.load(Ordering::SeqCst) {
+                    return Err(Error::new(ErrorKind::Interrupted, "evaluation was stopped")
+                        .remedy("The same command begins it again."));
+                }
                 let Drawn { view, image, truth, sums } = self.view(&file_name(place), frames[place], mean.as_ref())?;
                 colours.push(sums);
                 if fixed {

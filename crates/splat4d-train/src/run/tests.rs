@@ -646,7 +646,7 @@ fn scenes_with_a_head_are_judged_with_it_and_refuse_what_cannot_hold_it() {
     let store = Arc::new(ImageStore::new(capture.clone(), 1 << 20));
     let psnr = |scene: &Scene<f32>, name: &str| {
         let options = EvalOptions { folder: place.run(name), ..EvalOptions::default() };
-        let found = evaluate(scene, &capture, &store, 1, &options, &mut |_| {}).unwrap();
+        let found = evaluate(scene, &capture, &store, 1, &options, &AtomicBool::new(false), &mut |_| {}).unwrap();
         found.held("PSNR").unwrap()
     };
     let (with, without) = (psnr(&loud, "with"), psnr(&Scene { head: Head::Identity, ..loud.clone() }, "without"));
@@ -678,7 +678,7 @@ fn figures_say_what_they_hold_for_and_what_is_colour_in_them() {
             EvalOptions { folder: place.run("a"), measured, place: entry.map(str::to_owned), ..EvalOptions::default() };
         let store = Arc::new(ImageStore::new(capture.clone(), 1 << 20));
         scene.background = capture.background.unwrap();
-        evaluate(&scene, capture, &store, 7, &options, &mut |_| {}).unwrap()
+        evaluate(&scene, capture, &store, 7, &options, &AtomicBool::new(false), &mut |_| {}).unwrap()
     };
     let (white, black) = (open([1.0; 3]), open([0.0; 3]));
     let own = measure(&white, Measured::Test, None);

@@ -95,7 +95,7 @@ fn a_file_keeps_its_size_limit_and_reports_the_size_it_would_need() {
     let (like, needs) = (likeness.unwrap(), needs.expect("leaps are not 40 dB in a few segments each"));
     assert!(like.psnr < LIKE && needs.bytes > 2 * bytes, "{like:?} {needs:?}");
     let words = Needs { psnr: 40.0, bytes: 60 << 20, more: false }.in_words(32.1, 8 << 20);
-    assert_eq!(words, "32.1 dB against the model at 8.0 MiB; 40 dB needs about 60.0 MiB (--size)");
+    assert_eq!(words, "32.1 dB against the model at 8.0 MiB; 40 dB needs about 60.0 MiB (option `size`)");
     // The default is what was learnt, and a rate.
     let default = budget(&source(&Leaps::default()).scene) as f64;
     assert!(

@@ -128,7 +128,7 @@ pub fn shots(
 ) -> Result<Vec<Shot>> {
     let fit = |camera: &Camera| size.map_or_else(|| camera.clone(), |s| resized(camera, s));
     if clock.seconds.is_some() && !matches!(route, Route::Orbit | Route::Camera(_)) {
-        return Err(Error::input("--seconds sets the length of an orbit or of the film of one camera")
+        return Err(Error::input("option `seconds` sets the length of an orbit or of the film of one camera")
             .remedy("Leave it out: views and key frames have times of their own."));
     }
     match route {
@@ -164,7 +164,7 @@ pub fn shots(
             if out.is_empty() {
                 let which = if held { "held-out" } else { "training" };
                 return Err(Error::input(format!("there is no {which} view in that time range"))
-                    .remedy("Choose another --path, --from or --to; `splat4d info` lists what a run holds."));
+                    .remedy("Choose another option `path`, option `from` or option `to`; `splat4d info` lists what a run holds."));
             }
             Ok(out)
         }
@@ -208,7 +208,7 @@ fn known_cameras(views: &[View]) -> String {
         }
     }
     match names.len() {
-        0 => "This file has no cameras. Use --path orbit or a key frame file.".into(),
+        0 => "This file has no cameras. Use option `path` orbit or a key frame file.".into(),
         n if n > 24 => format!("There are {n}, for instance {}.", names[..24].join(", ")),
         _ => format!("There are {}.", names.join(", ")),
     }
@@ -270,7 +270,9 @@ mod tests {
         assert_eq!(times(&short, Route::Camera("b".into())).len(), 6, "both ends of the range are shown");
         let orbit = times(&short, Route::Orbit);
         assert_eq!((orbit.len(), orbit[0], orbit[4]), (5, 0.0, 1.0), "shorter than an orbit is by itself");
-        assert!(shots(&Route::Test, &short, &views, &stage, None).unwrap_err().to_string().contains("--seconds"));
+        assert!(
+            shots(&Route::Test, &short, &views, &stage, None).unwrap_err().to_string().contains("option `seconds`")
+        );
         let message = shots(&Route::Camera("c".into()), &clock(), &views, &stage, None).unwrap_err().to_string();
         assert!(message.contains("a, b"), "{message}");
         assert!(shots(&Route::Test, &Clock { from: 2.0, to: 3.0, ..clock() }, &views, &stage, None).is_err());

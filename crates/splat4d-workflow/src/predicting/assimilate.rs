@@ -2,6 +2,7 @@
 
 use super::score::{Case, Views, scores};
 use super::{Forecast, Work};
+use crate::deadline::unless_stopped;
 use crate::draw::antialias;
 use crate::events::Listener;
 use crate::report::predict::ModelScores;
@@ -15,6 +16,7 @@ use splat4d_train::capture::frames::{Frames, Picture};
 use splat4d_train::run::dataset::Dataset;
 use std::collections::BTreeSet;
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 /// Forecasts one frame ahead, each from the corrected frame before; what they are worth.
 ///
@@ -24,17 +26,19 @@ pub(super) fn run(
     of: &Forecast,
     views: &Views,
     baselines: [&Vec<Case>; 2],
+    stop: &AtomicBool,
     console: &dyn Listener,
 ) -> Result<ModelScores> {
     if of.fitted.is_empty() {
         return Err(Error::input(format!("{} has no nodes that could be corrected", of.model.name()))
-            .remedy("Choose another --model with --assimilate"));
+            .remedy("Choose another option `model` with option `assimilate`"));
     }
     let mut filter = Filter::new(&work.scene, &work.observed, work.clock);
     let mut paths = work.observed.paths.clone();
     let mut ahead = Vec::new();
     let actions = work.order.actions.as_ref();
     for h in 1..=work.horizon {
+        unless_stopped(stop)?;
         console.phase("correcting by each new frame", h, work.horizon);
         let forecast = work.rollout(&of.fitted, &paths, actions, 1).0.swap_remove(0);
         ahead.push(forecast.clone());
@@ -52,7 +56,7 @@ pub(super) fn run(
     }
     console.clear();
     let scene = predicted(&work.scene, &work.observed, &ahead, work.clock)?;
-    let cases: Vec<Case> = views.cases(work, &scene)?;
+    let cases: Vec<Case> = views.cases(work, &scene, stop)?;
     let mut model_scores = scores(&format!("{}, assimilated", of.model.name()), &cases, baselines, work.horizon);
     model_scores.track_error = views.track_errors(work, &ahead);
     model_scores.node_error = work.oracle()?.map(|oracle| node_errors(&ahead, &work.follow(&oracle)));

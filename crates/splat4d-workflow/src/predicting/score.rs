@@ -1,6 +1,7 @@
 //! Forecasts next to the images of what really came.
 
 use super::{Forecast, Work};
+use crate::deadline::unless_stopped;
 use crate::draw::Rgb;
 use crate::draw::{Painter, color_rgb};
 use crate::events::Listener;
@@ -17,6 +18,7 @@ use splat4d_train::eval::metrics::{psnr, psnr_region};
 use splat4d_train::eval::tracks;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
 
 /// A pixel has changed where a channel differs by more from the last observed image (the metrics' threshold of motion).
 const CHANGED: f32 = 0.05;
@@ -115,10 +117,11 @@ impl Views {
     }
 
     /// Draws a scene from where images were taken, and compares.
-    pub(super) fn cases(&self, work: &Work, scene: &Scene<f32>) -> Result<Vec<Case>> {
+    pub(super) fn cases(&self, work: &Work, scene: &Scene<f32>, stop: &AtomicBool) -> Result<Vec<Case>> {
         let mut painter = Painter::new(scene, scene.background, work.antialias, false);
         let mut out = Vec::new();
         for view in &self.views {
+            unless_stopped(stop)?;
             let frame = &work.capture.frames[view.frame];
             painter.draw(&frame.view, frame.time.0);
             let truth = work.store.load(view.frame)?.to_picture();
@@ -160,6 +163,7 @@ impl Views {
         work: &Work,
         folder: &Path,
         forecast: &Forecast,
+        stop: &AtomicBool,
         console: &dyn Listener,
     ) -> Result<Vec<(String, PathBuf)>> {
         const CAMERAS: usize = 2;
@@ -179,6 +183,7 @@ impl Views {
             let fps = work.clock.fps.min(30.0);
             let mut film = Film::create(&path, [2 * size.width, size.height], fps, shots.len())?;
             for (i, shot) in shots.iter().enumerate() {
+                unless_stopped(stop)?;
                 console.phase("filming", i, shots.len());
                 let frame = &work.capture.frames[shot.frame];
                 painter.draw(&frame.view, frame.time.0);

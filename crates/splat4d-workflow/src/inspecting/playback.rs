@@ -1,9 +1,9 @@
 //! What the index of a playback file says: sections, sizes, and how much has to arrive before there is something to see.
 
 use super::line;
+use crate::files::{grouped, human_bytes};
 use serde_json::{Value, json};
 use splat4d::format::playback::{Codec, Entry, HEADER_BYTES, Index, Kind};
-use splat4d_workflow::files::{grouped, human_bytes};
 use std::fmt::Write;
 
 /// Sections that are listed; `--json` has them all.

@@ -1,15 +1,16 @@
 //! `info --doctor`: everything that is wrong with a capture, on the terminal, as a page and as JSON.
 
-use super::Told;
-use crate::console::Console;
+use super::Inspection;
+use crate::events::Listener;
+use crate::report::doctor::{about, made, sentence, summary};
 use serde_json::json;
+use splat4d::Result;
 use splat4d_import::doctor::Grade;
 use splat4d_train::capture::Capture;
-use splat4d_workflow::report::doctor::{about, made, sentence, summary};
 use std::fmt::Write;
 use std::path::Path;
 
-pub(super) fn of(capture: &Capture, folder: &Path, console: &Console) -> anyhow::Result<Told> {
+pub(super) fn of(capture: &Capture, folder: &Path, console: &dyn Listener) -> Result<Inspection> {
     let (report, html) = made(capture, folder, console)?;
     let mut text = format!("{}\n", summary(&report));
     for f in report.findings.iter().filter(|f| f.grade == Grade::Note) {
@@ -26,8 +27,8 @@ pub(super) fn of(capture: &Capture, folder: &Path, console: &Console) -> anyhow:
     }
     let _ = writeln!(text, "wrote {} and doctor.json next to it", html.display());
     let troubles = report.findings.iter().filter(|f| f.grade > Grade::Note).map(sentence).collect();
-    let mut json = serde_json::to_value(&report)?;
+    let mut json = serde_json::to_value(&report).expect("a report is plain data");
     json["type"] = json!("doctor");
     json["page"] = json!(html.to_string_lossy());
-    Ok(Told { json, text, troubles, listed: Vec::new() })
+    Ok(Inspection { json, text, troubles, listed: Vec::new() })
 }

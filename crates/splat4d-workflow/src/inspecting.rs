@@ -1,17 +1,22 @@
-//! `info`: what a capture, a run or a file contains, and whether it looks healthy.
+//! The work behind `info`: what a capture, a run or a file contains, and whether it looks healthy.
 
 mod doctor;
 mod playback;
 
-use crate::console::Console;
+use crate::chunked;
+use crate::events::Listener;
+use crate::files::{self, grouped, human_bytes, human_seconds};
+use crate::run_folder::{Origin, Run};
+use crate::source::{Source, bundle, cloud, read_scene};
+use crate::status;
 use serde_json::{Value, json};
-use splat4d::Error;
 use splat4d::format::sog;
 use splat4d::layers::{Head, Scene};
 use splat4d::math::sh::degree_of;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, SH};
 use splat4d::text::in_line;
+use splat4d::{Error, Result};
 use splat4d_import::shipped;
 use splat4d_train::capture::{self, Aspect, Capture, Finding, Frame, Reach, Severity, Timing};
 use splat4d_train::event::Event;
@@ -20,10 +25,6 @@ use splat4d_train::path_text::{in_command, to_text};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::chunks::ChunkEstimate;
 use splat4d_train::run::{Stopwatch, memory_estimate, open_capture};
-use splat4d_workflow::files::{self, grouped, human_bytes, human_seconds};
-use splat4d_workflow::run_folder::{Origin, Run};
-use splat4d_workflow::source::{Source, bundle, cloud};
-use splat4d_workflow::{chunked, status};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -45,110 +46,73 @@ const MANY_LAYERS: usize = 8;
 /// Longest bar of a histogram, characters.
 const BAR: usize = 32;
 
-const EXAMPLES: &str = "\
-Examples:
-  splat4d info my-take            cameras, frames, split, findings, memory estimate
-  splat4d info my-take --check    exit code 2 if it does not look healthy, for scripts
-  splat4d info my-take --doctor   problems per camera and remedies (writes ./doctor/doctor.html)
-  splat4d info runs/knight        recipe, progress, scores
-  splat4d info scene.ply --json   Gaussians, SH degree, bounds, opacity and scales, damage";
-
-/// Print what a capture, run or file contains, and whether it looks healthy
-#[derive(Debug, clap::Args)]
-#[command(after_help = EXAMPLES)]
-pub(crate) struct Args {
-    /// A capture folder, a run, a scene.safetensors, a checkpoint, a .s4d or a 3DGS .ply
-    #[arg(value_name = "ANY")]
-    path: PathBuf,
-    /// Read a capture with images reduced by k
-    #[arg(long, value_name = "K")]
-    downscale: Option<usize>,
-    /// Read a capture with these views held out: camera=0,10 or every=8 or none
-    #[arg(long, value_name = "RULE")]
-    hold_out: Option<String>,
-    /// Read a capture with the images of this folder, such as images_4
-    #[arg(long, value_name = "NAME")]
-    images: Option<String>,
-    /// Read a capture's poses in this convention: opencv, opengl, inverse, transposed or xyzw, or several joined by +
-    #[arg(long, value_name = "CONVENTION")]
-    poses: Option<String>,
-    /// Read a capture with a setting, such as capture.sequence=photos, repeatable
-    #[arg(long, value_name = "KEY=VALUE")]
-    set: Vec<String>,
-    /// Check a capture's images and poses, and write doctor.html and doctor.json
-    #[arg(long)]
-    doctor: bool,
-    /// Fail with exit code 2 if it does not look healthy
-    #[arg(long)]
-    check: bool,
-    /// Folder of --doctor's output
-    #[arg(short, long, value_name = "FOLDER", default_value = "doctor", requires = "doctor")]
-    output: PathBuf,
-}
-
 /// What readers say of values that cannot be right as they were read; all else that they say is a note.
 const DOUBTS: [&str; 2] = ["--linear", "where single precision has steps"];
 
-/// Output of the verb: a JSON object, and the same for people.
-struct Told {
-    json: Value,
-    text: String,
-    /// Why it does not look healthy.
-    troubles: Vec<String>,
-    /// More of that, which the text lists already.
-    listed: Vec<String>,
+/// Options of [`inspect`].
+#[derive(Clone, Debug, Default)]
+pub struct InspectOptions {
+    /// How a capture is read.
+    pub recipe: Recipe,
+    /// Check a capture's images and poses too, and write `doctor.html` and `doctor.json` into this folder.
+    pub doctor: Option<PathBuf>,
 }
 
-pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
-    let path = &args.path;
+/// What a capture, a run or a file contains.
+#[derive(Clone, Debug)]
+#[non_exhaustive]
+pub struct Inspection {
+    /// All of it, for programs ([docs/events.md](https://github.com/splat4d/splat4d/blob/main/docs/events.md)).
+    pub json: Value,
+    /// The same for people, in lines.
+    pub text: String,
+    /// Why it does not look healthy.
+    pub troubles: Vec<String>,
+    /// More reasons, which `text` contains already.
+    pub listed: Vec<String>,
+}
+
+impl Inspection {
+    /// Whether nothing is wrong with it.
+    pub fn is_healthy(&self) -> bool {
+        self.troubles.is_empty() && self.listed.is_empty()
+    }
+}
+
+/// Reads what a capture, a run or a scene file contains, and whether it looks healthy.
+///
+/// Errors: no such file or folder; it cannot be read.
+///
+/// ```no_run
+/// ///
+/// # fn main() -> splat4d::Result<()> {
+/// let found = inspect("scene.ply".as_ref(), &InspectOptions::default(), &splat4d_workflow::events::ignore)?;
+/// println!("{} Gaussians, healthy: {}", found.json["gaussians"], found.is_healthy());
+/// # Ok(())
+/// # }
+/// ```
+pub fn inspect(path: &Path, options: &InspectOptions, console: &dyn Listener) -> Result<Inspection> {
     if !path.exists() {
         return Err(Error::input("there is no such file or folder")
             .at(path.display())
-            .remedy("Give a capture, a run or a scene file.")
-            .into());
+            .remedy("Give a capture, a run or a scene file."));
     }
     let marker = capture::is_metadata(path);
     let sog = path.join(sog::META).is_file() || path.file_name().is_some_and(|name| name == sog::META);
     let levels = path.file_name().is_some_and(|name| name == sog::levels::LEVELS);
     let foreign = sog || levels || (path.is_dir() && bundle::is_scene(path));
     let is_capture = !Run::is(path) && !foreign && (path.is_dir() || marker);
-    if args.doctor && !is_capture {
+    if options.doctor.is_some() && !is_capture {
         return Err(Error::input("the doctor checks captures only")
             .at(path.display())
-            .remedy("Give a capture's folder, or leave --doctor out.")
-            .into());
+            .remedy("Give a capture's folder, or leave option `doctor` out."));
     }
-    let mut told = if Run::is(path) {
-        of_run(path)?
+    if Run::is(path) {
+        of_run(path)
     } else if is_capture {
-        of_capture(path, args, console)?
+        of_capture(path, options, console)
     } else {
-        of_file(path)?
-    };
-    let healthy = told.troubles.is_empty() && told.listed.is_empty();
-    if console.json() {
-        told.troubles.append(&mut told.listed);
-        told.json["healthy"] = json!(healthy);
-        told.json["troubles"] = json!(told.troubles);
-        console.emit(&told.json);
-        return args.verdict(healthy);
-    }
-    for trouble in &told.troubles {
-        let _ = writeln!(told.text, "! {}", in_line(trouble));
-    }
-    let verdict = if healthy { "looks healthy" } else { "does not look healthy, see above" };
-    console.report(&format!("{}{verdict}", told.text), healthy);
-    args.verdict(healthy)
-}
-
-impl Args {
-    /// Errors: with --check, what does not look healthy.
-    fn verdict(&self, healthy: bool) -> anyhow::Result<()> {
-        if healthy || !self.check {
-            return Ok(());
-        }
-        let remedy = "The findings are listed above; without --check they do not change the exit code.";
-        Err(Error::input("does not look healthy").at(self.path.display()).remedy(remedy).into())
+        of_file(path)
     }
 }
 
@@ -156,22 +120,8 @@ fn line(out: &mut String, name: &str, value: &str) {
     let _ = writeln!(out, "{name:<16} {}", in_line(value));
 }
 
-fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Told> {
-    let mut recipe = Recipe::default();
-    if let Some(k) = args.downscale {
-        recipe.set(&format!("downscale={k}"))?;
-    }
-    if let Some(rule) = &args.hold_out {
-        recipe.set(&format!("hold_out={}", toml::Value::String(rule.clone())))?;
-    }
-    for (setting, value) in [("capture.images", &args.images), ("capture.poses", &args.poses)] {
-        if let Some(value) = value {
-            recipe.set(&format!("{setting}={}", toml::Value::String(value.clone())))?;
-        }
-    }
-    for assignment in &args.set {
-        recipe.set(assignment).map_err(|e| e.at("--set"))?;
-    }
+fn of_capture(path: &Path, options: &InspectOptions, console: &dyn Listener) -> Result<Inspection> {
+    let recipe = &options.recipe;
     if let Some(found) = shipped::contents(path)? {
         return Ok(of_shipped(path, &found));
     }
@@ -184,19 +134,19 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
         frame.flow = frame.flow.take().filter(|_| recipe.loss.flow > 0.0);
         frame.tracks = frame.tracks.take().filter(|_| recipe.loss.tracks > 0.0);
     }
-    if args.doctor {
-        check_apart(&args.output, &Origin::of(&capture).inputs().collect::<Vec<_>>())?;
-        // Before the images are looked at, which takes a while.
-        files::make_folder(&args.output)?;
-        return doctor::of(&capture, &args.output, console);
+    if let Some(folder) = &options.doctor {
+        check_apart(folder, &Origin::of(&capture).inputs().collect::<Vec<_>>())?;
+        // Before the images are read, which takes a while.
+        files::make_folder(folder)?;
+        return doctor::of(&capture, folder, console);
     }
     let (first, last) = capture.time_range();
     let (times, sizes) = (capture.times(), sizes(&capture));
     let capture = Arc::new(capture);
     let mut listen = |event: &Event| console.event(event);
-    let outlook = ChunkEstimate::new(&capture, &recipe, None, 0.0, true, &Stopwatch::start(), &mut listen)?;
+    let outlook = ChunkEstimate::new(&capture, recipe, None, 0.0, true, &Stopwatch::start(), &mut listen)?;
     console.clear();
-    let memory = outlook.as_ref().map_or_else(|| memory_estimate(&capture, &recipe), |o| o.memory);
+    let memory = outlook.as_ref().map_or_else(|| memory_estimate(&capture, recipe), |o| o.memory);
     let checked = capture.check_poses();
     let written_as = checked.written_as.map(|p| p.to_string());
     let mut findings = capture.preflight();
@@ -281,11 +231,11 @@ fn of_capture(path: &Path, args: &Args, console: &Console) -> anyhow::Result<Tol
         "findings": findings.iter().map(|f| json!({"severity": format!("{:?}", f.severity).to_lowercase(),
             "about": f.aspect.map(Aspect::name), "what": f.what, "remedy": f.remedy})).collect::<Vec<_>>(),
     });
-    Ok(Told { json, text, troubles, listed })
+    Ok(Inspection { json, text, troubles, listed })
 }
 
 /// A capture that is shipped as a video per camera with poses, whose frames are not extracted yet.
-fn of_shipped(path: &Path, found: &shipped::Contents) -> Told {
+fn of_shipped(path: &Path, found: &shipped::Contents) -> Inspection {
     let name = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
     let name = name.file_name().map_or_else(|| "capture".into(), |n| n.to_string_lossy().into_owned());
     let frames: Option<usize> = found.cameras.iter().map(|(_, n)| *n).sum();
@@ -324,7 +274,7 @@ fn of_shipped(path: &Path, found: &shipped::Contents) -> Told {
         "moments": found.cameras.iter().filter_map(|(_, n)| *n).max(), "fps": found.rate, "cameras": names,
         "findings": findings.chain(notes).collect::<Vec<_>>(),
     });
-    Told { json, text, troubles: found.warnings.clone(), listed: Vec::new() }
+    Inspection { json, text, troubles: found.warnings.clone(), listed: Vec::new() }
 }
 
 /// The first and the last name of a list, and those between where there are few.
@@ -375,7 +325,7 @@ fn held_cameras(capture: &Capture) -> Vec<String> {
     ids.into_iter().map(|c| capture.cameras[c].name.clone()).collect()
 }
 
-fn of_run(path: &Path) -> anyhow::Result<Told> {
+fn of_run(path: &Path) -> Result<Inspection> {
     let run = Run::open(path)?;
     let mut text = String::new();
     let mut troubles = Vec::new();
@@ -427,16 +377,16 @@ fn of_run(path: &Path) -> anyhow::Result<Told> {
         "iterations": total, "changed_knobs": changed, "info": run.info, "results": run.all_results,
     });
     if let Ok(file) = run.scene_file() {
-        let scene = splat4d_workflow::source::read_scene(&file)?;
+        let scene = read_scene(&file)?;
         let inner = of_scene(&scene);
         text.push_str(&inner.text);
         troubles.extend(inner.troubles);
         json["scene"] = inner.json;
     }
-    Ok(Told { json, text, troubles, listed: Vec::new() })
+    Ok(Inspection { json, text, troubles, listed: Vec::new() })
 }
 
-fn of_file(path: &Path) -> anyhow::Result<Told> {
+fn of_file(path: &Path) -> Result<Inspection> {
     let source = Source::open(path)?;
     let bytes = path.metadata().map(|m| m.len()).unwrap_or(0);
     let mut text = String::new();
@@ -480,7 +430,7 @@ fn of_file(path: &Path) -> anyhow::Result<Told> {
         json["type"] = json!("playback");
         json["playback"] = told.json;
     }
-    Ok(Told { json, text, troubles: inner.troubles, listed: Vec::new() })
+    Ok(Inspection { json, text, troubles: inner.troubles, listed: Vec::new() })
 }
 
 /// Names of edits, one after the other.
@@ -489,7 +439,7 @@ fn done(edits: &[Value]) -> String {
 }
 
 /// Gaussians, degree, bounds, histograms and damage.
-fn of_scene(scene: &Scene<f32>) -> Told {
+fn of_scene(scene: &Scene<f32>) -> Inspection {
     let (center, radius) = cloud(scene);
     let mut opacity = [0usize; OPACITY_EDGES.len() - 1];
     let mut scales = [0usize; SCALE_EDGES.len() - 1];
@@ -593,7 +543,7 @@ fn of_scene(scene: &Scene<f32>) -> Told {
         "middle": center, "radius": radius, "opacity_histogram": {"edges": OPACITY_EDGES, "counts": opacity},
         "scale_histogram": {"edges_log10_radii": SCALE_EDGES, "counts": scales},
     });
-    Told { json, text, troubles, listed: Vec::new() }
+    Inspection { json, text, troubles, listed: Vec::new() }
 }
 
 fn bucket(edges: &[f64], value: f64) -> usize {

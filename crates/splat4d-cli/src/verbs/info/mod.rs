@@ -1,0 +1,100 @@
+//! `info`: what a capture, a run or a file contains, and whether it looks healthy.
+
+use crate::console::Console;
+use serde_json::json;
+use splat4d::Error;
+use splat4d::text::in_line;
+use splat4d_train::recipe::Recipe;
+use splat4d_workflow::inspecting::{InspectOptions, inspect};
+use std::path::PathBuf;
+
+const EXAMPLES: &str = "\
+Examples:
+  splat4d info my-take            cameras, frames, split, findings, memory estimate
+  splat4d info my-take --check    exit code 2 if it does not look healthy, for scripts
+  splat4d info my-take --doctor   problems per camera and remedies (writes ./doctor/doctor.html)
+  splat4d info runs/knight        recipe, progress, scores
+  splat4d info scene.ply --json   Gaussians, SH degree, bounds, opacity and scales, damage";
+
+/// Print what a capture, run or file contains, and whether it looks healthy
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Args {
+    /// A capture folder, a run, a scene.safetensors, a checkpoint, a .s4d or a 3DGS .ply
+    #[arg(value_name = "ANY")]
+    path: PathBuf,
+    /// Read a capture with images reduced by k
+    #[arg(long, value_name = "K")]
+    downscale: Option<usize>,
+    /// Read a capture with these views held out: camera=0,10 or every=8 or none
+    #[arg(long, value_name = "RULE")]
+    hold_out: Option<String>,
+    /// Read a capture with the images of this folder, such as images_4
+    #[arg(long, value_name = "NAME")]
+    images: Option<String>,
+    /// Read a capture's poses in this convention: opencv, opengl, inverse, transposed or xyzw, or several joined by +
+    #[arg(long, value_name = "CONVENTION")]
+    poses: Option<String>,
+    /// Read a capture with a setting, such as capture.sequence=photos, repeatable
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Check a capture's images and poses, and write doctor.html and doctor.json
+    #[arg(long)]
+    doctor: bool,
+    /// Fail with exit code 2 if it does not look healthy
+    #[arg(long)]
+    check: bool,
+    /// Folder of --doctor's output
+    #[arg(short, long, value_name = "FOLDER", default_value = "doctor", requires = "doctor")]
+    output: PathBuf,
+}
+
+pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
+    let options = InspectOptions { recipe: recipe(args)?, doctor: args.doctor.then(|| args.output.clone()) };
+    let mut found = inspect(&args.path, &options, console)?;
+    let healthy = found.is_healthy();
+    if console.json() {
+        found.troubles.append(&mut found.listed);
+        found.json["healthy"] = json!(healthy);
+        found.json["troubles"] = json!(found.troubles);
+        console.emit(&found.json);
+        return args.verdict(healthy);
+    }
+    for trouble in &found.troubles {
+        found.text += &format!("! {}\n", in_line(trouble));
+    }
+    let verdict = if healthy { "looks healthy" } else { "does not look healthy, see above" };
+    console.report(&format!("{}{verdict}", found.text), healthy);
+    args.verdict(healthy)
+}
+
+/// How a capture is read.
+fn recipe(args: &Args) -> anyhow::Result<Recipe> {
+    let mut recipe = Recipe::default();
+    if let Some(k) = args.downscale {
+        recipe.set(&format!("downscale={k}"))?;
+    }
+    if let Some(rule) = &args.hold_out {
+        recipe.set(&format!("hold_out={}", toml::Value::String(rule.clone())))?;
+    }
+    for (setting, value) in [("capture.images", &args.images), ("capture.poses", &args.poses)] {
+        if let Some(value) = value {
+            recipe.set(&format!("{setting}={}", toml::Value::String(value.clone())))?;
+        }
+    }
+    for assignment in &args.set {
+        recipe.set(assignment).map_err(|e| e.at("--set"))?;
+    }
+    Ok(recipe)
+}
+
+impl Args {
+    /// Errors: with --check, what does not look healthy.
+    fn verdict(&self, healthy: bool) -> anyhow::Result<()> {
+        if healthy || !self.check {
+            return Ok(());
+        }
+        let remedy = "The findings are listed above; without --check they do not change the exit code.";
+        Err(Error::input("does not look healthy").at(self.path.display()).remedy(remedy).into())
+    }
+}
