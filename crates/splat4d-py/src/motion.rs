@@ -9,6 +9,7 @@ use numpy::PyUntypedArrayMethods;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use splat4d::Result;
+use splat4d::math::logit;
 use splat4d::motion::still::{activate, activate_backward};
 use splat4d::motion::{At, Cache, Motion, Phase, Spec, Still, Tape};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
@@ -221,12 +222,11 @@ impl PyMotion {
             return Err(bad_input(what, "Return opacities from 0 to 1, for instance sigmoid(opacity_logits)"));
         }
         let raw = (0..n).map(|j| {
-            let o = opacities[j].clamp(OPACITY_MARGIN, 1.0 - OPACITY_MARGIN);
             std::array::from_fn(|c| match c {
                 0..QUAT => means[3 * j + c],
                 QUAT..LOG_SCALE => quats[4 * j + c - QUAT],
                 LOG_SCALE..OPACITY => scales[3 * j + c - LOG_SCALE].ln(),
-                _ => (o / (1.0 - o)).ln(),
+                _ => logit(opacities[j], OPACITY_MARGIN),
             })
         });
         let raw = raw.collect();

@@ -6,6 +6,7 @@ use crate::errors::{OrRaise, bad_input};
 use numpy::PyUntypedArrayMethods;
 use pyo3::prelude::*;
 use splat4d::layers::{Layer, Scene};
+use splat4d::math::logit;
 use splat4d::math::sh::{MAX_COEFFS, rgb_to_dc};
 use splat4d::motion::spacetime::{ROTATION_RATES, VELOCITIES};
 use splat4d::motion::tracked::{POSE, Tracked, TrackedSpec};
@@ -156,8 +157,8 @@ impl Shapes {
             geometry.write(row, 0, self.means.read::<3>(0, row));
             geometry.write(row, QUAT, self.quats.read::<4>(0, row));
             geometry.write(row, LOG_SCALE, self.scales.read::<3>(0, row).map(f32::ln));
-            let o = f64::from(self.opacities.row(0, row)[0]).clamp(OPACITY_MARGIN, 1.0 - OPACITY_MARGIN);
-            geometry.set(row, OPACITY, (o / (1.0 - o)).ln() as f32);
+            let opacity = f64::from(self.opacities.row(0, row)[0]);
+            geometry.set(row, OPACITY, logit(opacity, OPACITY_MARGIN) as f32);
             self.sh.row(0, row).iter().enumerate().for_each(|(k, x)| sh.set(row, k, *x));
         }
         params

@@ -21,13 +21,10 @@ use crate::capture::CaptureSettings;
 use crate::init::InitSettings;
 use crate::loss::{LossSettings, TransportSettings};
 use crate::maintenance::{
-    AdcSettings, DensifySettings, FloaterSettings, GuidedSettings, LEAST, McmcSettings, MergeSettings, NodeSettings,
+    AdcSettings, DensifySettings, FloaterSettings, GuidedSettings, LEAST, McmcSettings, MergeSettings,
     OpacityResetSettings, PruneSettings, RelocateSettings, SplitSettings,
 };
-use crate::methods::{
-    AppearanceSettings, ControlSettings, DeformSettings, FilterSettings, HexplaneSettings, LifeSettings,
-    Native4dSettings, RateSettings, SpacetimeSettings, SsmSettings, TrackedSettings, still,
-};
+use crate::methods::{AppearanceSettings, LifeSettings, RateSettings, methods, still};
 use crate::settings::Table;
 use crate::step::replans::ScheduleChanges;
 use crate::train_state::RefineSettings;
@@ -59,7 +56,7 @@ macro_rules! recipe {
     };
 }
 
-recipe! {
+methods! { tables recipe {
     run: RunSettings,
     capture: CaptureSettings,
     init: InitSettings,
@@ -67,15 +64,7 @@ recipe! {
     rates: RateSettings,
     refine: RefineSettings,
     life: LifeSettings,
-    spacetime: SpacetimeSettings,
-    deform: DeformSettings,
-    hexplane: HexplaneSettings,
-    tracked: TrackedSettings,
-    native4d: Native4dSettings,
-    control: ControlSettings,
-    nodes: NodeSettings,
-    ssm: SsmSettings,
-    filter: FilterSettings,
+} {
     transport: TransportSettings,
     loss: LossSettings,
     densify: DensifySettings,
@@ -89,7 +78,7 @@ recipe! {
     merge: MergeSettings,
     split: SplitSettings,
     chunks: ChunkSettings,
-}
+} }
 
 impl Recipe {
     /// This recipe, changed.

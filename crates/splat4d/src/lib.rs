@@ -32,7 +32,7 @@
 //! |---|---|
 //! | `error.rs`, `text.rs` | the one error (what, where, what to do); text of files, made safe to print |
 //! | `wgsl.rs`, `simd.rs` | shader sources for the GPU renderer and the player; the one dispatch to instruction sets |
-//! | `math/` | quaternions, symmetric matrices, poses, twists, nearest rotations and neighbours, Wasserstein geometry of covariances (`spd.rs`), eigenvectors (`jacobi.rs`), similarities between sets of cameras (`align.rs`), spherical harmonics, counter-based random numbers, `Real` (f32 and f64) |
+//! | `math/` | quaternions, Fourier transforms, symmetric matrices, poses, twists, nearest rotations and neighbours, Wasserstein geometry of covariances (`spd.rs`), eigenvectors (`jacobi.rs`), similarities between sets of cameras (`align.rs`), spherical harmonics, counter-based random numbers, `Real` (f32 and f64) |
 //! | `scene/` | `Table`, `Params`, `Grads`, `RowEdit`, `Splats`, lifespans, cameras, planes, time; weights of a pixel head (`head.rs`), label logits (`labels.rs`), feature channels (`features.rs`) |
 //! | `nn/` | network parts, each with its backward under its forward: perceptrons over `gemm`, encodings, hash grids, feature planes, state-space scans, vector neurons, local frames |
 //! | `motion/` | the trait `Motion`; the list of models, from which `registry.rs` makes `Spec`, names and `build`; capabilities (`Capabilities`, `Polynomial`, `Phase`); one file per model, and `filtered` and `edited`, which wrap any of them; skinning to control nodes (`skin.rs`), dragging them (`arap.rs`), loops over sixteen rows (`lanes.rs`) |

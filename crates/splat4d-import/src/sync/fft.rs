@@ -1,7 +1,6 @@
-//! The fast Fourier transform. Ours, because those of crates choose instructions by the machine, and so other last digits on
-//! other machines.
+//! Fourier transforms of sound, and correlations by them.
 
-use std::f64::consts::TAU;
+use splat4d::math::fft;
 
 /// A transform of one length.
 pub(super) struct Fft {
@@ -19,38 +18,23 @@ pub(super) fn times(a: Complex, b: Complex) -> Complex {
 impl Fft {
     /// For `n` numbers, a power of two.
     pub(super) fn new(n: usize) -> Self {
-        assert!(n.is_power_of_two(), "a transform has a power of two of numbers");
-        let turn = |k: usize| {
-            let (sin, cos) = (TAU * k as f64 / n as f64).sin_cos();
-            [cos, -sin]
-        };
-        Self { turns: (0..n / 2).map(turn).collect() }
+        Self { turns: fft::twiddles(n) }
     }
 
-    /// X_k = Σ_j x_j e^(−2πijk/n), in place (Cooley and Tukey 1965).
+    /// X_k = Σ_j x_j e^(−2πijk/n), in place.
     pub(super) fn forward(&self, x: &mut [Complex]) {
         let n = x.len();
-        assert_eq!(n.max(2) / 2, self.turns.len().max(1), "numbers are as many as the transform is for");
-        let bits = n.trailing_zeros();
         for i in 0..n {
-            let j = if bits == 0 { 0 } else { i.reverse_bits() >> (usize::BITS - bits) };
+            let j = fft::reversed(i, n);
             if i < j {
                 x.swap(i, j);
             }
         }
-        let mut half = 1;
-        while half < n {
-            let stride = n / (2 * half);
-            for block in x.chunks_exact_mut(2 * half) {
-                let (low, high) = block.split_at_mut(half);
-                for (k, (a, b)) in low.iter_mut().zip(high).enumerate() {
-                    let t = times(*b, self.turns[k * stride]);
-                    *b = [a[0] - t[0], a[1] - t[1]];
-                    *a = [a[0] + t[0], a[1] + t[1]];
-                }
-            }
-            half *= 2;
-        }
+        fft::butterflies(x, &self.turns, |a, b, turn| {
+            let t = times(*b, turn);
+            *b = [a[0] - t[0], a[1] - t[1]];
+            *a = [a[0] + t[0], a[1] + t[1]];
+        });
     }
 
     /// The inverse of [`forward`](Self::forward).
@@ -87,6 +71,7 @@ pub(super) fn correlate(a: &[f64], b: &[f64]) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::f64::consts::TAU;
 
     #[test]
     fn a_transform_is_its_definition() {

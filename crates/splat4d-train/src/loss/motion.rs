@@ -6,11 +6,111 @@
 //! Every function adds `weight` times its gradient to all instants and returns `weight` times its value; the same bits
 //! with any number of threads.
 
+use super::LossSettings;
+use super::arap::{self, OWN_FLOOR};
 use super::graph::{Graph, add_to, length, over_points, square, sub, turn, turn_back};
 use splat4d::math::Real;
+use splat4d::scene::Table;
+use splat4d::scene::splats::COV;
 
 /// Keeps a root's derivative finite where nothing moved (Luiten et al. 2024).
 const UNDER_ROOT: f64 = 1e-20;
+
+/// Whether any of the losses on motion is on.
+pub(crate) fn is_on(w: &LossSettings) -> bool {
+    is_wide(w) || is_far(w) || [w.rigid, w.rot, w.velocity, w.least_motion].iter().any(|weight| *weight != 0.0)
+}
+
+/// Whether a loss reads four frames.
+pub(super) fn is_wide(w: &LossSettings) -> bool {
+    w.elastic > 0.0 || w.jerk > 0.0 || w.acceleration > 0.0
+}
+
+/// Whether a loss reads any other time of the clip.
+pub(super) fn is_far(w: &LossSettings) -> bool {
+    w.iso > 0.0 || w.arap > 0.0
+}
+
+/// Scales of the losses.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Scale {
+    /// 1/extent.
+    pub unit: f64,
+    /// Frames of the clip.
+    pub clip: f64,
+}
+
+/// All losses on motion that are on: adds their gradients to `d` and returns `loss` plus their values. `seen`: splats at the view's time and a frame
+/// later; if [`is_wide`], a frame before and two frames later; if [`is_far`], at any other time.
+///
+/// A new loss is its formula below, a line here, and its weight in [`LossSettings`].
+pub(super) fn terms<F: Real>(
+    w: &LossSettings,
+    scale: Scale,
+    graph: &Graph<F>,
+    seen: &[Table<F>],
+    d: &mut [Table<F>],
+    mut loss: f64,
+) -> f64 {
+    let x: Vec<Vec<[F; 3]>> = seen.iter().map(|t| (0..t.rows()).map(|r| t.read(r, 0)).collect()).collect();
+    let mut g: Vec<Vec<[F; 3]>> = x.iter().map(|x| vec![[F::ZERO; 3]; x.len()]).collect();
+    let Scale { unit, clip } = scale;
+    if w.least_motion > 0.0 {
+        let [before, now, ..] = &mut g[..] else { unreachable!("two instants are always asked for") };
+        loss += least([&x[1], &x[0]], w.least_motion * unit, [now, before]);
+    }
+    if w.rigid > 0.0 || w.rot > 0.0 || w.velocity > 0.0 {
+        let rotations = arap::rotations(graph, &x[1], &x[0]);
+        let [before, now, ..] = &mut g[..] else { unreachable!("two instants are always asked for") };
+        if w.rigid > 0.0 {
+            let way = [&x[1][..], &x[0][..]];
+            loss += rigidity(graph, &rotations, way, w.rigid * unit, [now, before]);
+        }
+        if w.velocity > 0.0 {
+            // From scene units a frame to extents a clip.
+            let weight = w.velocity * (unit * clip).powi(2);
+            loss += velocity(graph, [&x[1], &x[0]], weight, [now, before]);
+        }
+        if w.rot > 0.0 {
+            let cov: [Vec<[F; 6]>; 2] = [1, 0].map(|t| (0..seen[t].rows()).map(|r| seen[t].read(r, COV)).collect());
+            let mut d_cov = [0, 1].map(|_| vec![[F::ZERO; 6]; seen[0].rows()]);
+            let [d_now, d_before] = &mut d_cov;
+            loss += rotation(graph, &rotations, [&cov[0], &cov[1]], w.rot, [d_now, d_before]);
+            for (t, d_cov) in [1, 0].into_iter().zip(&d_cov) {
+                d_cov.iter().enumerate().for_each(|(r, v)| d[t].add(r, COV, *v));
+            }
+        }
+    }
+    if is_wide(w) {
+        // In the order of time: before, at, after, after that.
+        let [at, after, before, last, ..] = &mut g[..] else { unreachable!("four instants were asked for") };
+        let x = [&x[2][..], &x[0][..], &x[1][..], &x[3][..]];
+        if w.jerk > 0.0 {
+            loss += jerk(x, w.jerk * unit, [before, at, after, last]);
+        }
+        if w.acceleration > 0.0 {
+            loss += acceleration([x[0], x[1], x[2]], w.acceleration * unit * unit, [before, at, after]);
+        }
+        if w.elastic > 0.0 {
+            let mut d: [&mut [[F; 3]]; 4] = [before, at, after, last];
+            loss += arap::elastic(graph, &x, OWN_FLOOR / (unit * unit), w.elastic, &mut d);
+        }
+    }
+    if is_far(w) {
+        let (far, others) = g.split_last_mut().expect("instants were asked for");
+        let pair = [&x[0][..], &x[x.len() - 1][..]];
+        if w.iso > 0.0 {
+            loss += isometry(graph, pair, w.iso * unit, [&mut others[0], far]);
+        }
+        if w.arap > 0.0 {
+            loss += arap::arap(graph, pair, w.arap * unit * unit, [&mut others[0], far]);
+        }
+    }
+    for (d, g) in d.iter_mut().zip(&g) {
+        g.iter().enumerate().for_each(|(r, v)| d.add(r, 0, *v));
+    }
+    loss
+}
 
 /// Rigidity: mean over edges of √(w ‖e − R_i e⁰‖² + ε), scene units; e now, e⁰ before, R_i the turn of i's neighbours.
 ///

@@ -1,13 +1,12 @@
 //! [`Neighbourhood`]: the losses on motion, switched by recipe on any model.
 
-use super::arap::{self, OWN_FLOOR};
+use super::LossSettings;
 use super::graph::{Graph, Weigh};
 use super::motion;
 use super::near::{NEIGHBOURS, Near};
 use super::terms::{Probe, ProbeLoss, StepInfo};
 use splat4d::layers::Scene;
 use splat4d::math::{Real, Rng};
-use splat4d::scene::splats::COV;
 use splat4d::scene::{GEOMETRY, Space, Table, Time};
 use std::sync::Mutex;
 
@@ -16,48 +15,13 @@ pub(crate) const CENTRES: usize = 1024;
 /// exp(−c d²/median) of an edge; 1 keeps the typical edge and drops the far ones.
 const FALLOFF: f64 = 1.0;
 
-/// Weights of the terms; 0: off.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(crate) struct MotionWeights {
-    /// [`motion::rigidity`] over a frame, extents.
-    pub rigid: f64,
-    /// [`motion::rotation`] over a frame.
-    pub rot: f64,
-    /// [`motion::isometry`] between the view's time and any other of the clip, extents.
-    pub iso: f64,
-    /// [`arap::arap`] between the view's time and any other of the clip, extents².
-    pub arap: f64,
-    /// [`arap::elastic`] over four frames.
-    pub elastic: f64,
-    /// [`motion::velocity`], (extents a clip)².
-    pub velocity: f64,
-    /// [`motion::jerk`] of four frames, extents.
-    pub jerk: f64,
-    /// [`motion::acceleration`] of three frames, extents².
-    pub acceleration: f64,
-    /// [`motion::least`] over a frame, extents.
-    pub least: f64,
-}
-
-impl MotionWeights {
-    /// Whether four frames are looked at.
-    fn wide(&self) -> bool {
-        self.elastic > 0.0 || self.jerk > 0.0 || self.acceleration > 0.0
-    }
-
-    /// Whether nothing is to be done.
-    pub(crate) fn is_off(&self) -> bool {
-        *self == Self::default()
-    }
-}
-
 /// Rigidity, rotation, isometry, ARAP, elasticity, velocity, jerk, acceleration and least motion of the Gaussians of every layer that moves, over
 /// random neighbourhoods of those alive at the view's time.
 ///
 /// Neighbours are those of the raw means, searched again every 200 steps and after every edit of rows; an edge counts
 /// only where both of its ends are alive. Which neighbourhoods a step looks at is a function of seed and step.
 pub(crate) struct Neighbourhood<F> {
-    weights: MotionWeights,
+    weights: LossSettings,
     /// 1/extent
     unit: f64,
     /// Seconds of a frame.
@@ -70,7 +34,7 @@ pub(crate) struct Neighbourhood<F> {
 
 impl<F: Real> Neighbourhood<F> {
     /// For a scene of this extent (scene units), over a clip (seconds) of so many frames a second.
-    pub(crate) fn new(weights: MotionWeights, extent: f64, clip: [f64; 2], fps: f64) -> Self {
+    pub(crate) fn new(weights: LossSettings, extent: f64, clip: [f64; 2], fps: f64) -> Self {
         Self { weights, unit: 1.0 / extent, frame: 1.0 / fps, clip, near: Near::default(), graphs: Mutex::default() }
     }
 
@@ -79,8 +43,7 @@ impl<F: Real> Neighbourhood<F> {
     fn times(&self, info: &StepInfo, layer: usize) -> Option<Vec<Time>> {
         let seconds = self.clip[1] - self.clip[0];
         let t = info.times.first()?.0;
-        let w = &self.weights;
-        let wide = w.wide();
+        let wide = motion::is_wide(&self.weights);
         let (before, after) = if wide { (self.frame, 2.0 * self.frame) } else { (0.0, self.frame) };
         if seconds < before + after {
             return None;
@@ -90,7 +53,7 @@ impl<F: Real> Neighbourhood<F> {
         if wide {
             times.extend([Time(t - self.frame), Time(t + 2.0 * self.frame)]);
         }
-        if w.iso > 0.0 || w.arap > 0.0 {
+        if motion::is_far(&self.weights) {
             let any = Rng::new(info.seed, "far instant", info.iteration as u64).uniform(layer as u64);
             times.push(Time(self.clip[0] + any * seconds));
         }
@@ -132,69 +95,9 @@ impl<F: Real> ProbeLoss<F> for Neighbourhood<F> {
         let graphs = self.graphs.lock().expect("no thread panics while it holds the graphs");
         assert_eq!(graphs.len(), probes.len(), "eval answers the probes of the same step");
         let clip = (self.clip[1] - self.clip[0] + self.frame) / self.frame;
-        let mut loss = 0.0;
-        for ((graph, seen), d) in graphs.iter().zip(seen).zip(d) {
-            let x: Vec<Vec<[F; 3]>> = seen.iter().map(|t| (0..t.rows()).map(|r| t.read(r, 0)).collect()).collect();
-            let mut g: Vec<Vec<[F; 3]>> = x.iter().map(|x| vec![[F::ZERO; 3]; x.len()]).collect();
-            let (w, unit) = (&self.weights, self.unit);
-            let wide = w.wide();
-            if w.least > 0.0 {
-                let [before, now, ..] = &mut g[..] else { unreachable!("two instants are always asked for") };
-                loss += motion::least([&x[1], &x[0]], w.least * unit, [now, before]);
-            }
-            if w.rigid > 0.0 || w.rot > 0.0 || w.velocity > 0.0 {
-                let rotations = arap::rotations(graph, &x[1], &x[0]);
-                let [before, now, ..] = &mut g[..] else { unreachable!("two instants are always asked for") };
-                if w.rigid > 0.0 {
-                    let way = [&x[1][..], &x[0][..]];
-                    loss += motion::rigidity(graph, &rotations, way, w.rigid * unit, [now, before]);
-                }
-                if w.velocity > 0.0 {
-                    // From scene units a frame to extents a clip.
-                    let weight = w.velocity * (unit * clip).powi(2);
-                    loss += motion::velocity(graph, [&x[1], &x[0]], weight, [now, before]);
-                }
-                if w.rot > 0.0 {
-                    let cov: [Vec<[F; 6]>; 2] =
-                        [1, 0].map(|t| (0..seen[t].rows()).map(|r| seen[t].read(r, COV)).collect());
-                    let mut d_cov = [0, 1].map(|_| vec![[F::ZERO; 6]; seen[0].rows()]);
-                    let [d_now, d_before] = &mut d_cov;
-                    loss += motion::rotation(graph, &rotations, [&cov[0], &cov[1]], w.rot, [d_now, d_before]);
-                    for (t, d_cov) in [1, 0].into_iter().zip(&d_cov) {
-                        d_cov.iter().enumerate().for_each(|(r, v)| d[t].add(r, COV, *v));
-                    }
-                }
-            }
-            if wide {
-                // In the order of time: before, at, after, after that.
-                let [at, after, before, last, ..] = &mut g[..] else { unreachable!("four instants were asked for") };
-                let x = [&x[2][..], &x[0][..], &x[1][..], &x[3][..]];
-                if w.jerk > 0.0 {
-                    loss += motion::jerk(x, w.jerk * unit, [before, at, after, last]);
-                }
-                if w.acceleration > 0.0 {
-                    loss += motion::acceleration([x[0], x[1], x[2]], w.acceleration * unit * unit, [before, at, after]);
-                }
-                if w.elastic > 0.0 {
-                    let mut d: [&mut [[F; 3]]; 4] = [before, at, after, last];
-                    loss += arap::elastic(graph, &x, OWN_FLOOR / (unit * unit), w.elastic, &mut d);
-                }
-            }
-            if w.iso > 0.0 || w.arap > 0.0 {
-                let (far, others) = g.split_last_mut().expect("instants were asked for");
-                let pair = [&x[0][..], &x[x.len() - 1][..]];
-                if w.iso > 0.0 {
-                    loss += motion::isometry(graph, pair, w.iso * unit, [&mut others[0], far]);
-                }
-                if w.arap > 0.0 {
-                    loss += arap::arap(graph, pair, w.arap * unit * unit, [&mut others[0], far]);
-                }
-            }
-            for (d, g) in d.iter_mut().zip(&g) {
-                g.iter().enumerate().for_each(|(r, v)| d.add(r, 0, *v));
-            }
-        }
-        loss
+        let scale = motion::Scale { unit: self.unit, clip };
+        let layers = graphs.iter().zip(seen).zip(d);
+        layers.fold(0.0, |loss, ((graph, seen), d)| motion::terms(&self.weights, scale, graph, seen, d, loss))
     }
 
     fn on_edit(&self) {

@@ -41,7 +41,7 @@ use crate::Result;
 use crate::capture::frames::Frames;
 use crate::train_state::TrainState;
 use splat4d::layers::{Evaluation, Scene};
-use splat4d::math::{Real, Rng, sym3};
+use splat4d::math::{self, Real, Rng, sym3};
 use splat4d::render::Antialias;
 use splat4d::scene::params::{OPACITY, QUAT};
 use splat4d::scene::splats::COV;
@@ -257,9 +257,9 @@ fn opacity(scene: &Scene<f32>, layer: usize, row: usize) -> f64 {
 
 /// The logit of an opacity, kept finite.
 fn logit(o: f64) -> f32 {
-    // Just inside (0, 1): beyond it the logit's gradient is lost in f32.
-    let o = o.clamp(1e-6, 1.0 - 1e-6);
-    (o / (1.0 - o)).ln() as f32
+    /// Just inside (0, 1): beyond it the logit's gradient is lost in f32.
+    const MARGIN: f64 = 1e-6;
+    math::logit(o, MARGIN) as f32
 }
 
 /// Whether nothing of the row can ever be seen, or would only do harm: dead opacity, a life outside the clip, a row that

@@ -2,6 +2,41 @@
 //!
 //! `splat4d::motion::x` holds a model's mathematics, `methods::x` its stages, rates, losses and what it needs of a capture.
 
+/// The list of methods: how a motion model is trained is its file and an entry here, which names its table of settings and makes
+/// it from the recipe `r`. `auto` asks them in this order.
+macro_rules! methods {
+    // Tables of settings, between those before and after in the recipe.
+    (tables $then:ident { $($before:tt)* } { $($after:tt)* }) => {
+        $then! {
+            $($before)*
+            spacetime: $crate::methods::SpacetimeSettings,
+            deform: $crate::methods::DeformSettings,
+            hexplane: $crate::methods::HexplaneSettings,
+            tracked: $crate::methods::TrackedSettings,
+            native4d: $crate::methods::Native4dSettings,
+            control: $crate::methods::ControlSettings,
+            nodes: $crate::maintenance::NodeSettings,
+            ssm: $crate::methods::SsmSettings,
+            filter: $crate::methods::FilterSettings,
+            $($after)*
+        }
+    };
+    (makers) => {{
+        use $crate::methods::*;
+        [
+            ("still", |_| Box::new(still::StillMethod)),
+            ("tracked", |r| Box::new(tracked::TrackedMethod { tracked: r.tracked.clone() })),
+            ("spacetime", |r| Box::new(spacetime::SpacetimeMethod { spacetime: r.spacetime.clone(), guided: r.guided })),
+            ("control", |r| Box::new(control::ControlMethod { control: r.control.clone(), nodes: r.nodes })),
+            ("deform-mlp", |r| Box::new(deform::DeformMethod { deform: r.deform.clone() })),
+            ("hexplane", |r| Box::new(hexplane::HexplaneMethod { hexplane: r.hexplane.clone() })),
+            ("native4d", |r| Box::new(native4d::Native4dMethod { native4d: r.native4d.clone() })),
+            ("ssm", |r| Box::new(ssm::SsmMethod { ssm: r.ssm.clone(), control: r.control.clone(), nodes: r.nodes })),
+        ]
+    }};
+}
+pub(crate) use methods;
+
 pub(crate) mod auto;
 mod common;
 pub(crate) mod control;

@@ -3,8 +3,8 @@
 use super::auto::CaptureStats;
 use super::{CommonSettings, Group, Method, Rate, Stage, TrainContext};
 use crate::capture::Agreement;
-use crate::loss::LossSettings;
-use crate::loss::neighbourhood::{MotionWeights, Neighbourhood};
+use crate::loss::motion;
+use crate::loss::neighbourhood::Neighbourhood;
 use crate::loss::scene::{MeanOpacity, MeanScale, OpacityEntropy};
 use crate::loss::terms::{ParamLoss, ProbeLoss};
 use crate::maintenance::Strategy;
@@ -86,21 +86,6 @@ pub(crate) fn learn_life(stage: &mut Stage, plan: &TrainContext, life: LifeKind)
     }
 }
 
-/// Weights of the losses on motion.
-fn motion_weights(loss: &LossSettings) -> MotionWeights {
-    MotionWeights {
-        rigid: loss.rigid,
-        rot: loss.rot,
-        iso: loss.iso,
-        arap: loss.arap,
-        elastic: loss.elastic,
-        velocity: loss.velocity,
-        jerk: loss.jerk,
-        acceleration: loss.acceleration,
-        least: loss.least_motion,
-    }
-}
-
 /// A stage with the maintenance and the regularisers that every motion model has.
 pub fn stage(name: &str, plan: &TrainContext) -> Stage {
     let c = &plan.common;
@@ -119,9 +104,8 @@ pub fn stage(name: &str, plan: &TrainContext) -> Stage {
         params.push(Box::new(OpacityEntropy { weight: c.loss.opacity_entropy }));
     }
     let mut probes: Vec<Box<dyn ProbeLoss<f32>>> = Vec::new();
-    let weights = motion_weights(&c.loss);
-    if !weights.is_off() {
-        probes.push(Box::new(Neighbourhood::new(weights, plan.extent, plan.clip, plan.fps)));
+    if motion::is_on(&c.loss) {
+        probes.push(Box::new(Neighbourhood::new(c.loss.clone(), plan.extent, plan.clip, plan.fps)));
     }
     Stage {
         batch: plan.batch_size,

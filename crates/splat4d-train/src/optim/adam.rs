@@ -6,7 +6,7 @@
 use super::Floor;
 use splat4d::math::Real;
 use splat4d::scene::table::TableMut;
-use splat4d::scene::{BLOCK, Key};
+use splat4d::scene::{BLOCK, Key, Table};
 use splat4d::simd::{Kernel, each};
 
 /// Decay of the first moment (Kingma and Ba 2015).
@@ -149,6 +149,26 @@ fn step_lanes<F: Real>([m1, m2, p, d]: [Lane<F>; 4], rate: F, c1: &Lane<F>, c2: 
         out[2][l] = p[l] - rate * (a * c1[l]) / ((b * c2[l]).sqrt() + epsilon);
     }
     out
+}
+
+/// The step of one row [N values, N first moments, N second moments, steps], computed in f64; a gradient that is not finite leaves
+/// it as it was.
+pub(crate) fn step_row<const N: usize>(table: &mut Table<f32>, row: usize, d: [f64; N], rates: [f64; N]) {
+    if d.iter().any(|x| !x.is_finite()) {
+        return;
+    }
+    let steps = table.get(row, 3 * N) + 1.0;
+    table.set(row, 3 * N, steps);
+    let unbias = [BETA1, BETA2].map(|beta| 1.0 / (1.0 - beta.powi(steps as i32)));
+    for k in 0..N {
+        let old = |col| f64::from(table.get(row, col));
+        let first = BETA1 * old(N + k) + (1.0 - BETA1) * d[k];
+        let second = BETA2 * old(2 * N + k) + (1.0 - BETA2) * d[k] * d[k];
+        let value = old(k) - rates[k] * first * unbias[0] / ((second * unbias[1]).sqrt() + EPSILON);
+        table.set(row, k, value as f32);
+        table.set(row, N + k, first as f32);
+        table.set(row, 2 * N + k, second as f32);
+    }
 }
 
 #[inline(always)]

@@ -6,7 +6,7 @@
 mod adam;
 mod noise;
 
-pub(crate) use adam::corrections;
+pub(crate) use adam::{corrections, step_row};
 pub(crate) use noise::{MCMC_EXTENT, Noise};
 
 use splat4d::math::Real;

@@ -3,27 +3,15 @@
 use super::Recipe;
 use crate::init::{self, InitSettings};
 use crate::maintenance::{AdcSettings, DENSE, FINEST};
-use crate::methods::{
-    CommonSettings, Method, TrainContext, control, deform, filtered, hexplane, native4d, own, spacetime, ssm, still,
-    tracked,
-};
+use crate::methods::{CommonSettings, Method, TrainContext, filtered, methods, own};
 use crate::{Error, Result};
 use splat4d::motion::{BUILT_IN, MODELS};
 
 /// Makes a program with the settings of a recipe.
 type Make = fn(&Recipe) -> Box<dyn Method>;
 
-/// The programs by the names of their models: a method is its file and an entry here. `auto` asks them in this order.
-pub(crate) const PROGRAMS: [(&str, Make); 8] = [
-    ("still", |_| Box::new(still::StillMethod)),
-    ("tracked", |r| Box::new(tracked::TrackedMethod { tracked: r.tracked.clone() })),
-    ("spacetime", |r| Box::new(spacetime::SpacetimeMethod { spacetime: r.spacetime.clone(), guided: r.guided })),
-    ("control", |r| Box::new(control::ControlMethod { control: r.control.clone(), nodes: r.nodes })),
-    ("deform-mlp", |r| Box::new(deform::DeformMethod { deform: r.deform.clone() })),
-    ("hexplane", |r| Box::new(hexplane::HexplaneMethod { hexplane: r.hexplane.clone() })),
-    ("native4d", |r| Box::new(native4d::Native4dMethod { native4d: r.native4d.clone() })),
-    ("ssm", |r| Box::new(ssm::SsmMethod { ssm: r.ssm.clone(), control: r.control.clone(), nodes: r.nodes })),
-];
+/// The programs by the names of their models, in the order in which `auto` asks them.
+pub(crate) const PROGRAMS: [(&str, Make); 8] = methods!(makers);
 
 impl Recipe {
     /// The program of the recipe's motion model, with the losses over time and the filter that the recipe switches on.

@@ -6,6 +6,7 @@
 //! stands, how large it is and when it begins: the cameras' mean motion, their mean growth and the median of their clocks
 //! stay. The median, since of a rig with one clock that is wrong the others are right.
 
+use crate::optim::step_row;
 use crate::settings::settings;
 use serde_json::{Value, json};
 use splat4d::math::Se3;
@@ -56,9 +57,6 @@ settings! {
     }
 }
 
-/// Adam's constants (Kingma and Ba 2015); the last is the trainer's.
-const BETA: [f64; 2] = [0.9, 0.999];
-const EPSILON: f64 = 1e-15;
 /// Terms of the exponential's series: twists are small, and below one radian the next term is lost in rounding.
 const TERMS: usize = 16;
 /// Share of a frame by which cameras' times differ at least. Views at one time share one gradient to it; at times that are
@@ -259,7 +257,7 @@ impl Corrections {
             let place = rate([s.position_init, s.position_final], done, self.scale.extent);
             let turn = rate([s.rotation_init, s.rotation_final], done, 1.0);
             for (row, d) in d_poses {
-                adam(poses, row, d, [place, place, place, turn, turn, turn]);
+                step_row(poses, row, d, [place, place, place, turn, turn, turn]);
             }
             if self.gauge {
                 self.fix_poses();
@@ -268,7 +266,7 @@ impl Corrections {
         if let (Some(done), Some(focal)) = (share(s.poses_from), &mut self.focal) {
             let step = rate([s.focal_init, s.focal_final], done, 1.0);
             for (rig, d) in d_focal {
-                adam(focal, rig, d, [step]);
+                step_row(focal, rig, d, [step]);
                 let kept = f64::from(focal.get(rig, 0)) * (1.0 - PULL);
                 focal.set(rig, 0, kept.clamp(-FOCAL_LIMIT, FOCAL_LIMIT) as f32);
             }
@@ -277,7 +275,7 @@ impl Corrections {
             let step = rate([s.time_init, s.time_final], done, self.scale.frame);
             let limit = (s.time_limit * self.scale.frame) as f32;
             for (rig, d) in d_times {
-                adam(times, rig, d, [step]);
+                step_row(times, rig, d, [step]);
                 times.set(rig, 0, times.get(rig, 0).clamp(-limit, limit));
             }
             self.fix_times();
@@ -447,25 +445,6 @@ fn add<const N: usize>(sums: &mut Vec<(usize, [f64; N])>, row: usize, d: [f64; N
     match sums.iter_mut().find(|(known, _)| *known == row) {
         Some((_, sum)) => (0..N).for_each(|k| sum[k] += d[k]),
         None => sums.push((row, d)),
-    }
-}
-
-/// Adam on one row of values, moments and steps; a gradient that is not finite leaves it as it was.
-fn adam<const N: usize>(table: &mut Table<f32>, row: usize, d: [f64; N], rates: [f64; N]) {
-    if d.iter().any(|x| !x.is_finite()) {
-        return;
-    }
-    let steps = table.get(row, 3 * N) + 1.0;
-    table.set(row, 3 * N, steps);
-    let unbias = BETA.map(|beta| 1.0 / (1.0 - beta.powi(steps as i32)));
-    for k in 0..N {
-        let old = |col| f64::from(table.get(row, col));
-        let first = BETA[0] * old(N + k) + (1.0 - BETA[0]) * d[k];
-        let second = BETA[1] * old(2 * N + k) + (1.0 - BETA[1]) * d[k] * d[k];
-        let value = old(k) - rates[k] * first * unbias[0] / ((second * unbias[1]).sqrt() + EPSILON);
-        table.set(row, k, value as f32);
-        table.set(row, N + k, first as f32);
-        table.set(row, 2 * N + k, second as f32);
     }
 }
 

@@ -4,7 +4,7 @@ use super::{Evaluation, Layer, LayerTape, Scene};
 use crate::Result;
 use crate::math::sh::MAX_COEFFS;
 use crate::math::sh_rotation::{rotate_coefficients, sh_rotation};
-use crate::math::{Real, Sim3, quat, sym3};
+use crate::math::{Real, Sim3, logit, quat, sym3};
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::splats::{COV, SPLAT_OPACITY};
 use crate::scene::{Color, GEOMETRY, Key, LIFE, LifeKind, Params, Rows, SH, Space, Time};
@@ -190,13 +190,12 @@ fn write(layer: &Layer<f32>, tape: &LayerTape<f32>, coefficients: usize, first: 
         let row = first + j;
         let mean = part.out.read::<3>(j, 0);
         let cov = part.out.read::<6>(j, COV).map(f64::from);
-        let opacity = part.out.get(j, SPLAT_OPACITY).clamp(OPACITY_MARGIN, 1.0 - OPACITY_MARGIN);
         let (q, s) = shapes.of(j, cov);
         let [geometry, sh] = params.get_mut([GEOMETRY, SH]);
         geometry.write(row, 0, mean);
         geometry.write(row, QUAT, q.map(|x| x as f32));
         geometry.write(row, LOG_SCALE, s.map(|x| x as f32));
-        geometry.set(row, OPACITY, (opacity / (1.0 - opacity)).ln());
+        geometry.set(row, OPACITY, logit(part.out.get(j, SPLAT_OPACITY), OPACITY_MARGIN));
         coefficients_of(&part.color, j, &mut colors);
         if let Some(m) = &sh_matrix {
             rotate_coefficients(m, &mut colors);

@@ -1,11 +1,13 @@
-//! Small mathematics: vectors, quaternions, medians, image halving, symmetric 3x3 matrices, rigid motions, similarities, spherical harmonics, counter-based random
+//! Small mathematics: vectors, quaternions, medians, Fourier transforms, image halving, symmetric 3x3 matrices, rigid motions, similarities, spherical harmonics, counter-based random
 //! numbers, and the [`Real`] trait that lets every kernel run in f32 and be checked in f64.
 
 pub mod align;
 pub mod cholesky;
+pub mod fft;
 pub mod image;
 pub mod jacobi;
 pub mod knn;
+mod logit;
 pub mod mat3;
 mod median;
 pub mod quat;
@@ -20,6 +22,7 @@ pub mod sym3;
 pub(crate) mod twist;
 pub mod vec3;
 
+pub use logit::logit;
 pub use median::{median, median_by};
 pub use real::Real;
 pub use rng::Rng;

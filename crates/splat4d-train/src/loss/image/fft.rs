@@ -1,10 +1,9 @@
 //! A discrete Fourier transform of images whose sides are powers of two.
 //!
-//! Our own, because it is a page: radix 2 over sixteen columns at a time, so that every butterfly is a vector operation
-//! and the work stays in cache. A general library would bring three more crates for lengths we do not use.
+//! Sixteen columns at a time, so that every butterfly is a vector operation and the work stays in cache.
 
 use rayon::prelude::*;
-use splat4d::math::Real;
+use splat4d::math::{Real, fft};
 
 /// Columns that are transformed together.
 const LANES: usize = 16;
@@ -25,9 +24,7 @@ impl<F: Real> Spectrum<F> {
     pub(super) fn reset(&mut self, side: usize) {
         assert!(side.is_power_of_two() && side >= LANES, "sides are powers of two from {LANES} on, not {side}");
         if self.side != side {
-            let step = -std::f64::consts::TAU / side as f64;
-            let twiddle = |k: usize| [F::of((step * k as f64).cos()), F::of((step * k as f64).sin())];
-            self.twiddles = (0..side / 2).map(twiddle).collect();
+            self.twiddles = fft::twiddles(side);
             self.side = side;
         }
         for plane in [&mut self.re, &mut self.im, &mut self.scratch.0, &mut self.scratch.1] {
@@ -47,33 +44,22 @@ impl<F: Real> Spectrum<F> {
     fn columns(&mut self) {
         let side = self.side;
         let (re, im, twiddles) = (&self.re, &self.im, &self.twiddles);
-        let bits = side.trailing_zeros();
         let out = self.scratch.0.par_chunks_mut(side * LANES).zip(self.scratch.1.par_chunks_mut(side * LANES));
         out.enumerate().for_each(|(group, (out_re, out_im))| {
             let first = group * LANES;
             let mut a = vec![([F::ZERO; LANES], [F::ZERO; LANES]); side];
             for (y, a) in a.iter_mut().enumerate() {
-                // Decimation in time wants its input in the order of reversed bits.
-                let from = (y.reverse_bits() >> (usize::BITS - bits)) * side + first;
+                let from = fft::reversed(y, side) * side + first;
                 a.0.copy_from_slice(&re[from..from + LANES]);
                 a.1.copy_from_slice(&im[from..from + LANES]);
             }
-            let mut half = 1;
-            while half < side {
-                let stride = side / (2 * half);
-                for start in (0..side).step_by(2 * half) {
-                    let (low, high) = a[start..start + 2 * half].split_at_mut(half);
-                    for (k, (p, q)) in low.iter_mut().zip(high).enumerate() {
-                        let [c, s] = twiddles[k * stride];
-                        for l in 0..LANES {
-                            let (x, y) = (q.0[l] * c - q.1[l] * s, q.0[l] * s + q.1[l] * c);
-                            (q.0[l], q.1[l]) = (p.0[l] - x, p.1[l] - y);
-                            (p.0[l], p.1[l]) = (p.0[l] + x, p.1[l] + y);
-                        }
-                    }
+            fft::butterflies(&mut a, twiddles, |p, q, [c, s]| {
+                for l in 0..LANES {
+                    let (x, y) = (q.0[l] * c - q.1[l] * s, q.0[l] * s + q.1[l] * c);
+                    (q.0[l], q.1[l]) = (p.0[l] - x, p.1[l] - y);
+                    (p.0[l], p.1[l]) = (p.0[l] + x, p.1[l] + y);
                 }
-                half *= 2;
-            }
+            });
             for (y, a) in a.iter().enumerate() {
                 for l in 0..LANES {
                     out_re[l * side + y] = a.0[l];

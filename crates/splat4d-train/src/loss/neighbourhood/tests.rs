@@ -8,7 +8,7 @@ const N: usize = 3000;
 
 const CLIP: [f64; 2] = [0.0, 1.0];
 
-fn made(weights: MotionWeights, clip: [f64; 2]) -> Neighbourhood<f64> {
+fn made(weights: LossSettings, clip: [f64; 2]) -> Neighbourhood<f64> {
     Neighbourhood::new(weights, 2.0, clip, 10.0)
 }
 
@@ -31,8 +31,8 @@ fn info(iteration: usize) -> StepInfo {
     StepInfo { iteration, times: vec![Time(0.4)], seed: 3, progress: 0.0 }
 }
 
-fn all() -> MotionWeights {
-    MotionWeights {
+fn all() -> LossSettings {
+    LossSettings {
         rigid: 0.3,
         rot: 0.2,
         iso: 0.5,
@@ -41,7 +41,8 @@ fn all() -> MotionWeights {
         velocity: 0.01,
         jerk: 0.4,
         acceleration: 0.2,
-        least: 0.3,
+        least_motion: 0.3,
+        ..LossSettings::default()
     }
 }
 
@@ -80,11 +81,11 @@ fn eval(
 fn what_has_no_held_part_has_the_gradient_of_its_value() {
     let scene = scene(LifeKind::Infinite);
     for weights in [
-        MotionWeights { iso: 0.5, ..MotionWeights::default() },
-        MotionWeights { arap: 0.7, jerk: 0.4, ..MotionWeights::default() },
-        MotionWeights { velocity: 0.02, ..MotionWeights::default() },
+        LossSettings { iso: 0.5, ..LossSettings::default() },
+        LossSettings { arap: 0.7, jerk: 0.4, ..LossSettings::default() },
+        LossSettings { velocity: 0.02, ..LossSettings::default() },
     ] {
-        let loss = made(weights, CLIP);
+        let loss = made(weights.clone(), CLIP);
         let probes = ProbeLoss::probes(&loss, &scene, &info(0));
         let seen = answers(&probes);
         let (value, d) = eval(&loss, &scene, &seen, &probes);

@@ -8,7 +8,7 @@ use super::{BLOCK_GAUSSIANS, Depths, Entry, Kind, MAX_PAGE_GAUSSIANS, Node, PAGE
 use crate::Result;
 use crate::format::quant;
 use crate::layers::Layer;
-use crate::math::{Real, quat, sh};
+use crate::math::{self, Real, quat, sh};
 use crate::motion::{Polynomial, Spacetime, SpacetimeSpec};
 use crate::scene::life::{CENTER, LOG_SOFTNESS, LOG_WIDTH};
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
@@ -47,10 +47,7 @@ struct Constants {
 #[inline(always)]
 fn constants() -> &'static Constants {
     static CONSTANTS: LazyLock<Constants> = LazyLock::new(|| {
-        let logit = |code: usize| {
-            let o = (code as f64 / f64::from(LEVELS8)).clamp(OPACITY_MARGIN, 1.0 - OPACITY_MARGIN);
-            (o / (1.0 - o)).ln() as f32
-        };
+        let logit = |code: usize| math::logit(code as f64 / f64::from(LEVELS8), OPACITY_MARGIN) as f32;
         Constants {
             logits: std::array::from_fn(logit),
             instant: INSTANT.ln(),
