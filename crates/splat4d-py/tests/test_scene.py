@@ -105,6 +105,19 @@ class Scenes(InFolder):
         self.assertEqual(len(splat4d.open(self.folder / "again.spz")), len(self.scene.at(0.4)))
         self.assertGreater(len(splat4d.open(self.folder / "again.s4d")), 1000)
 
+    def test_films_sequences_tracks_and_facts_need_no_command(self):
+        self.assertEqual(splat4d.info(PLAYABLE)["type"], "playback")
+        self.scene.film(self.folder / "film", size=(16, 12), fps=1, seconds=1)
+        self.assertTrue((self.folder / "film" / "00000.png").is_file())
+        count = self.scene.export_frames(self.folder / "frames", fps=2)
+        self.assertEqual(count, len(list((self.folder / "frames").glob("frame_*.ply"))))
+        self.scene.export_tracks(self.folder / "near.csv", near=[0, 0, 1], count=2, fps=1)
+        self.assertGreater(len((self.folder / "near.csv").read_text().splitlines()), 2)
+        with self.assertRaisesRegex(splat4d.Error, "option `tracks` NAME.csv"):
+            self.scene.export_tracks(self.folder / "near.txt")
+        with self.assertRaisesRegex(splat4d.Error, "channel"):
+            self.scene.film(self.folder / "film.png", channel="heat")
+
     def test_cameras_come_and_go_unchanged(self):
         _, camera = self.scene.cameras[3]
         same = splat4d.Camera(

@@ -5,6 +5,7 @@ use splat4d::edit::Step;
 use splat4d::format::ply::write_placed;
 use splat4d::scene::params::{LOG_SCALE, QUAT};
 use splat4d::scene::{GEOMETRY, Params};
+use splat4d_train::recipe::Recipe;
 use splat4d_workflow::baking::{self, Baking};
 use splat4d_workflow::comparison::compare;
 use splat4d_workflow::compressing::{CompressOptions, compress};
@@ -12,11 +13,14 @@ use splat4d_workflow::converting::{self, Conversion};
 use splat4d_workflow::editing::{EditOptions, edit};
 use splat4d_workflow::evaluating::{Measure, evaluate};
 use splat4d_workflow::events::{Event, Listener, ignore};
-use splat4d_workflow::exporting;
+use splat4d_workflow::exporting::{self, Frames, TrackOptions};
+use splat4d_workflow::inspecting::{InspectOptions, inspect};
 use splat4d_workflow::labelling::label;
+use splat4d_workflow::localising::{LocaliseOptions, localise};
 use splat4d_workflow::predicting::{PredictOptions, predict};
 use splat4d_workflow::rendering::{RenderOptions, film};
 use splat4d_workflow::source::Source;
+use splat4d_workflow::training::{self, Finish, TrainingOptions};
 use std::cell::RefCell;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
@@ -63,6 +67,60 @@ fn a_scene_is_baked_converted_and_exported_by_functions() {
     let kinds: Vec<String> = records.borrow().iter().map(|r: &serde_json::Value| r["type"].to_string()).collect();
     assert_eq!(kinds, ["\"baked\"", "\"converted\""]);
     assert_eq!(*written.borrow(), ["a.s4d", "a.json", "a.spz", "a.html"].map(at));
+}
+
+#[test]
+fn scenes_are_inspected_and_followed_by_functions() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    write_scene(&at("scene.ply"));
+    let found = inspect(&at("scene.ply"), &InspectOptions::default(), &ignore).unwrap();
+    assert_eq!((&found.json["gaussians"], found.is_healthy()), (&GAUSSIANS.into(), true), "{}", found.text);
+    let doctor = InspectOptions { doctor: Some(at("doctor")), ..InspectOptions::default() };
+    assert!(inspect(&at("scene.ply"), &doctor, &ignore).is_err() && !at("doctor").exists(), "it is not a capture");
+
+    let source = exporting::open(&at("scene.ply"), None).unwrap();
+    let frames = Frames { fps: Some(2.0), ..Frames::default() };
+    let options = |near| TrackOptions { frames, near, ..TrackOptions::default() };
+    let tracked = |near, name: &str| {
+        exporting::tracks(&source.scene, &options(near), &at(name), &ignore).unwrap();
+        std::fs::read_to_string(at(name)).unwrap()
+    };
+    let (all, one) = (tracked(None, "all.csv"), tracked(Some(([0.7, 0.0, 1.0], 1)), "one.csv"));
+    assert_eq!(all.lines().count() - 1, GAUSSIANS * (one.lines().count() - 1), "{one}");
+    let error = exporting::tracks(&source.scene, &options(None), &at("all.txt"), &ignore).unwrap_err().to_string();
+    assert!(error.contains("option `tracks` NAME.csv") && !error.contains("--"), "{error}");
+    let count = exporting::frames(&at("scene.ply"), &source, &at("frames"), &frames, [false, false], &ignore).unwrap();
+    assert!(count > 0 && at("frames/frame_00000.ply").is_file());
+    let error = localise(&at("scene.ply"), &[at("a.png")], &LocaliseOptions::default(), &ignore).unwrap_err();
+    assert!(error.to_string().contains("option `start`"), "{error}");
+}
+
+#[test]
+fn a_capture_is_trained_and_continued_by_functions() {
+    let folder = tempfile::tempdir().unwrap();
+    let (run, stop) = (folder.path().join("run"), AtomicBool::new(false));
+    let capture = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/knight"));
+    let mut recipe = Recipe::default();
+    for setting in ["motion=still", "iterations=4", "downscale=16", "max_frames=1", "sh_degree=0", "init.count=200"] {
+        recipe.set(setting).unwrap();
+    }
+    let begun = RefCell::new(Vec::new());
+    let listen = |event: &Event<'_>| {
+        if let Event::Begun { title, capture, .. } = event {
+            begun.borrow_mut().push((title.to_string(), capture.is_some()));
+        }
+    };
+    let options = TrainingOptions { output: Some(run.clone()), finish: Finish::Scene, ..TrainingOptions::default() };
+    let stopped = AtomicBool::new(true);
+    let trained = training::train(capture, &recipe, &options, &stopped, &listen).unwrap();
+    assert!(trained.interrupted && trained.run == run && !run.join("scene.safetensors").exists());
+    let trained = training::resume(&run, &options, &stop, &listen).unwrap();
+    assert_eq!((trained.iteration, trained.interrupted), (Some(4), false));
+    assert!(run.join("scene.safetensors").is_file() && !run.join("report.html").exists());
+    assert_eq!(begun.borrow()[0], ("knight".to_owned(), true));
+    let error = training::resume(&folder.path().join("none"), &options, &stop, &ignore).unwrap_err();
+    assert_eq!(error.kind(), ErrorKind::BadInput, "{error}");
 }
 
 #[test]
