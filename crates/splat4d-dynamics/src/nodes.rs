@@ -50,12 +50,12 @@ pub struct Observed {
 }
 
 /// The Gaussians of a scene at a time, all layers after each other.
-struct Look {
+struct Snapshot {
     x: Vec<[f32; 3]>,
     alpha: Vec<f32>,
 }
 
-fn look(scene: &Scene<f32>, t: f64) -> Look {
+fn look(scene: &Scene<f32>, t: f64) -> Snapshot {
     let (mut x, mut alpha) = (Vec::new(), Vec::new());
     for layer in &scene.layers {
         let seen = Evaluation::of_layer(layer, Space::Gaussians, Rows::All, Time(t));
@@ -67,7 +67,7 @@ fn look(scene: &Scene<f32>, t: f64) -> Look {
             alpha.push(if sound { out.get(row, SPLAT_OPACITY) } else { 0.0 });
         }
     }
-    Look { x, alpha }
+    Snapshot { x, alpha }
 }
 
 /// At most `count` nodes on what moves over the `ticks` (seconds, ascending, one a frame), of which the last is the last
@@ -152,7 +152,7 @@ struct Tie {
 }
 
 impl Tie {
-    fn new(pose: &Pose, before: &Look, now: &Look, among: &[bool]) -> Self {
+    fn new(pose: &Pose, before: &Snapshot, now: &Snapshot, among: &[bool]) -> Self {
         let square = |i: usize| (0..3).map(|c| (f64::from(before.x[i][c]) - pose.x[c]).powi(2)).sum::<f64>();
         let mut order: Vec<(f64, usize)> = (0..now.x.len())
             .filter(|&i| among[i] && before.alpha[i].min(now.alpha[i]) >= OPAQUE)
@@ -168,18 +168,18 @@ impl Tie {
         Self { pose: *pose, members: order.iter().map(member).collect() }
     }
 
-    fn weight(m: &(usize, [f64; 3], f32), now: &Look) -> f32 {
+    fn weight(m: &(usize, [f64; 3], f32), now: &Snapshot) -> f32 {
         if now.alpha[m.0] >= OPAQUE { m.2.min(now.alpha[m.0]) } else { 0.0 }
     }
 
     /// Whether too few members are left.
-    fn worn(&self, now: &Look) -> bool {
+    fn worn(&self, now: &Snapshot) -> bool {
         let (all, left) = self.members.iter().fold((0.0, 0.0), |(a, l), m| (a + m.2, l + Self::weight(m, now)));
         left <= WORN * all
     }
 
     /// The node's pose by the rigid motion of its members; where there are none, as before.
-    fn pose(&self, before: &Pose, now: &Look) -> Pose {
+    fn pose(&self, before: &Pose, now: &Snapshot) -> Pose {
         let weights: Vec<f64> = self.members.iter().map(|m| f64::from(Self::weight(m, now))).collect();
         let all: f64 = weights.iter().sum();
         if all <= 0.0 {
@@ -211,7 +211,7 @@ impl Tie {
 }
 
 /// The middle of the opaque Gaussians (medians), and within which distance of it most of them lie.
-fn extent(look: &Look) -> ([f64; 3], f64) {
+fn extent(look: &Snapshot) -> ([f64; 3], f64) {
     let opaque: Vec<[f64; 3]> =
         (0..look.x.len()).filter(|&i| look.alpha[i] >= OPAQUE).map(|i| look.x[i].map(f64::from)).collect();
     let quantile = |mut v: Vec<f64>, q: f64| {
@@ -225,7 +225,7 @@ fn extent(look: &Look) -> ([f64; 3], f64) {
 /// Which Gaussians are fast while they are opaque, and which move: of those that are opaque finally the ones most of
 /// whose
 /// neighbours are fast. Of a body all move; what drifts or flickers does so alone.
-fn moving(scene: &Scene<f32>, ticks: &[f64], last: &Look, size: f64) -> (Vec<bool>, Vec<bool>) {
+fn moving(scene: &Scene<f32>, ticks: &[f64], last: &Snapshot, size: f64) -> (Vec<bool>, Vec<bool>) {
     let n = last.x.len();
     let mut bounds = vec![[[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]]; n];
     let mut seen = vec![0u32; n];

@@ -1,7 +1,7 @@
 //! Points that users ask for: a file of pixels or places, followed through a scene, and who sees them.
 
 use crate::paths::View;
-use splat4d::flow::query::{Followed, Place, Query, Sight, follow, sights};
+use splat4d::flow::query::{Followed, Place, PointView, Query, follow, sights};
 use splat4d::layers::Scene;
 use splat4d::scene::{Camera, Time};
 use splat4d::{Error, Result};
@@ -137,7 +137,7 @@ pub struct QueryResult {
     asked: Vec<PointQuery>,
     followed: Followed,
     /// [points, times]
-    sights: Vec<Option<Sight>>,
+    sights: Vec<Option<PointView>>,
 }
 
 impl QueryResult {

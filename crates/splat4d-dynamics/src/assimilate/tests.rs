@@ -33,13 +33,13 @@ fn cameras() -> Vec<Camera> {
 }
 
 /// Images of a scene, said to be of another time.
-struct Seen {
+struct ShiftedImages {
     cameras: Vec<Camera>,
     pictures: Vec<splat4d::scene::Planes<f32>>,
     time: f64,
 }
 
-impl Frames for Seen {
+impl Frames for ShiftedImages {
     fn len(&self) -> usize {
         self.cameras.len()
     }
@@ -83,7 +83,7 @@ fn a_wrong_forecast_is_corrected_by_images() {
         image.color.clone()
     });
     let pictures = pictures.collect();
-    let seen = Seen { pictures, cameras, time: filter.time() };
+    let seen = ShiftedImages { pictures, cameras, time: filter.time() };
     let sure = vec![0.0; 8];
     let unsure = vec![observed.size.powi(2); 8];
     let error = |m: &Moment| m.iter().zip(&truth).map(|(a, b)| norm(sub(a.x, b.x))).sum::<f64>() / 8.0;

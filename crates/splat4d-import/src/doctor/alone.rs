@@ -1,7 +1,7 @@
 //! What a camera's own images say.
 
-use super::finding::{GAMMA, SHARPNESS, Told, grade, unit, worse};
-use super::look::Seen;
+use super::finding::{FindingList, GAMMA, SHARPNESS, grade, unit, worse};
+use super::look::CameraObservations;
 use super::{Grade, Report};
 use crate::sync::median;
 use splat4d_train::capture::Capture;
@@ -22,7 +22,7 @@ const DARK: f64 = 20.0;
 const BLOCKS: [f64; 2] = [2.5, 5.0];
 
 /// What a camera's own images say.
-pub(super) fn alone(capture: &Capture, camera: usize, s: &Seen, report: &mut Report) {
+pub(super) fn alone(capture: &Capture, camera: usize, s: &CameraObservations, report: &mut Report) {
     let name = capture.cameras[camera].name.clone();
     let who = Some(name.as_str());
     if let (Some(moved), Some(stand)) = (s.moved, s.stands.first()) {
@@ -33,7 +33,7 @@ pub(super) fn alone(capture: &Capture, camera: usize, s: &Seen, report: &mut Rep
             let what = format!("Camera {name} moved: what stands still went {far:.1} px (of 1920) from first to last.");
             let words =
                 ("Everything it shows is doubled.", "Fasten it; cut the take where it was pushed, or leave it out.");
-            Told { report }.add((g, "moved"), who, (far, "px"), what, words);
+            FindingList { report }.add((g, "moved"), who, (far, "px"), what, words);
         }
     }
     if let Some(ratio) = s.focus {
@@ -46,10 +46,10 @@ pub(super) fn alone(capture: &Capture, camera: usize, s: &Seen, report: &mut Rep
                 "Texture that is soft in one part of the take, and a lens that is not one.",
                 "Lock focus; cut the take where it changed, or leave the camera out.",
             );
-            Told { report }.add((g, "focus"), who, (ratio, "times"), what, words);
+            FindingList { report }.add((g, "focus"), who, (ratio, "times"), what, words);
         }
     }
-    let mut told = Told { report };
+    let mut told = FindingList { report };
     let frames = capture.frames.iter().filter(|f| f.camera == camera).count();
     if frames >= 4 && capture.cameras[camera].fixed {
         let missing = s.clock.missing();

@@ -1,9 +1,9 @@
 //! What cameras say of each other: poses, exposure, white balance and sharpness, by features that two of them see.
 
-use super::finding::{AGREE, GAMMA, MATCHES, SHARPNESS, Told, grade, unit};
-use super::look::{Seen, Stand, detail};
+use super::finding::{AGREE, FindingList, GAMMA, MATCHES, SHARPNESS, grade, unit};
+use super::look::{CameraObservations, Stand, detail};
 use super::{Options, PairReport, Report};
-use crate::sfm::pictures::{Feature, Sight};
+use crate::sfm::pictures::{CameraView, Feature};
 use crate::sfm::tracks::{Pairing, links};
 use crate::sync::epipolar::{fundamental, sampson};
 use crate::sync::grey::Grey;
@@ -41,7 +41,7 @@ fn planes(stand: &Stand) -> Planes<f32> {
     Planes::from_interleaved(3, stand.picture.height, stand.picture.width, &values)
 }
 
-fn sight(name: &str, number: usize, stand: &Stand, most: usize) -> Sight {
+fn sight(name: &str, number: usize, stand: &Stand, most: usize) -> CameraView {
     /// Least contrast of a feature, as structure from motion takes it.
     const CONTRAST: f64 = 0.004;
     let found = find(&grey(&planes(stand)), Limits { contrast: CONTRAST, most }, &|_, _| true);
@@ -52,7 +52,7 @@ fn sight(name: &str, number: usize, stand: &Stand, most: usize) -> Sight {
         descriptor: f.descriptor,
         color: [0; 3],
     };
-    Sight {
+    CameraView {
         name: name.to_owned(),
         size: [stand.picture.width, stand.picture.height],
         factor: 1.0,
@@ -101,7 +101,7 @@ struct Pair {
 
 fn pair(
     stands: &[(usize, &Stand)],
-    sights: &[Sight],
+    sights: &[CameraView],
     [a, b]: [usize; 2],
     matches: &[([usize; 2], f32)],
 ) -> Option<Pair> {
@@ -179,7 +179,7 @@ fn poses(pairs: &[Pair], stands: &[(usize, &Stand)], camera: usize) -> Option<(f
 
 pub(super) fn between(
     capture: &Capture,
-    seen: &[Seen],
+    seen: &[CameraObservations],
     options: &Options,
     report: &mut Report,
     progress: &mut Progress<'_>,
@@ -188,7 +188,7 @@ pub(super) fn between(
         seen.iter().enumerate().flat_map(|(c, s)| s.stands.iter().map(move |stand| (c, stand))).collect();
     progress.phase("features", 0, stands.len());
     let name = |c: usize| capture.cameras[c].name.as_str();
-    let sights: Vec<Sight> =
+    let sights: Vec<CameraView> =
         stands.par_iter().enumerate().map(|(k, (c, s))| sight(name(*c), k, s, options.features)).collect();
     let found = links(&sights, Pairing::All, 0, progress);
     let pairs: Vec<Pair> = found.iter().filter_map(|l| pair(&stands, &sights, l.sights, &l.matches)).collect();
@@ -227,7 +227,7 @@ pub(super) fn between(
             row.sharpness = sharp;
         }
         let (exposure, sharpness) = (row.exposure, row.sharpness);
-        let mut told = Told { report };
+        let mut told = FindingList { report };
         if let (Some(off), Some(own)) = (off, own)
             && let Some(g) = grade(off, EPIPOLAR).min(grade(own, OWN_PIXELS))
         {

@@ -2,8 +2,8 @@
 //! is named: the first of two is a warning, the second is bad. Those of flicker, dark and clipped images are chosen
 //! by eye.
 
-use super::finding::{Told, grade};
-use super::look::Seen;
+use super::finding::{FindingList, grade};
+use super::look::CameraObservations;
 use super::{CameraReport, Finding, Grade, Options, Report, alone, between, clocks, volume};
 use splat4d::scene::Camera;
 use splat4d_train::capture::Capture;
@@ -24,7 +24,7 @@ const MOST: f64 = 0.5;
 /// Makes all checks and adds what they find.
 pub(super) fn all(
     capture: &Capture,
-    seen: &[Seen],
+    seen: &[CameraObservations],
     options: &Options,
     report: &mut Report,
     progress: &mut Progress<'_>,
@@ -86,7 +86,7 @@ fn gather(report: &mut Report, cameras: usize) {
 }
 
 /// What the whole rig says.
-fn take(capture: &Capture, seen: &[Seen], report: &mut Report) {
+fn take(capture: &Capture, seen: &[CameraObservations], report: &mut Report) {
     let fixed: Vec<usize> =
         (0..seen.len()).filter(|&c| capture.cameras[c].fixed && !seen[c].stands.is_empty()).collect();
     if fixed.len() < seen.len() {
@@ -99,7 +99,7 @@ fn take(capture: &Capture, seen: &[Seen], report: &mut Report) {
         let g = if fixed.len() < CAMERAS[1] { Grade::Bad } else { Grade::Warning };
         let word = if g == Grade::Bad { "poor" } else { "limited" };
         let what = format!("{} cameras: what can be learnt is {word}.", fixed.len());
-        Told { report }.add(
+        FindingList { report }.add(
             (g, "cameras"),
             None,
             (fixed.len() as f64, "cameras"),
@@ -124,7 +124,7 @@ fn take(capture: &Capture, seen: &[Seen], report: &mut Report) {
         if let Some(g) = grade(nearest, ANGLE) {
             let name = &capture.cameras[fixed[k]].name;
             let what = format!("Camera {name} stands {nearest:.0}° from its nearest neighbour.");
-            Told { report }.add(
+            FindingList { report }.add(
                 (g.min(Grade::Warning), "angle"),
                 Some(name),
                 (nearest, "°"),
@@ -136,12 +136,12 @@ fn take(capture: &Capture, seen: &[Seen], report: &mut Report) {
     if fixed.iter().all(|&c| seen[c].row < 2) {
         return;
     }
-    let own: Vec<&Seen> = fixed.iter().map(|&c| &seen[c]).collect();
+    let own: Vec<&CameraObservations> = fixed.iter().map(|&c| &seen[c]).collect();
     volume_of(&own, target, report);
 }
 
 /// What three cameras see of what moves about a place.
-pub(super) fn volume_of(seen: &[&Seen], target: [f64; 3], report: &mut Report) {
+pub(super) fn volume_of(seen: &[&CameraObservations], target: [f64; 3], report: &mut Report) {
     report.seen_by_three = volume::seen_by_three(seen, target);
     let Some(share) = report.seen_by_three else {
         report
@@ -153,7 +153,7 @@ pub(super) fn volume_of(seen: &[&Seen], target: [f64; 3], report: &mut Report) {
         let what = format!("Three cameras see {:.0} % of the space in which something moves.", 100.0 * share);
         let words =
             ("Moving things that dissolve between the views.", "Turn the cameras to the action, or film with more.");
-        Told { report }.add((g, "volume"), None, (100.0 * share, "%"), what, words);
+        FindingList { report }.add((g, "volume"), None, (100.0 * share, "%"), what, words);
     }
 }
 
@@ -168,7 +168,7 @@ pub(super) fn memory(needed: u64, there: Option<u64>, report: &mut Report) {
     if let Some(g) = grade(needed as f64 / there.max(1) as f64, MEMORY) {
         let mega = |bytes: u64| bytes.div_ceil(1 << 20);
         let what = format!("Training takes about {} MB of memory, and there are {}.", mega(needed), mega(there));
-        Told { report }.add(
+        FindingList { report }.add(
             (g, "memory"),
             None,
             (mega(needed) as f64, "MB"),

@@ -1,8 +1,8 @@
 //! Clocks of cameras against each other, by what moves.
 
 use super::Report;
-use super::finding::{AGREE, MATCHES, Told, grade, unit};
-use super::look::Seen;
+use super::finding::{AGREE, FindingList, MATCHES, grade, unit};
+use super::look::CameraObservations;
 use super::shutter::{self, Pair};
 use crate::sync::epipolar::{Range, fundamental, lag, neighbours};
 use crate::sync::graph::{Evidence, Kind, solve};
@@ -27,7 +27,7 @@ const NEIGHBOURS: usize = 3;
 const WITHIN: f64 = 10.0;
 const WITHIN_PART: f64 = 1.0 / 3.0;
 
-pub(super) fn clocks(capture: &Capture, seen: &[Seen], report: &mut Report, progress: &mut Progress<'_>) {
+pub(super) fn clocks(capture: &Capture, seen: &[CameraObservations], report: &mut Report, progress: &mut Progress<'_>) {
     let ready: Vec<usize> =
         (0..seen.len()).filter(|&c| capture.cameras[c].fixed && seen[c].tracks.len() >= MATCHES).collect();
     if ready.len() < 2 {
@@ -100,7 +100,7 @@ pub(super) fn clocks(capture: &Capture, seen: &[Seen], report: &mut Report, prog
                 1e3 * sigma
             );
             let remedy = format!("Add {:+.4} s to its times.", off);
-            Told { report }.add(
+            FindingList { report }.add(
                 (g, "offset"),
                 Some(name),
                 (1e3 * off, "ms"),
@@ -124,7 +124,7 @@ pub(super) fn clocks(capture: &Capture, seen: &[Seen], report: &mut Report, prog
                 "What moves fast leans, and differently in each view.",
                 "Film at a higher rate: it reads its rows faster.",
             );
-            Told { report }.add((g, "rolling-shutter"), Some(name), (1e3 * seconds, "ms"), what, words);
+            FindingList { report }.add((g, "rolling-shutter"), Some(name), (1e3 * seconds, "ms"), what, words);
         }
     }
 }

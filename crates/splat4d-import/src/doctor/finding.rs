@@ -32,11 +32,11 @@ pub(super) fn unit(view: &Camera) -> f64 {
 }
 
 /// Where findings go.
-pub(super) struct Told<'a> {
+pub(super) struct FindingList<'a> {
     pub(super) report: &'a mut Report,
 }
 
-impl Told<'_> {
+impl FindingList<'_> {
     pub(super) fn add(
         &mut self,
         (grade, check): (Grade, &'static str),

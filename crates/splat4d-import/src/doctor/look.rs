@@ -33,7 +33,7 @@ pub(super) struct Stand {
 
 /// What was seen of a camera.
 #[derive(Default)]
-pub(super) struct Seen {
+pub(super) struct CameraObservations {
     pub(super) stands: Vec<Stand>,
     /// Corners that move, by the camera's clock.
     pub(super) tracks: Vec<Track>,
@@ -187,12 +187,17 @@ fn moved(ends: [&[Rgb8]; 2]) -> Option<f64> {
     (ways.len() >= CORNERS).then(|| median(&mut ways))
 }
 
-pub(super) fn camera(capture: &Capture, store: &ImageStore, camera: usize, options: &Options) -> Result<Seen> {
+pub(super) fn camera(
+    capture: &Capture,
+    store: &ImageStore,
+    camera: usize,
+    options: &Options,
+) -> Result<CameraObservations> {
     let mut frames: Vec<usize> = (0..capture.frames.len()).filter(|&i| capture.frames[i].camera == camera).collect();
     frames.sort_by(|&i, &j| capture.frames[i].time.0.total_cmp(&capture.frames[j].time.0));
     let fixed = capture.cameras[camera].fixed;
     let load = |i: usize| Ok::<Rgb8, crate::Error>(bytes(&store.load(i)?.to_picture().color));
-    let mut seen = Seen::default();
+    let mut seen = CameraObservations::default();
     let size = |i: usize| [capture.frames[i].source.width, capture.frames[i].source.height];
     seen.sizes = frames.iter().map(|&i| size(i)).collect();
     seen.sizes.sort_unstable();

@@ -2,7 +2,7 @@
 //! what
 //! moves leaves its epipolar line by as much.
 
-use super::look::Seen;
+use super::look::CameraObservations;
 use crate::sync::epipolar::{EpipolarLag, sampson};
 use crate::sync::{NORMAL_MAD, median};
 use splat4d::math::cholesky::Cholesky;
@@ -41,7 +41,7 @@ struct Sighting {
 /// ρ: row from −½ to ½), so that at `s = t + lag` the distance from the line and its speed times what is missing sum to nothing, to first order. Least
 /// squares over all r and a correction of each lag; deviations by clusters of tracks (White 1980), for what is wrong with a track
 /// is wrong at all of its times.
-pub(super) fn shutters(pairs: &[Pair], seen: &[Seen], interval: f64) -> Vec<Option<[f64; 2]>> {
+pub(super) fn shutters(pairs: &[Pair], seen: &[CameraObservations], interval: f64) -> Vec<Option<[f64; 2]>> {
     let clusters: Vec<(usize, Vec<Sighting>)> = (pairs.iter().enumerate())
         .flat_map(|(k, p)| p.found.matches.iter().map(move |m| (k, sightings(p, *m, seen, STEP * interval))))
         .filter(|(_, s)| !s.is_empty())
@@ -100,7 +100,7 @@ pub(super) fn shutters(pairs: &[Pair], seen: &[Seen], interval: f64) -> Vec<Opti
     (0..n).map(|c| (tracks(c) >= TRACKS).then(|| [values[c], deviations[c]])).collect()
 }
 
-fn sightings(pair: &Pair, [i, j]: [usize; 2], seen: &[Seen], step: f64) -> Vec<Sighting> {
+fn sightings(pair: &Pair, [i, j]: [usize; 2], seen: &[CameraObservations], step: f64) -> Vec<Sighting> {
     let [a, b] = pair.cameras;
     let (one, other) = (&seen[a].tracks[i], &seen[b].tracks[j]);
     let height = |c: usize| seen[c].stands[0].view.height as f64;

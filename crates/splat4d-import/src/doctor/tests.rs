@@ -1,7 +1,7 @@
 //! Each fault drawn once, and a clean take: a room of random spots that six cameras see, and balls that move in it.
 
 use super::clocks::clocks;
-use super::look::{Seen, Stand};
+use super::look::{CameraObservations, Stand};
 use super::{CameraReport, Grade, Options, Report, check, examine, volume};
 use crate::sync::tracks::Track;
 use crate::video::Clock;
@@ -315,7 +315,7 @@ fn a_camera_apart_from_the_others_is_found() {
 }
 
 /// What cameras see of a ball: the cells in which it is.
-fn seen_ball(view: Camera, place: [f64; 3]) -> Seen {
+fn seen_ball(view: Camera, place: [f64; 3]) -> CameraObservations {
     let (across, down) = (view.width.div_ceil(super::look::CELL), view.height.div_ceil(super::look::CELL));
     let mut cells = vec![false; across * down];
     for y in 0..down {
@@ -326,7 +326,11 @@ fn seen_ball(view: Camera, place: [f64; 3]) -> Seen {
             cells[y * across + x] = (pixel[0] - middle[0]).hypot(pixel[1] - middle[1]) < radius;
         }
     }
-    Seen { stands: vec![Stand { view, picture: Rgb8::default() }], motion: vec![cells; 2], ..Seen::default() }
+    CameraObservations {
+        stands: vec![Stand { view, picture: Rgb8::default() }],
+        motion: vec![cells; 2],
+        ..CameraObservations::default()
+    }
 }
 
 #[test]
@@ -339,10 +343,10 @@ fn the_share_of_what_moves_that_three_cameras_see_is_measured() {
         view
     };
     let rig = |view: &dyn Fn(usize) -> Camera| (0..CAMERAS).map(|c| seen_ball(view(c), place)).collect::<Vec<_>>();
-    let share = |rig: &[Seen]| volume::seen_by_three(&rig.iter().collect::<Vec<_>>(), place);
+    let share = |rig: &[CameraObservations]| volume::seen_by_three(&rig.iter().collect::<Vec<_>>(), place);
     assert_eq!(share(&rig(&camera)), Some(1.0));
     assert_eq!(share(&rig(&away)), Some(0.0));
-    let told = |rig: &[Seen]| {
+    let told = |rig: &[CameraObservations]| {
         let mut report = Report::default();
         check::volume_of(&rig.iter().collect::<Vec<_>>(), place, &mut report);
         report.findings.iter().map(|f| (f.check, f.grade)).collect::<Vec<_>>()
@@ -387,15 +391,15 @@ fn timed(late: f64, shutter: f64) -> Report {
     let capture = write(folder.path(), &moment, 0.0, CAMERAS);
     let seen = |c: usize| {
         let own = |value: f64| if c == ILL { value } else { 0.0 };
-        Seen {
+        CameraObservations {
             stands: vec![Stand { view: camera(c), picture: Rgb8::default() }],
             tracks: tracks(c, own(late), own(shutter)),
             clock: Clock { interval: 1.0 / FPS, ..Clock::default() },
             row: 60,
-            ..Seen::default()
+            ..CameraObservations::default()
         }
     };
-    let seen: Vec<Seen> = (0..CAMERAS).map(seen).collect();
+    let seen: Vec<CameraObservations> = (0..CAMERAS).map(seen).collect();
     let cameras = (0..CAMERAS).map(|_| CameraReport::default()).collect();
     let mut report = Report { cameras, ..Report::default() };
     clocks(&capture, &seen, &mut report, &mut Progress(&mut |_| {}));

@@ -1,9 +1,9 @@
 //! The share of the space in which something moves that three cameras see.
 
-use super::look::{CELL, Seen};
+use super::look::{CELL, CameraObservations};
 use splat4d::math::se3::{norm, sub};
 use splat4d::scene::Camera;
-use splat4d_train::vision::triangulate::{self, Sight};
+use splat4d_train::vision::triangulate::{self, PixelObservation};
 
 /// Cells of the cube along each side.
 const SIDE: usize = 40;
@@ -19,13 +19,14 @@ const LEAST: usize = 60;
 /// Where so many cameras look, by their images' middles.
 pub(super) fn target(views: &[&Camera]) -> Option<[f64; 3]> {
     let middle = |v: &&Camera| [0.5 * v.width as f64, 0.5 * v.height as f64];
-    let sights: Vec<Sight<'_>> = views.iter().map(|v| Sight { camera: v, pixel: middle(v) }).collect();
+    let sights: Vec<PixelObservation<'_>> =
+        views.iter().map(|v| PixelObservation { camera: v, pixel: middle(v) }).collect();
     triangulate::triangulate(&sights)
 }
 
 /// Of the visual hull of what moves (Laurentini 1994; moment by moment, as far as two cameras see it) the part that three see;
 /// None where too little moves to tell.
-pub(super) fn seen_by_three(seen: &[&Seen], target: [f64; 3]) -> Option<f64> {
+pub(super) fn seen_by_three(seen: &[&CameraObservations], target: [f64; 3]) -> Option<f64> {
     let views: Vec<&Camera> = seen.iter().map(|s| &s.stands[0].view).collect();
     let mut far: Vec<f64> = views.iter().map(|v| norm(sub(v.center(), target))).collect();
     let half = HALF * crate::sync::median(&mut far);

@@ -23,7 +23,7 @@ const SHORTEST: usize = 30;
 const NEIGHBOURS: usize = 3;
 
 /// A camera that stands still, as a pinhole camera, and corners that move in it, by its own clock.
-struct Seen {
+struct StandingCamera {
     camera: Camera,
     tracks: Vec<Track>,
     frames: usize,
@@ -69,7 +69,7 @@ fn measured(stored: &Stored<'_>, clock: &Solution, progress: &mut Progress<'_>) 
     Ok(pairs.par_iter().filter_map(of).collect())
 }
 
-fn camera(stored: &Stored<'_>, c: usize, middle: f64) -> Result<Option<Seen>> {
+fn camera(stored: &Stored<'_>, c: usize, middle: f64) -> Result<Option<StandingCamera>> {
     let Some((known, pose)) = stored.known(c).and_then(|k| Some((k, k.pose?))) else { return Ok(None) };
     let shots = &stored.pictures[c].shots;
     let count = shots.len();
@@ -96,5 +96,5 @@ fn camera(stored: &Stored<'_>, c: usize, middle: f64) -> Result<Option<Seen>> {
         track.samples = track.samples.iter().map_while(|(t, p)| Some((*t, straight.pixel(*p)?))).collect();
     }
     tracks.retain(|t| !t.samples.is_empty());
-    Ok(Some(Seen { camera: straight.camera(pose, size), tracks, frames: row }))
+    Ok(Some(StandingCamera { camera: straight.camera(pose, size), tracks, frames: row }))
 }

@@ -258,12 +258,12 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     if stop() {
         return Err(stopped());
     }
-    let found = Found { stored: &stored, given, solved, evidence: &evidence, told: &told, moves };
+    let found = Solution { stored: &stored, given, solved, evidence: &evidence, told: &told, moves };
     finish(request, found, &mut corrections, report, progress)
 }
 
 /// All that was found.
-struct Found<'a> {
+struct Solution<'a> {
     stored: &'a stored::Stored<'a>,
     given: Option<given::Given>,
     solved: poses::Solved,
@@ -458,13 +458,13 @@ fn open(request: &Request) -> Result<Vec<Camera>> {
 /// Writes points, capture, corrections and report.
 fn finish(
     request: &Request,
-    found: Found<'_>,
+    found: Solution<'_>,
     corrections: &mut Corrections,
     mut report: Report,
     progress: &mut Progress<'_>,
 ) -> Result<Report> {
     let folder = &request.folder;
-    let Found { stored, given, mut solved, evidence, told, moves } = found;
+    let Solution { stored, given, mut solved, evidence, told, moves } = found;
     let pictures = stored.pictures;
     let posed = given.as_ref().is_some_and(|g| g.posed);
     // COLMAP's own axes and unit are those of some camera.

@@ -13,7 +13,7 @@ use splat4d::math::se3::{add, cross, dot, norm, normalize, scale, sub};
 use splat4d::scene::Camera;
 use splat4d_train::event::Progress;
 use splat4d_train::vision::raster::grey;
-use splat4d_train::vision::triangulate::{Sight, angle_at, triangulate};
+use splat4d_train::vision::triangulate::{PixelObservation, angle_at, triangulate};
 
 /// Moments at which fixed cameras look for tags, and frames in which a moving one does.
 const MOMENTS: usize = 12;
@@ -32,7 +32,7 @@ const ASKEW: f64 = 0.985;
 
 /// What tags tell.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Found {
+pub(super) struct TagWorld {
     /// Metres of the unit that lengths had.
     pub scale: f64,
     /// Upwards, and the middle of the tag with the lowest number, metres.
@@ -43,7 +43,7 @@ pub(super) struct Found {
     pub spread: f64,
 }
 
-impl Found {
+impl TagWorld {
     pub(super) fn about(&self) -> String {
         let many = |n: usize, one: &str| if n == 1 { format!("1 {one}") } else { format!("{n} {one}s") };
         format!(
@@ -56,7 +56,7 @@ impl Found {
 }
 
 /// A tag as a camera sees it.
-struct Seen {
+struct TagView {
     camera: Camera,
     tag: Tag,
     /// Pixels that a corner may lie off.
@@ -77,15 +77,15 @@ pub(super) fn measured(
     stored: &Stored<'_>,
     solved: &Solved,
     progress: &mut Progress<'_>,
-) -> Result<Found> {
+) -> Result<TagWorld> {
     let clock = stored.on(&solved.offsets);
     // What each look is: a camera, a frame, and the moment that it belongs to.
     let looks = if solved.moving { walked(&clock, solved) } else { stood(&clock, solved) };
-    let mut seen: Vec<(usize, Seen)> = Vec::new();
+    let mut seen: Vec<(usize, TagView)> = Vec::new();
     const AT_ONCE: usize = 8;
     for (k, some) in looks.chunks(AT_ONCE).enumerate() {
         progress.phase("looking for tags", k * AT_ONCE, looks.len());
-        let found: Vec<Vec<(usize, Seen)>> =
+        let found: Vec<Vec<(usize, TagView)>> =
             some.par_iter().map(|look| look.tags(board, &clock, solved)).collect::<Result<_>>()?;
         seen.extend(found.into_iter().flatten());
     }
@@ -105,14 +105,14 @@ pub(super) fn measured(
     })
 }
 
-struct Look {
+struct TagImage {
     camera: usize,
     frame: usize,
     moment: usize,
 }
 
 /// Fixed cameras look at moments that they share: the board may be carried about.
-fn stood(stored: &Stored<'_>, solved: &Solved) -> Vec<Look> {
+fn stood(stored: &Stored<'_>, solved: &Solved) -> Vec<TagImage> {
     let cameras: Vec<usize> = (0..stored.cameras()).filter(|&c| solved.cameras[c].is_ok()).collect();
     let ends = |c: usize| (stored.time(c, 0), stored.time(c, stored.frames(c) - 1));
     let first = cameras.iter().map(|&c| ends(c).0).fold(f64::INFINITY, f64::min);
@@ -126,7 +126,7 @@ fn stood(stored: &Stored<'_>, solved: &Solved) -> Vec<Look> {
             let interval = stored.pictures[camera].clock.interval;
             // One image is of every moment.
             let near = |k: &usize| stored.frames(camera) == 1 || off(k) <= NEAR * interval;
-            out.extend(nearest.filter(near).map(|frame| Look { camera, frame, moment }));
+            out.extend(nearest.filter(near).map(|frame| TagImage { camera, frame, moment }));
         }
     }
     out.dedup_by_key(|l| (l.camera, l.frame, l.moment));
@@ -134,19 +134,19 @@ fn stood(stored: &Stored<'_>, solved: &Solved) -> Vec<Look> {
 }
 
 /// Moving cameras look from everywhere at a board that stands.
-fn walked(stored: &Stored<'_>, solved: &Solved) -> Vec<Look> {
+fn walked(stored: &Stored<'_>, solved: &Solved) -> Vec<TagImage> {
     let mut out = Vec::new();
     for (camera, stand) in solved.cameras.iter().enumerate() {
         let Ok(stand) = stand else { continue };
         let known: Vec<usize> = (0..stored.frames(camera)).filter(|&k| stand.poses[k].is_some()).collect();
         let count = known.len().min(4 * MOMENTS);
-        out.extend((0..count).map(|k| Look { camera, frame: known[k * known.len() / count], moment: 0 }));
+        out.extend((0..count).map(|k| TagImage { camera, frame: known[k * known.len() / count], moment: 0 }));
     }
     out
 }
 
-impl Look {
-    fn tags(&self, board: &Board, stored: &Stored<'_>, solved: &Solved) -> Result<Vec<(usize, Seen)>> {
+impl TagImage {
+    fn tags(&self, board: &Board, stored: &Stored<'_>, solved: &Solved) -> Result<Vec<(usize, TagView)>> {
         let Ok(stand) = &solved.cameras[self.camera] else { return Ok(Vec::new()) };
         let Some(pose) = stand.poses.get(if stand.fixed { 0 } else { self.frame }).copied().flatten() else {
             return Ok(Vec::new());
@@ -160,22 +160,26 @@ impl Look {
         let straightened = |tag: Tag| {
             let corners = tag.corners.map(|c| straight.pixel(c));
             let [Some(a), Some(b), Some(c), Some(d)] = corners else { return None };
-            Some((self.moment, Seen { camera: camera.clone(), tag: Tag { corners: [a, b, c, d], ..tag }, tolerance }))
+            Some((
+                self.moment,
+                TagView { camera: camera.clone(), tag: Tag { corners: [a, b, c, d], ..tag }, tolerance },
+            ))
         };
         Ok(board::tags(&picture, &board.family).into_iter().filter_map(straightened).collect())
     }
 }
 
 /// Tags where two cameras and more see them at one moment, each moment for itself.
-fn placed(seen: &[(usize, Seen)]) -> Vec<Placed> {
+fn placed(seen: &[(usize, TagView)]) -> Vec<Placed> {
     let mut keys: Vec<(usize, usize)> = seen.iter().map(|(m, s)| (*m, s.tag.id)).collect();
     keys.sort_unstable();
     keys.dedup();
     let of = |&(moment, id): &(usize, usize)| {
-        let about: Vec<&Seen> = seen.iter().filter(|(m, s)| *m == moment && s.tag.id == id).map(|(_, s)| s).collect();
+        let about: Vec<&TagView> =
+            seen.iter().filter(|(m, s)| *m == moment && s.tag.id == id).map(|(_, s)| s).collect();
         let corner = |k: usize| {
-            let sights: Vec<Sight<'_>> =
-                about.iter().map(|s| Sight { camera: &s.camera, pixel: s.tag.corners[k] }).collect();
+            let sights: Vec<PixelObservation<'_>> =
+                about.iter().map(|s| PixelObservation { camera: &s.camera, pixel: s.tag.corners[k] }).collect();
             let x = triangulate(&sights)?;
             let near = sights.iter().zip(&about).all(|(s, a)| s.error(x) <= a.tolerance);
             let centers: Vec<[f64; 3]> = sights.iter().map(|s| s.camera.center()).collect();
@@ -223,7 +227,7 @@ impl Placed {
 }
 
 /// What placed tags tell.
-fn of(board: &Board, placed: &[Placed], held: [f64; 3]) -> Result<Found> {
+fn of(board: &Board, placed: &[Placed], held: [f64; 3]) -> Result<TagWorld> {
     let contradicts = |what: String| {
         Error::input(what).remedy(
             "Give the length of one tag's dark square; if there are tags of two sizes, cover one kind; let the board rest while it is \
@@ -260,7 +264,7 @@ fn of(board: &Board, placed: &[Placed], held: [f64; 3]) -> Result<Found> {
         });
         Ok((mean(&near), origin))
     });
-    Ok(Found { scale, frame: frame.transpose()?, tags: ids.len(), times: square.len(), spread })
+    Ok(TagWorld { scale, frame: frame.transpose()?, tags: ids.len(), times: square.len(), spread })
 }
 
 #[cfg(test)]
@@ -287,13 +291,13 @@ mod tests {
         };
         let puts = [put(4, -0.4, 0.2, 0.3), put(9, 0.2, 0.1, 0.3)];
         let up = world([0.0, 0.0, unit]);
-        let seen = |puts: &[Put]| -> Vec<(usize, Seen)> {
+        let seen = |puts: &[Put]| -> Vec<(usize, TagView)> {
             let mut all = Vec::new();
             for eye in [[-1.0, -1.2, 1.6], [0.1, -1.5, 1.5], [1.1, -1.1, 1.7]] {
                 let pose = Se3::look_at(world(eye), world([0.0; 3]), up);
                 let camera = Camera::with_fov_y(pose, 0.7, 320, 240);
                 let found = board::tags(&drawn(&camera, puts), &family);
-                all.extend(found.into_iter().map(|tag| (0, Seen { camera: camera.clone(), tag, tolerance: 0.5 })));
+                all.extend(found.into_iter().map(|tag| (0, TagView { camera: camera.clone(), tag, tolerance: 0.5 })));
             }
             all
         };
@@ -310,7 +314,7 @@ mod tests {
         let mixed = seen(&[put(4, -0.4, 0.2, 0.3), put(9, 0.2, 0.1, 0.4)]);
         assert!(of(&board, &placed(&mixed), up).is_err() || placed(&mixed).len() < 2);
         // One camera places nothing.
-        let alone: Vec<(usize, Seen)> = looked.into_iter().take(2).collect();
+        let alone: Vec<(usize, TagView)> = looked.into_iter().take(2).collect();
         assert!(placed(&alone).is_empty());
         // Against a wall, whichever edge was printed as the upper one, it is the one that cameras hold upwards.
         let hung = Placed { id: 0, corners: [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, 0.0, 0.0]] };

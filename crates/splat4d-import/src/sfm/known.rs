@@ -2,7 +2,7 @@
 
 use super::lens::{Known, Lens as Plain, unit};
 use super::mapper::{Ground, Mapped, Mapping};
-use super::pictures::{Feature, Sight};
+use super::pictures::{CameraView, Feature};
 use super::tracks::{self, Link};
 use crate::sync::epipolar::{fundamental, sampson};
 use splat4d::math::Se3;
@@ -71,7 +71,7 @@ impl Straight {
 /// What moves lies next to its epipolar lines as long as clocks are off: first clocks are found of what looks alike,
 /// within wide
 /// bounds; then points of what lies on the lines, which it does at any clock, so that they tell none.
-pub(crate) fn about(sights: &[Sight], links: &[Link], how: &Mapping, progress: &mut Progress<'_>) -> Mapped {
+pub(crate) fn about(sights: &[CameraView], links: &[Link], how: &Mapping, progress: &mut Progress<'_>) -> Mapped {
     /// Of the tolerance: two frames of what is followed at all, in images 1920 across.
     const WIDE: f64 = 8.0;
     /// Of what moves and was matched, the least share that must fit a clock: of matches by chance few do.
@@ -120,8 +120,8 @@ const TELL: usize = 3;
 ///
 /// Links must have been found without these poses. Distances are epipolar, as the doctor takes them: the lower quartile of a
 /// pair, as the median that it implies, for chance matches only add large ones; of a camera the second least of its pairs.
-fn errors(sights: &[Sight], links: &[Link]) -> Vec<Option<f64>> {
-    let camera = |s: &Sight| {
+fn errors(sights: &[CameraView], links: &[Link]) -> Vec<Option<f64>> {
+    let camera = |s: &CameraView| {
         let lens = Plain::plain(s.focal?, s.size[0], s.size[1]);
         Some(lens.pinhole(s.pose?, s.size[0], s.size[1]))
     };

@@ -29,7 +29,7 @@ pub struct Lens {
 }
 
 /// A pixel position and how it changes.
-pub(crate) struct Seen {
+pub(crate) struct LensProjection {
     pub pixel: [f64; 2],
     /// With the place in the camera's axes.
     pub by_place: [[f64; 3]; 2],
@@ -54,7 +54,7 @@ impl Lens {
     }
 
     /// As [`Lens::project`], with derivatives.
-    pub(crate) fn project_by(&self, p: [f64; 3]) -> Option<Seen> {
+    pub(crate) fn project_by(&self, p: [f64; 3]) -> Option<LensProjection> {
         let pixel = self.project(p)?;
         let (f, k, z) = (self.focal, self.k1, p[2]);
         let (x, y) = (p[0] / z, p[1] / z);
@@ -65,7 +65,7 @@ impl Lens {
             [[f * (d + 2.0 * k * x * x), f * 2.0 * k * x * y], [f * 2.0 * k * x * y, f * (d + 2.0 * k * y * y)]];
         let by_place = [[uu / z, uv / z, -(uu * x + uv * y) / z], [vu / z, vv / z, -(vu * x + vv * y) / z]];
         let by_lens = [[f * d * x, f * r2 * x], [f * d * y, f * r2 * y]];
-        Some(Seen { pixel, by_place, by_lens })
+        Some(LensProjection { pixel, by_place, by_lens })
     }
 
     /// The direction seen at a pixel, depth 1 (camera axes).

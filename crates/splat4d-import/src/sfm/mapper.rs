@@ -5,7 +5,7 @@ mod strays;
 
 use super::adjust::{Bundle, Free, Priors, Settings, Sighting, View, adjust};
 use super::lens::{Lens, off, unit};
-use super::pictures::{Feature, Sight};
+use super::pictures::{CameraView, Feature};
 use super::resection::{Known, Placed, place, polish};
 use super::tracks::{self, Link, Track, about_middle};
 use super::two_view::{Pair, Relative, relative};
@@ -13,7 +13,7 @@ use rayon::prelude::*;
 use splat4d::math::{Rng, Se3};
 use splat4d::scene::Camera;
 use splat4d_train::event::Progress;
-use splat4d_train::vision::triangulate::{Sight as Ray, Transfer, angle_at, triangulate};
+use splat4d_train::vision::triangulate::{PixelObservation as Ray, Transfer, angle_at, triangulate};
 
 /// How cameras are placed.
 #[derive(Clone, Debug, PartialEq)]
@@ -98,7 +98,7 @@ struct Spot {
 /// What is known so far.
 #[derive(Clone)]
 pub(crate) struct Map<'a> {
-    sights: &'a [Sight],
+    sights: &'a [CameraView],
     tracks: &'a [Track],
     /// For each sight its tracks and its place in them.
     shows: &'a [Vec<(usize, usize)>],
@@ -123,7 +123,7 @@ pub(crate) struct Map<'a> {
 
 /// What all starts share.
 pub(crate) struct Ground<'a> {
-    pub sights: &'a [Sight],
+    pub sights: &'a [CameraView],
     pub tracks: &'a [Track],
     pub links: &'a [Link],
     pub how: &'a Mapping,
@@ -133,7 +133,7 @@ pub(crate) struct Ground<'a> {
 }
 
 impl<'a> Ground<'a> {
-    pub(crate) fn new(sights: &'a [Sight], tracks: &'a [Track], links: &'a [Link], how: &'a Mapping) -> Self {
+    pub(crate) fn new(sights: &'a [CameraView], tracks: &'a [Track], links: &'a [Link], how: &'a Mapping) -> Self {
         let mut shows = vec![Vec::new(); sights.len()];
         for (t, track) in tracks.iter().enumerate() {
             track.seen.iter().enumerate().for_each(|(k, (s, _))| shows[*s].push((t, k)));
@@ -141,7 +141,7 @@ impl<'a> Ground<'a> {
         let mut numbers: Vec<usize> = sights.iter().map(|s| s.lens).collect();
         numbers.sort_unstable();
         numbers.dedup();
-        let of = |s: &Sight| numbers.binary_search(&s.lens).expect("all numbers are there");
+        let of = |s: &CameraView| numbers.binary_search(&s.lens).expect("all numbers are there");
         Self { sights, tracks, links, how, shows, lens_of: sights.iter().map(of).collect(), lens_count: numbers.len() }
     }
 
@@ -174,7 +174,7 @@ impl<'a> Ground<'a> {
     fn rays(&self, link: usize, focal: [f64; 2]) -> Vec<Pair> {
         let link = &self.links[link];
         let [a, b] = link.sights.map(|s| &self.sights[s]);
-        let ray = |s: &Sight, f: f64, k: usize| about_middle(s, s.features[k].pixel).map(|v| v / f);
+        let ray = |s: &CameraView, f: f64, k: usize| about_middle(s, s.features[k].pixel).map(|v| v / f);
         link.matches.iter().map(|&([i, j], _)| [ray(a, focal[0], i), ray(b, focal[1], j)]).collect()
     }
 
@@ -680,7 +680,7 @@ impl Map<'_> {
             let error = off.sum::<f64>() / spot.seen.len() as f64;
             let first = &self.sights[seen[0].0].features[seen[0].1];
             let (color, moment) = (first.color, first.moment);
-            Some(Found { place: spot.place, color, moment, seen: seen.into_iter().map(|(s, _)| s).collect(), error })
+            Some(MapPoint { place: spot.place, color, moment, seen: seen.into_iter().map(|(s, _)| s).collect(), error })
         };
         Mapped {
             cameras: (0..self.sights.len()).map(of).collect(),
@@ -709,7 +709,7 @@ pub struct Stand {
 
 /// A point.
 #[derive(Clone, Debug)]
-pub struct Found {
+pub struct MapPoint {
     /// In the world.
     pub place: [f64; 3],
     /// sRGB.
@@ -728,7 +728,7 @@ pub struct Mapped {
     /// One for each sight.
     pub cameras: Vec<Result<Stand, String>>,
     /// In the order of tracks.
-    pub points: Vec<Found>,
+    pub points: Vec<MapPoint>,
     /// Of cameras whose poses were given; see [`super::Solution::contradiction`].
     pub contradiction: Vec<Option<f64>>,
     /// Of each camera, the points that move by which its clock was found.
@@ -739,7 +739,7 @@ pub struct Mapped {
 
 /// Places cameras: from several starts, the best of which is kept. `None`: no two images fit together.
 pub fn map(
-    sights: &[Sight],
+    sights: &[CameraView],
     tracks: &[Track],
     links: &[Link],
     focals: &[f64],

@@ -20,7 +20,7 @@ pub mod two_view;
 use crate::{Error, Result};
 use lens::Lens;
 use mapper::Mapping;
-use pictures::{Look, Pictures, Sight};
+use pictures::{CameraView, FeatureOptions, Pictures};
 use splat4d::math::Se3;
 use splat4d::math::se3::{norm, sub};
 use splat4d_train::event::Progress;
@@ -33,7 +33,7 @@ type Who = (usize, Option<usize>);
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Options {
     /// What features are taken from.
-    pub look: Look,
+    pub look: FeatureOptions,
     /// How cameras are placed.
     pub mapping: Mapping,
     /// Whether cameras move: then every frame is placed on its own, at most so many of them.
@@ -113,7 +113,7 @@ pub struct Solution {
 ///
 /// Errors: images that cannot be read; no two that show one scene.
 pub fn solve(pictures: &dyn Pictures, options: &Options, progress: &mut Progress<'_>) -> Result<Solution> {
-    let (who, sights, pairing): (Vec<Who>, Vec<Sight>, Pairing) = match options.walking {
+    let (who, sights, pairing): (Vec<Who>, Vec<CameraView>, Pairing) = match options.walking {
         None => {
             let sights = pictures::fixed(pictures, &options.look, progress)?;
             ((0..sights.len()).map(|c| (c, None)).collect(), sights, Pairing::All)
@@ -135,7 +135,7 @@ const WALK: Pairing = Pairing::Sequence { near: 10, every: 6 };
 
 fn solve_sights(
     who: &[Who],
-    sights: &[Sight],
+    sights: &[CameraView],
     pairing: Pairing,
     options: &Options,
     progress: &mut Progress<'_>,
@@ -161,7 +161,7 @@ fn solve_sights(
 }
 
 /// The solution whose unit is the median distance of cameras from what they see.
-fn in_units(who: &[Who], sights: &[Sight], mapped: mapper::Mapped, pairs: usize) -> Solution {
+fn in_units(who: &[Who], sights: &[CameraView], mapped: mapper::Mapped, pairs: usize) -> Solution {
     let mut distances = vec![Vec::new(); sights.len()];
     for p in &mapped.points {
         for &s in &p.seen {
@@ -175,8 +175,8 @@ fn in_units(who: &[Who], sights: &[Sight], mapped: mapper::Mapped, pairs: usize)
 }
 
 /// The solution in a unit of so many of the map's.
-fn solution(who: &[Who], sights: &[Sight], mapped: mapper::Mapped, pairs: usize, scale: f64) -> Solution {
-    let placed = |(camera, sight): (&Result<mapper::Stand, String>, &Sight)| {
+fn solution(who: &[Who], sights: &[CameraView], mapped: mapper::Mapped, pairs: usize, scale: f64) -> Solution {
+    let placed = |(camera, sight): (&Result<mapper::Stand, String>, &CameraView)| {
         camera.as_ref().map_err(Clone::clone).map(|c| Placed {
             pose: Se3 { rotation: c.pose.rotation, translation: c.pose.translation.map(|t| t * scale) },
             lens: c.lens.scaled(sight.factor),
@@ -193,7 +193,7 @@ fn solution(who: &[Who], sights: &[Sight], mapped: mapper::Mapped, pairs: usize,
         .zip(who)
         .map(|(c, &(camera, frame))| Taken { camera, frame, name: c.1.name.clone(), placed: placed(c) })
         .collect();
-    let point = |p: mapper::Found| Point {
+    let point = |p: mapper::MapPoint| Point {
         place: p.place.map(|v| v * scale),
         color: p.color,
         moment: p.moment,

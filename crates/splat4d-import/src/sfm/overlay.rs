@@ -116,7 +116,7 @@ impl Eye<'_> {
 
 /// A point in a camera's image.
 #[derive(Clone, Copy)]
-pub(super) struct Seen<'a> {
+pub(super) struct ImagePoint<'a> {
     /// The image.
     pub shown: Option<&'a Shown>,
     /// Where in it.
@@ -126,7 +126,7 @@ pub(super) struct Seen<'a> {
 }
 
 /// How fast a point moves that these see moving so fast (pixels a second); `None`: they do not tell.
-pub(super) fn speed(x: [f64; 3], seen: &[Seen<'_>], velocities: &[[f64; 2]]) -> Option<[f64; 3]> {
+pub(super) fn speed(x: [f64; 3], seen: &[ImagePoint<'_>], velocities: &[[f64; 2]]) -> Option<[f64; 3]> {
     if velocities.iter().all(|v| *v == [0.0; 2]) {
         return Some([0.0; 3]);
     }
@@ -161,7 +161,7 @@ const SLANT: f64 = 1.0;
 /// The place of every sighting that agrees with the most central one's, by number, as offsets in pixels; those that do not agree
 /// have none. The most central one itself stays. All `None`: nothing can be said. Then the same of `more` cameras, whose places
 /// are guesses.
-pub(super) fn aligned(x: [f64; 3], seen: &[Seen<'_>], more: &[Seen<'_>]) -> Vec<Option<[f64; 2]>> {
+pub(super) fn aligned(x: [f64; 3], seen: &[ImagePoint<'_>], more: &[ImagePoint<'_>]) -> Vec<Option<[f64; 2]>> {
     let toward: Vec<[f64; 3]> = seen.iter().map(|s| normalize(sub(s.eye.center(), x))).collect();
     let central = |k: usize| toward.iter().map(|t| dot(*t, toward[k])).sum::<f64>();
     let normal = normalize(std::array::from_fn(|k| toward.iter().map(|t| t[k]).sum()));
@@ -177,7 +177,7 @@ pub(super) fn aligned(x: [f64; 3], seen: &[Seen<'_>], more: &[Seen<'_>]) -> Vec<
 }
 
 /// How pixels about a point in one image lie in another one, if it stands on a plane with this normal.
-fn warp(x: [f64; 3], normal: [f64; 3], from: &Seen<'_>, to: &Seen<'_>) -> Option<[[f64; 2]; 2]> {
+fn warp(x: [f64; 3], normal: [f64; 3], from: &ImagePoint<'_>, to: &ImagePoint<'_>) -> Option<[[f64; 2]; 2]> {
     /// Pixels over which the slope is taken.
     const STEP: f64 = 2.0;
     let middle = from.eye.pixel(x)?;
@@ -203,7 +203,7 @@ struct Template {
 }
 
 impl Template {
-    fn new(of: &Seen<'_>) -> Option<Self> {
+    fn new(of: &ImagePoint<'_>) -> Option<Self> {
         let (window, place) = (of.shown?, of.place);
         let mut values = [(0.0, 0.0); SIDE * SIDE];
         for (k, v) in values.iter_mut().enumerate() {
@@ -218,7 +218,7 @@ impl Template {
     }
 
     /// How far the place of another sighting is from where its window agrees with this one.
-    fn over(&self, other: &Seen<'_>, start: [[f64; 2]; 2]) -> Option<[f64; 2]> {
+    fn over(&self, other: &ImagePoint<'_>, start: [[f64; 2]; 2]) -> Option<[f64; 2]> {
         /// Shift, warp, gain, offset.
         const N: usize = 8;
         let (window, place) = (other.shown?, other.place);
@@ -319,8 +319,8 @@ mod tests {
         let true_places: Vec<[f64; 2]> = (0..4).map(|k| eye(k).pixel(x).unwrap()).collect();
         // Those of the middle camera are right; the others are off as features are.
         let off = [[0.45, -0.3], [0.0, 0.0], [-0.35, 0.5], [0.2, 0.2]];
-        let seen: Vec<Seen<'_>> = (0..4)
-            .map(|k| Seen {
+        let seen: Vec<ImagePoint<'_>> = (0..4)
+            .map(|k| ImagePoint {
                 shown: Some(&shown[k]),
                 place: [true_places[k][0] + off[k][0], true_places[k][1] + off[k][1]],
                 eye: eye(k),
@@ -336,7 +336,7 @@ mod tests {
         }
         assert!(found[3].is_none());
         let flat = Shown::new(&Planes::new(1, 120, 160), [0, 0], 0.0);
-        let blank: Vec<Seen<'_>> = seen.iter().map(|s| Seen { shown: Some(&flat), ..*s }).collect();
+        let blank: Vec<ImagePoint<'_>> = seen.iter().map(|s| ImagePoint { shown: Some(&flat), ..*s }).collect();
         assert!(aligned(x, &blank, &[]).iter().all(Option::is_none));
     }
 
@@ -351,7 +351,8 @@ mod tests {
         let there = eyes[0].pixel(std::array::from_fn(|k| x[k] + h * v[k])).unwrap();
         let here = eyes[0].pixel(x).unwrap();
         assert!((0..2).all(|k| ((there[k] - here[k]) / h - velocities[0][k]).abs() < 1e-3));
-        let seen: Vec<Seen<'_>> = eyes.iter().map(|&eye| Seen { shown: None, place: [0.0; 2], eye }).collect();
+        let seen: Vec<ImagePoint<'_>> =
+            eyes.iter().map(|&eye| ImagePoint { shown: None, place: [0.0; 2], eye }).collect();
         let found = speed(x, &seen, &velocities).unwrap();
         assert!((0..3).all(|k| (found[k] - v[k]).abs() < 1e-9), "{found:?}");
         assert_eq!(speed(x, &seen, &[[0.0; 2]; 2]), Some([0.0; 3]));

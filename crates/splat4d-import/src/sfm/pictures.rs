@@ -60,7 +60,7 @@ pub struct Feature {
 
 /// A camera that is to be placed: all of a fixed one's images, or one frame of a moving one.
 #[derive(Clone, Debug)]
-pub struct Sight {
+pub struct CameraView {
     /// Its name in messages.
     pub name: String,
     /// Pixels across and down, of the images that features are from.
@@ -86,7 +86,7 @@ pub struct Sight {
 
 /// What features are taken from.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Look {
+pub struct FeatureOptions {
     /// Moments at which features are taken from what moves.
     pub moments: usize,
     /// Least contrast of a feature.
@@ -99,7 +99,7 @@ pub struct Look {
     pub pixels: usize,
 }
 
-impl Default for Look {
+impl Default for FeatureOptions {
     fn default() -> Self {
         // Measured on a hall with 31 cameras of 640x360: contrasts of OpenCV's 0.004 to 0.01 (divided by its three layers) and ten
         // moments map it. Poses of the bundled capture are 1.3 times as exact with 25 moments as with ten.
@@ -221,7 +221,7 @@ fn frame_length(pictures: &dyn Pictures, camera: usize) -> f64 {
 /// Cameras that do not move, one sight each.
 ///
 /// Errors: a camera without frames, images that cannot be read or change their size.
-pub fn fixed(pictures: &dyn Pictures, look: &Look, progress: &mut Progress<'_>) -> Result<Vec<Sight>> {
+pub fn fixed(pictures: &dyn Pictures, look: &FeatureOptions, progress: &mut Progress<'_>) -> Result<Vec<CameraView>> {
     let count = pictures.cameras();
     for camera in 0..count {
         if pictures.frames(camera) == 0 {
@@ -251,13 +251,13 @@ pub fn fixed(pictures: &dyn Pictures, look: &Look, progress: &mut Progress<'_>) 
     const TOGETHER: usize = 4;
     for part in (0..count).collect::<Vec<_>>().chunks(TOGETHER) {
         progress.phase("features", part[0], count);
-        let sights: Result<Vec<Sight>> = part.par_iter().map(|&c| sight(pictures, c, look, &moments)).collect();
+        let sights: Result<Vec<CameraView>> = part.par_iter().map(|&c| sight(pictures, c, look, &moments)).collect();
         out.extend(sights?);
     }
     Ok(out)
 }
 
-fn sight(pictures: &dyn Pictures, camera: usize, look: &Look, moments: &[f64]) -> Result<Sight> {
+fn sight(pictures: &dyn Pictures, camera: usize, look: &FeatureOptions, moments: &[f64]) -> Result<CameraView> {
     let (background, factor) = median(pictures, camera, look.pixels)?;
     let limits = |most: usize| Limits { contrast: look.contrast, most };
     // What stands still counts where the middle frame does.
@@ -281,13 +281,13 @@ fn sight(pictures: &dyn Pictures, camera: usize, look: &Look, moments: &[f64]) -
         }
     }
     let size = [background.width, background.height];
-    Ok(Sight { name: pictures.name(camera), features, shown, frame, ..empty(pictures, camera, size, factor) }
+    Ok(CameraView { name: pictures.name(camera), features, shown, frame, ..empty(pictures, camera, size, factor) }
         .straightened(pictures, camera))
 }
 
 /// A camera of which nothing was seen yet.
-fn empty(pictures: &dyn Pictures, camera: usize, size: [usize; 2], factor: f64) -> Sight {
-    Sight {
+fn empty(pictures: &dyn Pictures, camera: usize, size: [usize; 2], factor: f64) -> CameraView {
+    CameraView {
         name: String::new(),
         size,
         factor,
@@ -301,7 +301,7 @@ fn empty(pictures: &dyn Pictures, camera: usize, size: [usize; 2], factor: f64) 
     }
 }
 
-impl Sight {
+impl CameraView {
     /// Takes away the distortion of a lens that is known.
     fn straightened(mut self, pictures: &dyn Pictures, camera: usize) -> Self {
         let Some(known) = pictures.known(camera) else { return self };
@@ -356,7 +356,7 @@ fn moving(
     camera: usize,
     frame: usize,
     background: &Planes<f32>,
-    look: &Look,
+    look: &FeatureOptions,
     moment: usize,
     t: f64,
 ) -> Result<(Vec<Feature>, Option<Shown>)> {
@@ -415,10 +415,10 @@ fn moving(
 /// Errors: as [`fixed`].
 pub fn walking(
     pictures: &dyn Pictures,
-    look: &Look,
+    look: &FeatureOptions,
     most: usize,
     progress: &mut Progress<'_>,
-) -> Result<Vec<(usize, usize, Sight)>> {
+) -> Result<Vec<(usize, usize, CameraView)>> {
     let total: usize = (0..pictures.cameras()).map(|c| pictures.frames(c)).sum();
     if total == 0 {
         return Err(Error::input("there are no images"));
@@ -430,13 +430,13 @@ pub fn walking(
     const TOGETHER: usize = 8;
     for part in chosen.chunks(TOGETHER) {
         progress.phase("features", out.len(), chosen.len());
-        let sights: Result<Vec<Sight>> = part
+        let sights: Result<Vec<CameraView>> = part
             .par_iter()
             .map(|&(camera, frame)| {
                 let (picture, factor) = load(pictures, camera, frame, look.pixels)?;
                 let limits = Limits { contrast: look.contrast, most: look.still };
                 let counts = mask(pictures, camera, frame, &picture)?;
-                let sight = Sight {
+                let sight = CameraView {
                     name: format!("{}, frame {frame}", pictures.name(camera)),
                     frame: frame_length(pictures, camera),
                     features: found(&picture, limits, &|x, y| counts.as_ref().is_none_or(|m| m.counts(x, y)), 0),
@@ -445,7 +445,7 @@ pub fn walking(
                 };
                 let sight = sight.straightened(pictures, camera);
                 // One frame's place is not the camera's.
-                Ok(Sight { pose: None, ..sight })
+                Ok(CameraView { pose: None, ..sight })
             })
             .collect();
         out.extend(part.iter().zip(sights?).map(|(&(camera, frame), s)| (camera, frame, s)));

@@ -2,7 +2,7 @@
 
 use super::algebra::{orthonormal, roots, rotation};
 use super::lens::{Lens, off};
-use super::sample::{Data, Found, Search, consensus};
+use super::sample::{Consensus, Data, Search, consensus};
 use splat4d::math::cholesky::Cholesky;
 use splat4d::math::se3::{cross, dot, mat_mul, mat_vec, norm, normalize, sub, transpose};
 use splat4d::math::{Rng, Se3, mat3};
@@ -191,9 +191,15 @@ const ENOUGH: f64 = 0.6;
 
 /// The camera that sees most of the known points where it does, with one of these lenses or, where `free`, one of a focal length
 /// near theirs. `tolerance` in pixels.
-pub(crate) fn place(known: &[Known], lenses: &[Lens], free: bool, tolerance: f64, rng: Rng) -> Option<Found<Placed>> {
+pub(crate) fn place(
+    known: &[Known],
+    lenses: &[Lens],
+    free: bool,
+    tolerance: f64,
+    rng: Rng,
+) -> Option<Consensus<Placed>> {
     let search = Search { tolerance, most: MOST, missed: MISSED };
-    let mut best: Option<Found<Placed>> = None;
+    let mut best: Option<Consensus<Placed>> = None;
     for (k, &lens) in lenses.iter().enumerate() {
         let rays = known.iter().map(|n| lens.ray(n.pixel)).collect();
         let found = consensus(&Resection { known, rays, lens, free }, search, rng.fork(k as u64));

@@ -32,7 +32,7 @@ pub(crate) struct Search {
 
 /// A model and who agrees.
 #[derive(Clone, Debug)]
-pub(crate) struct Found<M> {
+pub(crate) struct Consensus<M> {
     pub model: M,
     /// Ascending.
     pub inliers: Vec<usize>,
@@ -44,7 +44,7 @@ pub(crate) struct Found<M> {
 const POLISHES: usize = 4;
 
 /// The best model found; the same for the same random numbers. `None`: no sample gave any.
-pub(crate) fn consensus<D: Data>(data: &D, search: Search, rng: Rng) -> Option<Found<D::Model>> {
+pub(crate) fn consensus<D: Data>(data: &D, search: Search, rng: Rng) -> Option<Consensus<D::Model>> {
     let n = data.len();
     if n < D::SAMPLE {
         return None;
@@ -61,7 +61,7 @@ pub(crate) fn consensus<D: Data>(data: &D, search: Search, rng: Rng) -> Option<F
         sum
     };
     let inliers = |model: &D::Model| (0..n).filter(|&k| data.error(model, k) < limit).collect::<Vec<usize>>();
-    let mut best: Option<Found<D::Model>> = None;
+    let mut best: Option<Consensus<D::Model>> = None;
     let mut most = search.most;
     let mut trial = 0;
     let mut sample = vec![0; D::SAMPLE];
@@ -84,7 +84,7 @@ pub(crate) fn consensus<D: Data>(data: &D, search: Search, rng: Rng) -> Option<F
             if first >= least || first.is_nan() {
                 continue;
             }
-            let mut found = Found { inliers: inliers(&model), model, cost: first };
+            let mut found = Consensus { inliers: inliers(&model), model, cost: first };
             for _ in 0..POLISHES {
                 if found.inliers.len() <= D::SAMPLE {
                     break;
@@ -94,7 +94,7 @@ pub(crate) fn consensus<D: Data>(data: &D, search: Search, rng: Rng) -> Option<F
                 if next >= found.cost || next.is_nan() {
                     break;
                 }
-                found = Found { inliers: inliers(&better), model: better, cost: next };
+                found = Consensus { inliers: inliers(&better), model: better, cost: next };
             }
             let share = found.inliers.len() as f64 / n as f64;
             let clean = share.powi(D::SAMPLE as i32).clamp(1e-12, 1.0 - 1e-12);

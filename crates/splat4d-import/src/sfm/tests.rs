@@ -3,7 +3,7 @@
 use super::lens::Known;
 use super::lens::Lens;
 use super::mapper::{FOCALS, Mapping, map};
-use super::pictures::{Feature, Look, Pictures, Sight, fixed};
+use super::pictures::{CameraView, Feature, FeatureOptions, Pictures, fixed};
 use super::tracks::{Pairing, focal_votes, join, links};
 use super::{Options, solve, solve_sights};
 use crate::Result;
@@ -18,7 +18,7 @@ struct Rig {
     poses: Vec<Se3>,
     lenses: Vec<Lens>,
     taus: Vec<f64>,
-    sights: Vec<Sight>,
+    sights: Vec<CameraView>,
 }
 
 /// Cameras on an arc around points, seven tenths of which move; every feature off by `noise` pixels, and `wrong` of them look like
@@ -57,7 +57,7 @@ fn rig(cameras: usize, points: usize, noise: f64, wrong: f64, spread: f64) -> Ri
             }
         }
         features.sort_by_key(|f| f.moment);
-        out.sights.push(Sight {
+        out.sights.push(CameraView {
             name: format!("camera {c}"),
             size: [640, 360],
             factor: 1.0,
@@ -289,7 +289,7 @@ fn walk(cameras: usize) -> Walk {
 #[test]
 fn what_moves_is_seen_at_times_with_its_velocity() {
     let mut silent = |_: &_| {};
-    let look = Look { moments: 3, ..Look::default() };
+    let look = FeatureOptions { moments: 3, ..FeatureOptions::default() };
     let sights = fixed(&walk(1), &look, &mut Progress(&mut silent)).unwrap();
     let features = &sights[0].features;
     assert!(features.is_sorted_by_key(|f| f.moment));
@@ -309,7 +309,8 @@ fn images_of_straightened_features_are_not_laid_over_each_other() {
     let camera = Lens { k1: -0.2, ..Lens::plain(200.0, 240, 120) }.camera(Se3::IDENTITY, 240, 120);
     let known = Known { intrinsics: camera.intrinsics, lens: camera.lens, pose: None };
     let bent = Walk { known: Some(known), ..walk(1) };
-    let sights = fixed(&bent, &Look { moments: 3, ..Look::default() }, &mut Progress(&mut silent)).unwrap();
+    let sights =
+        fixed(&bent, &FeatureOptions { moments: 3, ..FeatureOptions::default() }, &mut Progress(&mut silent)).unwrap();
     assert!(sights[0].exact && sights[0].shown.is_empty() && !sights[0].features.is_empty());
 }
 

@@ -1,6 +1,6 @@
 //! Features of many images that show one place: matched without any pose, verified two images at a time, joined.
 
-use super::pictures::{Feature, Sight};
+use super::pictures::{CameraView, Feature};
 use super::two_view::{Pair, fundamental, unlike_focal};
 use rayon::prelude::*;
 use splat4d::math::Rng;
@@ -152,7 +152,7 @@ fn mutual(a: &Rows, b: &Rows, from: &[Feature], to: &[Feature]) -> Vec<([usize; 
 }
 
 /// Compares images and keeps what agrees with one motion between them, in the order of pairs.
-pub fn links(sights: &[Sight], pairing: Pairing, seed: u64, progress: &mut Progress<'_>) -> Vec<Link> {
+pub fn links(sights: &[CameraView], pairing: Pairing, seed: u64, progress: &mut Progress<'_>) -> Vec<Link> {
     let all: Vec<Vec<Rows>> = sights.par_iter().map(|s| rows(&s.features)).collect();
     let pairs = pairing.pairs(sights.len());
     let mut out = Vec::new();
@@ -191,7 +191,7 @@ const WIDEST: f64 = 80.0;
 
 /// Compares placed images along epipolar lines, within `tolerance` pixels of [`super::lens::unit`].
 pub(crate) fn guided(
-    sights: &[Sight],
+    sights: &[CameraView],
     known: &[Option<Known>],
     tolerance: f64,
     progress: &mut Progress<'_>,
@@ -284,11 +284,11 @@ fn along(a: &Rows, b: &Rows, lines: &[[f32; 3]], pixels: &[[f64; 2]]) -> Vec<([u
 }
 
 /// Pixels about the middle of the image.
-pub(crate) fn about_middle(sight: &Sight, pixel: [f64; 2]) -> [f64; 2] {
+pub(crate) fn about_middle(sight: &CameraView, pixel: [f64; 2]) -> [f64; 2] {
     std::array::from_fn(|k| pixel[k] - 0.5 * sight.size[k] as f64)
 }
 
-fn verified(sights: &[Sight], [a, b]: [usize; 2], matches: Vec<([usize; 2], f32)>, rng: Rng) -> Option<Link> {
+fn verified(sights: &[CameraView], [a, b]: [usize; 2], matches: Vec<([usize; 2], f32)>, rng: Rng) -> Option<Link> {
     if matches.len() < LEAST {
         return None;
     }
@@ -311,7 +311,7 @@ fn verified(sights: &[Sight], [a, b]: [usize; 2], matches: Vec<([usize; 2], f32)
 
 /// Joins the matches of all links, surest first, so that no track has two places of one sight. Tracks ascend by their first
 /// features.
-pub fn join(sights: &[Sight], links: &[Link]) -> Vec<Track> {
+pub fn join(sights: &[CameraView], links: &[Link]) -> Vec<Track> {
     // Features of exactly one place are one.
     let mut starts = vec![0];
     let mut place_of: Vec<Vec<usize>> = Vec::with_capacity(sights.len());
@@ -359,7 +359,7 @@ pub fn join(sights: &[Sight], links: &[Link]) -> Vec<Track> {
 /// The focal lengths, in units of the images' larger side, that all cameras may share, the likeliest first: each
 /// link votes for
 /// those with which its fundamental matrix is an essential one.
-pub fn focal_votes(sights: &[Sight], links: &[Link], candidates: &[f64]) -> Vec<f64> {
+pub fn focal_votes(sights: &[CameraView], links: &[Link], candidates: &[f64]) -> Vec<f64> {
     /// What a matrix of noisy matches misses, at the right focal length: the vote falls to 1/e.
     const OFF: f64 = 0.05;
     let vote = |focal: f64| -> f64 {
@@ -378,8 +378,8 @@ pub fn focal_votes(sights: &[Sight], links: &[Link], candidates: &[f64]) -> Vec<
 mod tests {
     use super::*;
 
-    fn sight(features: Vec<Feature>) -> Sight {
-        Sight {
+    fn sight(features: Vec<Feature>) -> CameraView {
+        CameraView {
             name: String::new(),
             size: [640, 360],
             factor: 1.0,

@@ -4,7 +4,7 @@
 use super::algebra::{
     Mat3, add, eliminate, least_vector, multiply, null_space, orthonormal, roots, rotation, skew, svd, value,
 };
-use super::sample::{Data, Found, Search, consensus};
+use super::sample::{Consensus, Data, Search, consensus};
 use splat4d::math::se3::{cross, dot, mat_mul, mat_vec, norm, normalize, transpose};
 use splat4d::math::{Rng, Se3};
 use std::sync::LazyLock;
@@ -109,7 +109,7 @@ impl Data for Uncalibrated<'_> {
 ///
 /// Pixel positions are about the images' middles (subtract them before); `size` is the larger side of the images. F is
 /// for positions in pixels. `None`: fewer than seven pairs, or no model.
-pub(crate) fn fundamental(pairs: &[Pair], size: f64, tolerance: f64, rng: Rng) -> Option<Found<Mat3>> {
+pub(crate) fn fundamental(pairs: &[Pair], size: f64, tolerance: f64, rng: Rng) -> Option<Consensus<Mat3>> {
     let unit = 0.5 * size;
     let small: Vec<Pair> = pairs.iter().map(|p| p.map(|q| q.map(|v| v / unit))).collect();
     let search = Search { tolerance, most: MOST, missed: MISSED };

@@ -153,7 +153,7 @@ fn interval(tracks: &[Track]) -> f64 {
 }
 
 /// Where a track was, and the squared slope of the line there; None: it was not.
-type Seen = Option<([f64; 2], f64)>;
+type TrackPoint = Option<([f64; 2], f64)>;
 
 /// A pair of tracks and its mean squared distance at every lag.
 type Costs = ([usize; 2], Vec<f32>);
@@ -233,7 +233,7 @@ impl Problem<'_> {
             (self.a.iter()).map(|t| smoothed(t).map(|(time, x)| (place(time), line(self.f, x))).collect()).collect();
         let mut out: Vec<Costs> = pairs.iter().map(|&p| (p, vec![MOST as f32; grid.len()])).collect();
         for (k, &lag) in grid.iter().enumerate() {
-            let others: Vec<Vec<Seen>> = (self.b.par_iter())
+            let others: Vec<Vec<TrackPoint>> = (self.b.par_iter())
                 .map(|track| {
                     let at = |t: &f64| track.smooth(t + lag).map(|y| (y, back(self.f, y)));
                     times.iter().map(at).collect()

@@ -28,7 +28,7 @@ pub(super) struct Avi {
 
 /// What the walk through the file has found.
 #[derive(Default)]
-struct Found {
+struct AviContents {
     /// Kind and codec of each stream, and seconds a sample.
     streams: Vec<([u8; 4], [u8; 4], f64)>,
     frames: Vec<(u64, u32)>,
@@ -52,7 +52,7 @@ impl Avi {
         if &head[..4] != b"RIFF" || &head[8..] != b"AVI " {
             return Err(other());
         }
-        let mut found = Found::default();
+        let mut found = AviContents::default();
         // Long files are several RIFF lists in a row (OpenDML).
         let mut at = 0;
         while at + 12 <= end {
@@ -117,7 +117,7 @@ fn info(path: &Path, interval: f64, warnings: Vec<String>) -> Info {
 }
 
 /// Reads the list at a place; where the next thing begins.
-fn list(file: &mut BufReader<File>, at: u64, end: u64, found: &mut Found, depth: usize) -> std::io::Result<u64> {
+fn list(file: &mut BufReader<File>, at: u64, end: u64, found: &mut AviContents, depth: usize) -> std::io::Result<u64> {
     file.seek(SeekFrom::Start(at))?;
     let mut head = [0; 12];
     file.read_exact(&mut head)?;

@@ -9,7 +9,7 @@ use crate::recipe::Recipe;
 use crate::run::dataset::Dataset;
 use crate::run::{learnable, plan, scale};
 use crate::step::chain::{Chain, Losses, Step};
-use crate::step::clocks::Look;
+use crate::step::clocks::OffsetImages;
 use crate::step::loss::TrainLoss;
 use crate::train_state::{Corrections, Origin, RefineSettings, Scale};
 use serde_json::Value;
@@ -61,7 +61,7 @@ impl Align {
             let look = Dataset::new(store.clone(), frames.to_vec());
             for round in SEARCHES {
                 let antialias = backend.config().antialias;
-                let look = Look { frames: &look, corrections: &found, exposure: None, antialias };
+                let look = OffsetImages { frames: &look, corrections: &found, exposure: None, antialias };
                 let shifts = look.shifts(scene, found.search(round))?;
                 found.shift(&shifts);
             }

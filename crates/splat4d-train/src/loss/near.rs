@@ -11,16 +11,16 @@ pub(crate) const NEIGHBOURS: usize = 8;
 const SEARCH_INTERVAL: usize = 200;
 
 /// The epoch of the last search of a layer, and its result.
-type Found = (usize, Vec<u32>);
+type SearchResult = (usize, Vec<u32>);
 
 /// The nearest neighbours of the rows of every layer, by raw means, searched again every 200 steps and after every
 /// edit of
 /// rows.
 #[derive(Debug, Default)]
-pub(crate) struct Near(Mutex<Vec<Found>>);
+pub(crate) struct Near(Mutex<Vec<SearchResult>>);
 
 impl Near {
-    fn lock(&self) -> MutexGuard<'_, Vec<Found>> {
+    fn lock(&self) -> MutexGuard<'_, Vec<SearchResult>> {
         self.0.lock().expect("no thread panics while it holds the neighbours")
     }
 
@@ -52,7 +52,7 @@ impl Near {
 
     /// Per layer: the epoch of the search, the number of indices, the indices.
     pub(crate) fn state(&self) -> Vec<u32> {
-        let layer = |(epoch, near): &Found| {
+        let layer = |(epoch, near): &SearchResult| {
             [&[u32::try_from(*epoch).unwrap_or(u32::MAX), near.len() as u32], near.as_slice()].concat()
         };
         self.lock().iter().flat_map(layer).collect()

@@ -63,7 +63,7 @@ settings! {
 }
 
 /// A view that was looked at.
-struct Look {
+struct ViewError {
     frame: usize,
     error: f64,
     /// Mean absolute error a pixel, [1, h, w].
@@ -149,10 +149,10 @@ impl Maintenance for Guided {
 }
 
 /// The worst of some views, evenly chosen with a random start.
-fn looks(scene: &Scene<f32>, frames: &dyn Frames, antialias: Antialias, rng: Rng) -> Result<Vec<Look>> {
+fn looks(scene: &Scene<f32>, frames: &dyn Frames, antialias: Antialias, rng: Rng) -> Result<Vec<ViewError>> {
     let mut backend = device::cpu(RenderConfig { antialias, ..RenderConfig::default() });
     let (mut instant, mut image, mut picture) = (Evaluation::default(), Image::default(), Picture::default());
-    let mut worst: Vec<Look> = Vec::new();
+    let mut worst: Vec<ViewError> = Vec::new();
     let count = LOOKS.min(frames.len());
     for k in 0..count {
         let frame = ((k as f64 + rng.uniform(0)) * frames.len() as f64 / count as f64) as usize;
@@ -174,7 +174,7 @@ fn looks(scene: &Scene<f32>, frames: &dyn Frames, antialias: Antialias, rng: Rng
         let seen = depth.data.iter().zip(&image.alpha.data).filter(|(_, a)| **a >= COVERED);
         let farthest = seen.map(|(d, _)| *d).fold(0.0, f32::max);
         if farthest > 0.0 {
-            worst.push(Look { frame, error, errors, truth: picture.color.clone(), farthest });
+            worst.push(ViewError { frame, error, errors, truth: picture.color.clone(), farthest });
             worst.sort_by(|a, b| b.error.total_cmp(&a.error).then(a.frame.cmp(&b.frame)));
             worst.truncate(WORST_VIEWS);
         }
@@ -191,7 +191,7 @@ struct Point {
 }
 
 /// Adds at most `most` points along the rays of a view's worst patches, the worst first.
-fn rays(look: &Look, frames: &dyn Frames, most: usize, rng: Rng, points: &mut Vec<Point>) {
+fn rays(look: &ViewError, frames: &dyn Frames, most: usize, rng: Rng, points: &mut Vec<Point>) {
     let camera: &Camera = frames.camera(look.frame);
     let (h, w) = (look.errors.height, look.errors.width);
     let mut sorted = look.errors.data.clone();

@@ -27,14 +27,14 @@ const FARTHEST: f64 = 0.25;
 
 /// The images from which time offsets are found, and what is known of their cameras.
 #[derive(Clone, Copy)]
-pub(crate) struct Look<'a> {
+pub(crate) struct OffsetImages<'a> {
     pub frames: &'a dyn Frames,
     pub corrections: &'a Corrections,
     pub exposure: Option<&'a Exposure>,
     pub antialias: Antialias,
 }
 
-impl Look<'_> {
+impl OffsetImages<'_> {
     /// By how many seconds to shift each camera's clock from where it is now, so that its images suit the scene best.
     /// Errors: images that cannot be read.
     pub(crate) fn shifts(&self, scene: &Scene<f32>, due: SearchDue) -> Result<Vec<(usize, f64)>> {

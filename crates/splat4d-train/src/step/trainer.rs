@@ -2,7 +2,7 @@
 
 use super::batch::Batch;
 use super::chain::StepInfo;
-use super::clocks::Look;
+use super::clocks::OffsetImages;
 use super::emphasis::Emphasis;
 use super::engine::{Blame, Engine, StepPlan};
 pub use super::engine::{Fault, Measured, Stepped};
@@ -430,7 +430,7 @@ impl<'a> Trainer<'a> {
         let Some(corrections) = &self.train_state.corrections else { return Ok(()) };
         if let Some(due) = corrections.search_due(progress, after) {
             let (frames, antialias) = (self.frames.as_ref(), self.engine.antialias());
-            let look = Look { frames, corrections, exposure: self.train_state.exposure.as_ref(), antialias };
+            let look = OffsetImages { frames, corrections, exposure: self.train_state.exposure.as_ref(), antialias };
             let shifts = look.shifts(self.train_state.scene(), due)?;
             self.train_state.corrections.iter_mut().for_each(|c| c.shift(&shifts));
         }

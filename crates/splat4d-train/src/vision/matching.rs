@@ -1,7 +1,7 @@
 //! Features of neighbouring cameras, matched along epipolar lines, and the points that they show.
 
 use super::features::{self, Feature, Limits};
-use super::triangulate::{Sight, Transfer, angle_at, triangulate};
+use super::triangulate::{PixelObservation, Transfer, angle_at, triangulate};
 use super::view::View;
 use rayon::prelude::*;
 use splat4d::math::se3::{dot, norm, sub};
@@ -202,7 +202,8 @@ fn groups(total: usize, matches: &[(f64, usize, usize)], view_of: &dyn Fn(usize)
 /// The point of a group of features: the one that fits worst is left out until all fit.
 fn settle(cameras: &[&Camera], mut seen: Vec<(usize, [f64; 2])>, ratio: f64) -> Option<Track> {
     while seen.len() >= 2 {
-        let sights: Vec<Sight<'_>> = seen.iter().map(|&(view, pixel)| Sight { camera: cameras[view], pixel }).collect();
+        let sights: Vec<PixelObservation<'_>> =
+            seen.iter().map(|&(view, pixel)| PixelObservation { camera: cameras[view], pixel }).collect();
         let Some(point) = triangulate(&sights) else {
             // Two rays that do not meet are no point; among more, one may spoil the others.
             seen.pop();

@@ -216,8 +216,8 @@ fn wrong_poses_give_few_points() {
     let right = Room::new(6, 1.0);
     let mut wrong = Room::new(6, 1.0);
     // The images are those of the right cameras: only what is told of them is wrong.
-    struct Told<'a>(&'a Room, &'a Room);
-    impl Frames for Told<'_> {
+    struct Posed<'a>(&'a Room, &'a Room);
+    impl Frames for Posed<'_> {
         fn len(&self) -> usize {
             self.0.len()
         }
@@ -245,7 +245,7 @@ fn wrong_poses_give_few_points() {
         camera.cam_from_world = Se3::look_at(eye, target, [0.1 * (2.0 * a).sin(), -1.0, 0.0]);
     }
     let count = |told: &dyn Frames| points(told, &[], 2000, &mut Progress(&mut |_| {})).unwrap().len();
-    let (good, bad) = (count(&right), count(&Told(&wrong, &right)));
+    let (good, bad) = (count(&right), count(&Posed(&wrong, &right)));
     assert!(bad * 10 < good, "{bad} points with wrong poses, {good} with right ones");
 }
 

@@ -55,14 +55,14 @@ impl Transfer {
 
 /// A point seen by a camera.
 #[derive(Clone, Copy, Debug)]
-pub struct Sight<'a> {
+pub struct PixelObservation<'a> {
     /// By which camera (pinhole).
     pub camera: &'a Camera,
     /// Where in its image.
     pub pixel: [f64; 2],
 }
 
-impl Sight<'_> {
+impl PixelObservation<'_> {
     /// Distance of a world point's image from where it was seen, pixels; infinite behind the camera.
     pub fn error(&self, x: [f64; 3]) -> f64 {
         let off = |([u, v], _): ([f64; 2], f64)| (u - self.pixel[0]).hypot(v - self.pixel[1]);
@@ -80,7 +80,7 @@ const STEPS: usize = 3;
 
 /// The point that several cameras see: where their rays come nearest to each other, then least squares of the
 /// reprojection errors. Nothing where the rays are parallel or meet behind a camera.
-pub fn triangulate(sights: &[Sight<'_>]) -> Option<[f64; 3]> {
+pub fn triangulate(sights: &[PixelObservation<'_>]) -> Option<[f64; 3]> {
     let mut a = [[0.0; 3]; 3];
     let mut b = [0.0; 3];
     // About the first camera, for the sake of digits far from the world's origin.
@@ -119,7 +119,7 @@ pub fn triangulate(sights: &[Sight<'_>]) -> Option<[f64; 3]> {
         let step = solve(h, g)?;
         (0..3).for_each(|k| x[k] += step[k]);
     }
-    let seen = |s: &Sight<'_>| s.camera.cam_from_world.apply(x)[2] > 0.0;
+    let seen = |s: &PixelObservation<'_>| s.camera.cam_from_world.apply(x)[2] > 0.0;
     (x.iter().all(|v| v.is_finite()) && sights.iter().all(seen)).then_some(x)
 }
 
@@ -139,8 +139,8 @@ mod tests {
         for unit in [1e-3, 1.0, 1e3] {
             let cameras = [-1.0, 0.2, 1.0].map(|x| camera(x, unit));
             let x = [0.3, -0.2, 0.5].map(|v| v * unit);
-            let sights: Vec<Sight<'_>> =
-                cameras.iter().map(|c| Sight { camera: c, pixel: c.project(x).unwrap().0 }).collect();
+            let sights: Vec<PixelObservation<'_>> =
+                cameras.iter().map(|c| PixelObservation { camera: c, pixel: c.project(x).unwrap().0 }).collect();
             let found = triangulate(&sights).unwrap();
             assert!(norm(sub(found, x)) < 1e-9 * unit, "{found:?}");
             let transfer = Transfer::new(&cameras[0], &cameras[1]);
@@ -155,10 +155,13 @@ mod tests {
     #[test]
     fn one_place_and_rays_that_part_give_no_point() {
         let one = camera(0.5, 1.0);
-        let same = [Sight { camera: &one, pixel: [10.0, 20.0] }; 2];
+        let same = [PixelObservation { camera: &one, pixel: [10.0, 20.0] }; 2];
         assert!(triangulate(&same).is_none());
         let (left, right) = (camera(-1.0, 1.0), camera(1.0, 1.0));
-        let parting = [Sight { camera: &left, pixel: [0.0, 120.0] }, Sight { camera: &right, pixel: [320.0, 120.0] }];
+        let parting = [
+            PixelObservation { camera: &left, pixel: [0.0, 120.0] },
+            PixelObservation { camera: &right, pixel: [320.0, 120.0] },
+        ];
         assert!(triangulate(&parting).is_none());
     }
 }

@@ -60,7 +60,7 @@ pub(super) struct Subject<'a> {
 }
 
 /// One frame's look, in f64.
-struct Look {
+struct FrameSample {
     time: f64,
     mean: [f64; 3],
     cov: [f64; 6],
@@ -102,7 +102,7 @@ impl Fitter<'_> {
         // frames too, but a single frame is what it is.
         let held = if single { &looks[..1] } else { &looks[..] };
 
-        let weight = |l: &Look| l.alpha + FAINT;
+        let weight = |l: &FrameSample| l.alpha + FAINT;
         let total: f64 = looks.iter().map(weight).sum();
         let time = looks.iter().map(|l| weight(l) * l.time).sum::<f64>() / total;
         let mean: [f64; 3] = std::array::from_fn(|k| looks.iter().map(|l| weight(l) * l.mean[k]).sum::<f64>() / total);
@@ -150,13 +150,20 @@ impl Fitter<'_> {
 
     /// The shape of the looks that a piece is held to. That of a single frame turns on to the next one's, so that what is
     /// seen between them is whole, where it then misses its own by no more than is allowed, and both by less.
-    fn shape(&self, subject: &Subject<'_>, looks: &[Look], held: &[Look], center: f64, pixels: f64) -> Shape {
+    fn shape(
+        &self,
+        subject: &Subject<'_>,
+        looks: &[FrameSample],
+        held: &[FrameSample],
+        center: f64,
+        pixels: f64,
+    ) -> Shape {
         let own = shape(subject, held, center);
         if held.len() == looks.len() {
             return own;
         }
         let turning = shape(subject, looks, center);
-        let miss = |shape: &Shape, look: &Look| {
+        let miss = |shape: &Shape, look: &FrameSample| {
             look.alpha * difference(shape.covariance(look.time - center), look.cov) * pixels
         };
         let worst = |shape: &Shape| looks.iter().map(|l| miss(shape, l)).fold(0.0, f64::max);
@@ -165,11 +172,11 @@ impl Fitter<'_> {
     }
 
     /// The finite looks at a span's frames, its end included.
-    fn looks(&self, subject: &Subject<'_>, span: Span) -> Vec<Look> {
+    fn looks(&self, subject: &Subject<'_>, span: Span) -> Vec<FrameSample> {
         let [first, last] = subject.row.frames;
         let look = |frame: usize| {
             let v = subject.samples.at(subject.row, frame);
-            v.iter().all(|x| x.is_finite()).then(|| Look {
+            v.iter().all(|x| x.is_finite()).then(|| FrameSample {
                 time: self.tree.time(frame),
                 mean: std::array::from_fn(|k| f64::from(v[k])),
                 cov: std::array::from_fn(|k| f64::from(v[3 + k])),
@@ -186,7 +193,7 @@ impl Fitter<'_> {
     }
 
     /// Envelope and opacity: the life as it was learnt, or, where that is not what is seen, a constant.
-    fn life(&self, subject: &Subject<'_>, span: Span, looks: &[Look]) -> (Envelope, f64) {
+    fn life(&self, subject: &Subject<'_>, span: Span, looks: &[FrameSample]) -> (Envelope, f64) {
         let [from, to] = [self.tree.border(span[0]), self.tree.border(span[1])];
         let still = Envelope::forever(0.5 * (from + to));
         let range = looks.iter().fold([1.0f64, 0.0], |r, l| [r[0].min(l.alpha), r[1].max(l.alpha)]);
@@ -214,7 +221,13 @@ impl Fitter<'_> {
     }
 
     /// What was found, or one side of an envelope where a cross-fade makes that a better fit.
-    fn or_tail(&self, subject: &Subject<'_>, looks: &[Look], found: (Envelope, f64), miss: f64) -> (Envelope, f64) {
+    fn or_tail(
+        &self,
+        subject: &Subject<'_>,
+        looks: &[FrameSample],
+        found: (Envelope, f64),
+        miss: f64,
+    ) -> (Envelope, f64) {
         if !subject.cross_fades || LEVEL_PIXELS * miss <= self.tolerance {
             return found;
         }
@@ -227,11 +240,11 @@ impl Fitter<'_> {
 
 /// An envelope about the strongest look that falls as the looks do: σ = exp(−½y²), y = (x − h)/s beyond h, is a line through
 /// √(−2 ln(α/α_max)).
-fn tail(looks: &[Look]) -> Option<(Envelope, f64)> {
+fn tail(looks: &[FrameSample]) -> Option<(Envelope, f64)> {
     /// Looks at which next to nothing has fallen yet, or next to nothing is left, say little of the slope.
     const TELLING: std::ops::Range<f64> = 0.02..0.98;
     let peak = looks.iter().max_by(|a, b| a.alpha.total_cmp(&b.alpha))?;
-    let share = |l: &Look| l.alpha / peak.alpha;
+    let share = |l: &FrameSample| l.alpha / peak.alpha;
     let told: Vec<[f64; 3]> = looks
         .iter()
         .filter(|l| TELLING.contains(&share(l)))
@@ -251,7 +264,7 @@ fn tail(looks: &[Look]) -> Option<(Envelope, f64)> {
 }
 
 /// The shape: as it was learnt where that is what is seen, else turning at a steady rate.
-fn shape(subject: &Subject<'_>, looks: &[Look], center: f64) -> Shape {
+fn shape(subject: &Subject<'_>, looks: &[FrameSample], center: f64) -> Shape {
     let own = subject.own;
     let same = |cov: [f64; 6], other: [f64; 6]| {
         let trace = (cov[0] + cov[3] + cov[5]).abs();
@@ -271,7 +284,7 @@ fn shape(subject: &Subject<'_>, looks: &[Look], center: f64) -> Shape {
 }
 
 /// SH coefficients: the Gaussian's own, or the weighted mean of what is seen.
-fn colors(subject: &Subject<'_>, looks: &[Look]) -> [f32; COLORS] {
+fn colors(subject: &Subject<'_>, looks: &[FrameSample]) -> [f32; COLORS] {
     if let Some(own) = subject.colors {
         return own;
     }

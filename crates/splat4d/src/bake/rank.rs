@@ -30,7 +30,7 @@ const GOLDEN: f64 = 0.618_033_988_749_894_9;
 
 /// What was measured for one primitive.
 #[derive(Clone, Copy, Default)]
-struct Seen {
+struct ImageChange {
     /// Change of the image, mean squared error, and squared opacity, over the renders at whose time it is there.
     change: f64,
     squares: f64,
@@ -44,7 +44,8 @@ pub(super) fn rank(nodes: &mut [Node], scene: &Scene<f32>, options: &Options) {
     }
     let (layers, places) = as_layers(nodes);
     let baked = Scene { layers, clip: scene.clip, fps: scene.fps, background: scene.background, ..Scene::default() };
-    let mut seen: Vec<Vec<Seen>> = nodes.iter().map(|n| vec![Seen::default(); n.primitives.len()]).collect();
+    let mut seen: Vec<Vec<ImageChange>> =
+        nodes.iter().map(|n| vec![ImageChange::default(); n.primitives.len()]).collect();
     let (mut importance, mut instant) = (Importance::new(RenderConfig::default()), Evaluation::default());
     let mut changes = Vec::new();
     for (time, camera) in shots {
@@ -86,7 +87,7 @@ fn shots(clip: [f64; 2], options: &Options, gaussians: usize) -> Vec<(f64, &Came
 }
 
 /// Sets the importance of a node's primitives from what renders measured.
-fn weigh(node: &mut Node, seen: &[Seen]) {
+fn weigh(node: &mut Node, seen: &[ImageChange]) {
     let guesses: Vec<f64> = node.primitives.iter().map(|p| f64::from(p.importance.max(0.0))).collect();
     let measured: Vec<f64> = node
         .primitives

@@ -40,7 +40,7 @@ const FAINT: f64 = 0.02;
 
 /// Sums over renders for one Gaussian, each divided by its squared opacity there.
 #[derive(Clone, Copy, Debug, Default)]
-struct Seen {
+struct GaussianSums {
     /// Second moment of the image's gradient with respect to the mean, mean squared error a unit².
     moment: [f64; 6],
     /// Its trace in units of the Gaussian's own size: mean squared error of all of it.
@@ -54,7 +54,7 @@ struct Seen {
 /// What was measured, by layer and row.
 #[derive(Debug)]
 pub(super) struct Weights {
-    seen: Vec<Vec<Seen>>,
+    seen: Vec<Vec<GaussianSums>>,
     /// Seconds of the renders of a camera that moves, rising.
     times: Vec<f64>,
     /// By layer, [times, rows]: energies in these renders.
@@ -107,7 +107,7 @@ impl Weights {
         let moving: Vec<(f64, &Camera)> = path.iter().step_by(stride).take(poses).map(|(t, c)| (*t, c)).collect();
         let shots: Vec<(f64, &Camera)> = (0..renders).map(still).chain(moving.iter().copied()).collect();
         let mut out = Self {
-            seen: scene.layers.iter().map(|l| vec![Seen::default(); l.params.len()]).collect(),
+            seen: scene.layers.iter().map(|l| vec![GaussianSums::default(); l.params.len()]).collect(),
             times: moving.iter().map(|m| m.0).collect(),
             path: scene.layers.iter().map(|l| vec![0.0; moving.len() * l.params.len()]).collect(),
             pixels: PIXELS,
@@ -168,7 +168,7 @@ impl Weights {
         let scale = sampling.pixels([v[0], v[1], v[2]]);
         let pass = LOW_PASS / (scale * scale);
         let sizes = values.map(|s| s.max(0.0) + pass);
-        let Seen { moment, energy: sum, color, still: [renders, still] } = self.seen[layer][row];
+        let GaussianSums { moment, energy: sum, color, still: [renders, still] } = self.seen[layer][row];
         // Cameras that stand still and one that moves count the same, each by its mean.
         let still = if renders > 0.0 { still / renders } else { 0.0 };
         let count = self.seen[layer].len();

@@ -65,7 +65,7 @@ impl Followed {
 
 /// A camera's sight of a point.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Sight {
+pub struct PointView {
     /// Pixel position; outside of the image too.
     pub pixel: [f64; 2],
     /// Whether it lies in the image with at least half of the light left before it.
@@ -95,7 +95,7 @@ pub fn follow(scene: &Scene<f32>, queries: &[Query], times: &[f64]) -> Followed 
     let backwards: Vec<usize> = (0..(last + 1).min(moments.len())).rev().collect();
     for order in [forwards, backwards] {
         let mut on_the_way: Vec<Option<Point>> = vec![None; queries.len()];
-        let (mut now, mut next) = (Seen::default(), Seen::default());
+        let (mut now, mut next) = (ActiveGaussians::default(), ActiveGaussians::default());
         for (step, &k) in order.iter().enumerate() {
             if step == 0 {
                 now.look(scene, moments[k]);
@@ -127,8 +127,8 @@ pub fn follow(scene: &Scene<f32>, queries: &[Query], times: &[f64]) -> Followed 
 }
 
 /// What a camera sees of points at one time.
-pub fn sights(scene: &Scene<f32>, camera: &Camera, t: Time, points: &[Option<[f64; 3]>]) -> Vec<Option<Sight>> {
-    let mut seen = Seen::default();
+pub fn sights(scene: &Scene<f32>, camera: &Camera, t: Time, points: &[Option<[f64; 3]>]) -> Vec<Option<PointView>> {
+    let mut seen = ActiveGaussians::default();
     seen.look(scene, t.0);
     let projected = projected(scene, &seen, camera);
     let sight = |point: &Option<[f64; 3]>| {
@@ -138,13 +138,19 @@ pub fn sights(scene: &Scene<f32>, camera: &Camera, t: Time, points: &[Option<[f6
         let visible = inside
             && z > camera.near
             && 1.0 - along(&projected, pixel).iter().filter(before).map(|h| h.weight).sum::<f64>() >= HALF;
-        Some(Sight { pixel, visible })
+        Some(PointView { pixel, visible })
     };
     points.par_iter().map(sight).collect()
 }
 
 /// The points whose queries are of moment k.
-fn begin(scene: &Scene<f32>, now: &Seen, queries: &[Query], begins: &[usize], k: usize) -> Vec<(usize, Option<Point>)> {
+fn begin(
+    scene: &Scene<f32>,
+    now: &ActiveGaussians,
+    queries: &[Query],
+    begins: &[usize],
+    k: usize,
+) -> Vec<(usize, Option<Point>)> {
     let mut of_camera: Option<(&Camera, Vec<Projected<f32>>)> = None;
     let mut out = Vec::new();
     for (q, query) in queries.iter().enumerate().filter(|(q, _)| begins[*q] == k) {
@@ -167,7 +173,7 @@ fn begin(scene: &Scene<f32>, now: &Seen, queries: &[Query], begins: &[usize], k:
 }
 
 /// The point that a pixel shows.
-fn of_pixel(now: &Seen, projected: &[Projected<f32>], camera: &Camera, pixel: [f64; 2]) -> Option<Point> {
+fn of_pixel(now: &ActiveGaussians, projected: &[Projected<f32>], camera: &Camera, pixel: [f64; 2]) -> Option<Point> {
     let hits = along(projected, pixel);
     let all: f64 = hits.iter().map(|h| h.weight).sum();
     if all < HALF {
@@ -196,7 +202,7 @@ struct Hit {
 }
 
 /// All splats of an image before any is blended.
-fn projected(scene: &Scene<f32>, seen: &Seen, camera: &Camera) -> Vec<Projected<f32>> {
+fn projected(scene: &Scene<f32>, seen: &ActiveGaussians, camera: &Camera) -> Vec<Projected<f32>> {
     Importance::new(RenderConfig::default()).project(&scene.splats(&seen.evaluation), camera).to_vec()
 }
 
@@ -242,7 +248,7 @@ struct Point {
 
 impl Point {
     /// Moves with its carriers; false: it has none.
-    fn step(&mut self, now: &Seen, next: &Seen) -> bool {
+    fn step(&mut self, now: &ActiveGaussians, next: &ActiveGaussians) -> bool {
         let mut moved = self.moved(now, next);
         if moved.is_none() {
             self.carriers = now.around(self.at, Some(next));
@@ -254,7 +260,7 @@ impl Point {
     }
 
     /// The mean displacement of the carriers that live at both times; `None`: fewer than half of them do.
-    fn moved(&self, now: &Seen, next: &Seen) -> Option<[f64; 3]> {
+    fn moved(&self, now: &ActiveGaussians, next: &ActiveGaussians) -> Option<[f64; 3]> {
         let (mut sum, mut all) = ([0.0; 3], 0.0);
         for &(member, weight) in &self.carriers {
             if let (Some(from), Some(to)) = (now.mean(member), next.mean(member)) {
@@ -268,11 +274,11 @@ impl Point {
 
 /// The Gaussians alive at one time.
 #[derive(Default)]
-struct Seen {
+struct ActiveGaussians {
     evaluation: Evaluation<f32>,
 }
 
-impl Seen {
+impl ActiveGaussians {
     fn look(&mut self, scene: &Scene<f32>, t: f64) {
         scene.at(Time(t), &mut self.evaluation);
     }
@@ -300,7 +306,7 @@ impl Seen {
 
     /// The Gaussians that carry what is at x, alike; of those that live on at `next` where it is given. None where the
     /// nearest is too far to be of one thing with it.
-    fn around(&self, x: [f64; 3], next: Option<&Seen>) -> Vec<(Member, f64)> {
+    fn around(&self, x: [f64; 3], next: Option<&ActiveGaussians>) -> Vec<(Member, f64)> {
         let mut best: Vec<(f64, f64, Member)> = Vec::with_capacity(NEAREST + 1);
         for (layer, tape) in self.evaluation.tapes().enumerate() {
             for j in 0..tape.out().rows() {

@@ -25,7 +25,7 @@ const FLAT: f64 = 1e4;
 
 /// When a Gaussian is seen. Seconds.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Seen {
+pub(super) struct Visibility {
     pub(super) kind: LifeKind,
     /// Its columns, as [`LifeKind::eval`] takes them.
     pub(super) life: [f64; 3],
@@ -46,7 +46,7 @@ pub(super) struct Fade {
     pub(super) opacity: f64,
 }
 
-impl Seen {
+impl Visibility {
     fn sigma(&self, t: f64) -> f64 {
         self.kind.eval(self.life, Time(t)).sigma
     }
@@ -164,8 +164,8 @@ fn nearest(samples: &[[f64; 2]; SAMPLES], length: f64) -> Fade {
 mod tests {
     use super::*;
 
-    fn interval(center: f64, half: f64, softness: f64) -> Seen {
-        Seen {
+    fn interval(center: f64, half: f64, softness: f64) -> Visibility {
+        Visibility {
             kind: LifeKind::Interval,
             life: [center, half.ln(), softness.ln()],
             opacity: 0.6,
@@ -193,10 +193,10 @@ mod tests {
         let long = interval(1.0, 1e9, 0.1).exact().unwrap();
         assert!((long.at(0.0) - 0.6).abs() < 1e-7);
         // A span that holds the whole life cuts nothing.
-        let held = Seen { span: [0.0, 1.5], ..interval(0.7, 1e-9, 0.1) };
+        let held = Visibility { span: [0.0, 1.5], ..interval(0.7, 1e-9, 0.1) };
         assert_eq!(held.exact().unwrap().center, 0.7);
         assert!(interval(1.0, 0.3, 0.05).exact().is_none());
-        assert!(Seen { span: [0.5, 1.5], ..interval(1.0, 1e9, 0.1) }.exact().is_none());
+        assert!(Visibility { span: [0.5, 1.5], ..interval(1.0, 1e9, 0.1) }.exact().is_none());
     }
 
     #[test]
@@ -211,10 +211,10 @@ mod tests {
             assert!(rms(400, seen.clip, |t| other.at(t) - seen.opacity * seen.sigma(t)) > miss);
         }
         // A piece in the tail of a life must not bring the whole life along.
-        let tail = Seen { span: [0.0, 0.3], ..interval(1.0, 1e-9, 0.25) };
+        let tail = Visibility { span: [0.0, 0.3], ..interval(1.0, 1e-9, 0.25) };
         assert_eq!(tail.exact(), None);
         assert!(tail.fit().is_none_or(|f| f.at(1.0) < 0.05), "{:?}", tail.fit());
-        let never = Seen { span: [3.0, 4.0], ..seen };
+        let never = Visibility { span: [3.0, 4.0], ..seen };
         assert_eq!(never.fit(), None);
     }
 
@@ -224,7 +224,7 @@ mod tests {
         let pieces: Vec<Fade> = (0..4)
             .map(|i| {
                 let span = [0.5 * f64::from(i), 0.5 * f64::from(i + 1)];
-                Seen { span, ..interval(1.0, 1e9, 1.0) }.fit().unwrap()
+                Visibility { span, ..interval(1.0, 1e9, 1.0) }.fit().unwrap()
             })
             .collect();
         let together = |t: f64| 1.0 - pieces.iter().map(|p| 1.0 - p.at(t)).product::<f64>();

@@ -3,7 +3,7 @@
 
 use super::bytes::sound_rows;
 use super::dialect::Y_DOWN;
-use super::fade::Seen;
+use super::fade::Visibility;
 use super::warnings::Warnings;
 use crate::layers::{Layer, Scene, with_polynomial};
 use crate::math::{Real, quat};
@@ -116,7 +116,7 @@ pub(super) fn rows(
             let (quat, norm) = quat::normalize(geometry.read::<4>(row, QUAT).map(f64::from));
             let norm = if norm > 0.0 { norm } else { 1.0 };
             let columns = layer.life.columns().len();
-            let seen = Seen {
+            let seen = Visibility {
                 kind: layer.life,
                 life: std::array::from_fn(|k| if k < columns { f64::from(p[LIFE].get(row, k)) } else { 0.0 }),
                 opacity: f64::from(geometry.get(row, OPACITY)).sigmoid(),

@@ -1,8 +1,8 @@
 //! Sightings of a map whose cameras stand: made exact, and found in cameras whose detectors missed them.
 
 use super::Map;
-use crate::sfm::overlay::{self, Eye, Seen};
-use crate::sfm::pictures::{Feature, Sight};
+use crate::sfm::overlay::{self, Eye, ImagePoint};
+use crate::sfm::pictures::{CameraView, Feature};
 use crate::sfm::tracks::Track;
 use rayon::prelude::*;
 
@@ -23,7 +23,7 @@ struct Laid {
 impl Map<'_> {
     /// Sights and tracks with features where windows about the points agree best, also in cameras that did not find them.
     /// Sightings whose windows do not agree go, but of cameras that would be left with few.
-    pub(super) fn overlaid(&self) -> (Vec<Sight>, Vec<Track>) {
+    pub(super) fn overlaid(&self) -> (Vec<CameraView>, Vec<Track>) {
         let laid: Vec<Option<Laid>> = (0..self.tracks.len()).into_par_iter().map(|t| self.laid(t)).collect();
         let mut left = vec![0; self.sights.len()];
         for (t, laid) in laid.iter().enumerate() {
@@ -32,8 +32,9 @@ impl Map<'_> {
             kept.chain(laid.found.iter().map(|f| f.0)).for_each(|s| left[s] += 1);
         }
         // Without the images, which are many bytes.
-        let bare = |s: &Sight| Sight { name: s.name.clone(), features: s.features.clone(), shown: Vec::new(), ..*s };
-        let mut sights: Vec<Sight> = self.sights.iter().map(bare).collect();
+        let bare =
+            |s: &CameraView| CameraView { name: s.name.clone(), features: s.features.clone(), shown: Vec::new(), ..*s };
+        let mut sights: Vec<CameraView> = self.sights.iter().map(bare).collect();
         let mut tracks = self.tracks.to_vec();
         for (t, laid) in laid.into_iter().enumerate() {
             let Some(laid) = laid else { continue };
@@ -69,9 +70,9 @@ impl Map<'_> {
         let at = |s: usize, f: &Feature| {
             let later = shown(s).map_or(0.0, |w| w.later);
             let place = std::array::from_fn(|a| f.pixel[a] - f.velocity[a] * later);
-            Some(Seen { shown: shown(s), place, eye: eye(s)? })
+            Some(ImagePoint { shown: shown(s), place, eye: eye(s)? })
         };
-        let seen: Option<Vec<Seen<'_>>> = spot.seen.iter().map(|&k| at(track.seen[k].0, feature(k))).collect();
+        let seen: Option<Vec<ImagePoint<'_>>> = spot.seen.iter().map(|&k| at(track.seen[k].0, feature(k))).collect();
         let seen = seen?;
         let velocities: Vec<[f64; 2]> = spot.seen.iter().map(|&k| feature(k).velocity).collect();
         let speed = overlay::speed(spot.place, &seen, &velocities)?;
@@ -84,7 +85,7 @@ impl Map<'_> {
         let guesses: Vec<(usize, Feature)> = others.filter(|&s| shown(s).is_some()).filter_map(guess).collect();
         let step = guesses.len().div_ceil(LOOKED_IN).max(1);
         let guesses: Vec<(usize, Feature)> = guesses.into_iter().step_by(step).collect();
-        let more: Vec<Seen<'_>> = guesses.iter().filter_map(|(s, f)| at(*s, f)).collect();
+        let more: Vec<ImagePoint<'_>> = guesses.iter().filter_map(|(s, f)| at(*s, f)).collect();
         let mut offs = overlay::aligned(spot.place, &seen, &more);
         let found = offs.split_off(seen.len());
         let found = guesses.into_iter().zip(found).filter_map(|((s, mut f), off)| {

@@ -4,7 +4,7 @@ use super::super::Capture;
 use super::super::account::Severity;
 use super::super::preflight::Finding;
 use super::Aspect;
-use super::look::Look;
+use super::look::SmallImage;
 use super::pairs::{self, Match};
 use super::points;
 use splat4d::math::Se3;
@@ -48,11 +48,16 @@ impl Tried {
 
 /// A warning where points or matches need other focal lengths; a note where matches fit any. `None`: they are right, or there
 /// is no evidence. `matches`: none were looked for where points have shown that poses are right.
-pub(super) fn check(capture: &Capture, matches: Option<&[Match]>, looks: &[Look], poses: &[Se3]) -> Option<Finding> {
+pub(super) fn check(
+    capture: &Capture,
+    matches: Option<&[Match]>,
+    looks: &[SmallImage],
+    poses: &[Se3],
+) -> Option<Finding> {
     by_points(capture, looks, poses).or_else(|| by_matches(matches?, looks, poses))
 }
 
-fn by_points(capture: &Capture, looks: &[Look], poses: &[Se3]) -> Option<Finding> {
+fn by_points(capture: &Capture, looks: &[SmallImage], poses: &[Se3]) -> Option<Finding> {
     capture.points.as_ref()?;
     let gains = Tried::new(|times| points::gain_of_focal(capture, looks, poses, times).unwrap_or(0.0));
     let best = gains.best();
@@ -64,7 +69,7 @@ fn by_points(capture: &Capture, looks: &[Look], poses: &[Se3]) -> Option<Finding
     })
 }
 
-fn by_matches(matches: &[Match], looks: &[Look], poses: &[Se3]) -> Option<Finding> {
+fn by_matches(matches: &[Match], looks: &[SmallImage], poses: &[Se3]) -> Option<Finding> {
     let weight = |residual: f64| (1.0 - (residual / REACH).powi(2)).max(0.0);
     let fit = Tried::new(|times| pairs::residuals(matches, looks, poses, times).into_iter().map(weight).sum());
     let best = fit.best();
@@ -91,7 +96,7 @@ fn by_matches(matches: &[Match], looks: &[Look], poses: &[Se3]) -> Option<Findin
     })
 }
 
-fn warning(how: &str, step: i32, looks: &[Look], as_read: &str) -> Finding {
+fn warning(how: &str, step: i32, looks: &[SmallImage], as_read: &str) -> Finding {
     let (times, own) = (STEP.powi(step), looks[0].camera.intrinsics.fx);
     let what = format!(
         "Focal lengths are probably wrong: {how} if they are {times:.2} times as long ({:.0} px in place of {own:.0} px), {as_read}.",

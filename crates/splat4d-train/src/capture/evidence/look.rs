@@ -46,7 +46,7 @@ pub(super) struct Shown {
 }
 
 /// A small image.
-pub(super) struct Look {
+pub(super) struct SmallImage {
     /// Its frame of the capture.
     pub(super) frame: usize,
     /// The camera of the image file.
@@ -65,22 +65,25 @@ pub(super) struct Look {
 }
 
 /// Reads the images of these frames; those that cannot be read are left out.
-pub(super) fn take(capture: &Capture, frames: &[usize], detail: Detail) -> Vec<Look> {
-    frames.par_iter().filter_map(|&i| Look::read(i, &capture.frames[i], capture.background, detail.side)).collect()
+pub(super) fn take(capture: &Capture, frames: &[usize], detail: Detail) -> Vec<SmallImage> {
+    frames
+        .par_iter()
+        .filter_map(|&i| SmallImage::read(i, &capture.frames[i], capture.background, detail.side))
+        .collect()
 }
 
 /// The image of a frame with or without its EXIF orientation.
-pub(super) fn one(capture: &Capture, frame: usize, upright: bool) -> Option<Look> {
-    Look::read(frame, &Frame { upright, ..capture.frames[frame].clone() }, capture.background, COARSE.side)
+pub(super) fn one(capture: &Capture, frame: usize, upright: bool) -> Option<SmallImage> {
+    SmallImage::read(frame, &Frame { upright, ..capture.frames[frame].clone() }, capture.background, COARSE.side)
 }
 
 /// Finds the features of all.
-pub(super) fn describe(looks: &mut [Look], detail: Detail) {
+pub(super) fn describe(looks: &mut [SmallImage], detail: Detail) {
     describe_each(&mut looks.iter_mut().collect::<Vec<_>>(), detail);
 }
 
 /// [`describe`] of some.
-pub(super) fn describe_each(looks: &mut [&mut Look], detail: Detail) {
+pub(super) fn describe_each(looks: &mut [&mut SmallImage], detail: Detail) {
     looks.par_iter_mut().for_each(|look| {
         let limits = Limits { contrast: CONTRAST, most: detail.features };
         let found = find(&grey(&look.color), limits, &|_, _| true);
@@ -113,7 +116,7 @@ fn box_sums<T: Copy + Into<u64>>(samples: &[T], raster: &Raster, channel: usize,
     out
 }
 
-impl Look {
+impl SmallImage {
     fn read(number: usize, frame: &Frame, background: Option<[f32; 3]>, side: usize) -> Option<Self> {
         let raster = picture::decode_as(&frame.image, Some(&frame.source), frame.upright).ok()?;
         let factor = raster.width.max(raster.height).div_ceil(side).max(1);

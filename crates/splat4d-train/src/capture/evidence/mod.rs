@@ -19,7 +19,7 @@ use super::account::Severity;
 use super::account::first_names;
 use super::preflight::Finding;
 use super::{Aspect, Capture, DepthFile, Frame, Poses};
-use look::Look;
+use look::SmallImage;
 pub use motion::Agreement;
 use splat4d::math::Se3;
 use std::collections::BTreeSet;
@@ -111,7 +111,7 @@ impl Capture {
     }
 
     /// The verdict by these images; features are found and matched if points do not say enough.
-    fn judge(&self, looks: &mut [Look], matches: &mut Option<Vec<pairs::Match>>) -> PoseCheck {
+    fn judge(&self, looks: &mut [SmallImage], matches: &mut Option<Vec<pairs::Match>>) -> PoseCheck {
         let mut conventions = vec![Poses::STATED];
         conventions.extend(self.convention.others());
         let posed = |f: &Frame, p: Poses| match p {
@@ -251,7 +251,7 @@ fn other_unit(ratio: f64, by: &str, file: &DepthFile) -> String {
 }
 
 /// What masks and alpha say of themselves: white counts.
-fn check_masks(looks: &[Look], poses: &[Se3]) -> Option<Finding> {
+fn check_masks(looks: &[SmallImage], poses: &[Se3]) -> Option<Finding> {
     let percent = |x: f64| 100.0 * x;
     let (severity, aspect, what, remedy) = match silhouettes::masks(looks, poses) {
         silhouettes::Masks::Fine => return None,
@@ -289,8 +289,8 @@ pub(super) fn upright(capture: &Capture, unsure: &[usize]) -> Option<bool> {
     let measured = [true, false].map(|upright| {
         let asked = some.iter().filter_map(|&i| look::one(capture, i, upright));
         let sure = others.clone().filter_map(|i| look::one(capture, i, true));
-        let mut looks: Vec<Look> = asked.chain(sure).collect();
-        let pose = |l: &Look| capture.frames[l.frame].source.cam_from_world;
+        let mut looks: Vec<SmallImage> = asked.chain(sure).collect();
+        let pose = |l: &SmallImage| capture.frames[l.frame].source.cam_from_world;
         let poses: Vec<Se3> = looks.iter().map(pose).collect();
         let count = looks.iter().filter(|l| some.contains(&l.frame)).count();
         let gain = points::gain_of(capture, &looks[..count], &poses[..count]);

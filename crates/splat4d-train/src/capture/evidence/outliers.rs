@@ -6,7 +6,7 @@ use super::super::account::first_names;
 use super::super::pose::same_pose;
 use super::super::preflight::Finding;
 use super::super::{Aspect, Capture, Frame};
-use super::look::{self, Look};
+use super::look::{self, SmallImage};
 use super::pairs::{self, Match};
 use super::points;
 use rayon::prelude::*;
@@ -61,26 +61,26 @@ impl Sign {
 }
 
 /// Looks for single wrong poses; `looks` are images that are read already.
-pub(super) fn check(capture: &Capture, looks: Vec<Look>, pixels: usize) -> Vec<Finding> {
+pub(super) fn check(capture: &Capture, looks: Vec<SmallImage>, pixels: usize) -> Vec<Finding> {
     let order = places(capture);
     let signs = signs(capture, &order);
     let size = capture.frames.first().map_or(1, |f| f.source.width * f.source.height).max(1);
     let (chosen, compared) = chosen(&order, &signs, (pixels / size).max(2 * BESIDE + 1));
     let frames: Vec<usize> = chosen.iter().map(|&k| order[k]).collect();
-    let mut looks: Vec<Look> = looks.into_iter().filter(|l| frames.contains(&l.frame)).collect();
+    let mut looks: Vec<SmallImage> = looks.into_iter().filter(|l| frames.contains(&l.frame)).collect();
     let missing: Vec<usize> = frames.iter().copied().filter(|f| looks.iter().all(|l| l.frame != *f)).collect();
     looks.extend(look::take(capture, &missing, look::COARSE));
     looks.sort_by_key(|l| frames.iter().position(|f| *f == l.frame));
-    let pose = |l: &Look| capture.frames[l.frame].source.cam_from_world;
-    let gain = |l: &Look| points::gain_of(capture, std::slice::from_ref(l), &[pose(l)]);
+    let pose = |l: &SmallImage| capture.frames[l.frame].source.cam_from_world;
+    let gain = |l: &SmallImage| points::gain_of(capture, std::slice::from_ref(l), &[pose(l)]);
     let strange = strange(capture, &order, &looks, &gain);
-    let vouched = |l: &Look| gain(l).is_some_and(|gain| gain >= VOUCHED);
-    let place = |l: &Look| order.iter().position(|f| *f == l.frame).unwrap_or(0);
+    let vouched = |l: &SmallImage| gain(l).is_some_and(|gain| gain >= VOUCHED);
+    let place = |l: &SmallImage| order.iter().position(|f| *f == l.frame).unwrap_or(0);
     let doubtful: Vec<usize> = looks.par_iter().filter(|l| !vouched(l)).map(place).collect();
     looks.retain(|l| doubtful.iter().any(|k| k.abs_diff(place(l)) <= BESIDE));
     // Positions of the images in the order; unreadable ones have none.
     let at: Vec<usize> = looks.iter().filter_map(|l| order.iter().position(|f| *f == l.frame)).collect();
-    let mut bare: Vec<&mut Look> = looks.iter_mut().filter(|l| l.marks.is_empty()).collect();
+    let mut bare: Vec<&mut SmallImage> = looks.iter_mut().filter(|l| l.marks.is_empty()).collect();
     look::describe_each(&mut bare, look::COARSE);
     let suspect = |k: usize| signs.contains_key(&at[k]);
     let mut wanted = Vec::new();
@@ -166,8 +166,8 @@ impl Strange {
 fn strange(
     capture: &Capture,
     order: &[usize],
-    looks: &[Look],
-    gain: &(dyn Fn(&Look) -> Option<f64> + Sync),
+    looks: &[SmallImage],
+    gain: &(dyn Fn(&SmallImage) -> Option<f64> + Sync),
 ) -> Option<Strange> {
     capture.points.as_ref()?;
     let size = capture.frames.first().map_or(1, |f| f.source.width * f.source.height).max(1);
@@ -175,7 +175,7 @@ fn strange(
     let more = order.iter().step_by(order.len().div_ceil(most).max(1)).copied();
     let more: Vec<usize> = more.filter(|f| looks.iter().all(|l| l.frame != *f)).collect();
     let others = look::take(capture, &more, look::COARSE);
-    let all: Vec<&Look> = looks.iter().chain(&others).collect();
+    let all: Vec<&SmallImage> = looks.iter().chain(&others).collect();
     let mut gains: Vec<(f64, usize)> = all.par_iter().filter_map(|l| Some((gain(l)?, l.frame))).collect();
     gains.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
     let middle = gains.get(gains.len() / 2)?.0;

@@ -1,7 +1,7 @@
 //! Features that two images share, and whether poses put them on each other's epipolar lines, in front of both cameras.
 
 use super::super::pose::same_pose;
-use super::look::{Look, Mark};
+use super::look::{Mark, SmallImage};
 use rayon::prelude::*;
 use splat4d::math::Se3;
 use splat4d::math::se3::{cross, dot, mat_vec, norm, normalize, sub, transpose};
@@ -71,7 +71,7 @@ pub(super) fn prefers(m: &Measure) -> bool {
 }
 
 /// Mutual best matches of all pairs of looks but those of one pose, which fits them in any convention.
-pub(super) fn matches(looks: &[Look]) -> Vec<Match> {
+pub(super) fn matches(looks: &[SmallImage]) -> Vec<Match> {
     let all = (0..looks.len()).flat_map(|a| (a + 1..looks.len()).map(move |b| [a, b]));
     let pairs: Vec<[usize; 2]> = all.filter(|&[a, b]| !same_pose(&looks[a].camera, &looks[b].camera)).collect();
     pairs.par_iter().flat_map_iter(|&[a, b]| between([a, b], &looks[a].marks, &looks[b].marks, RATIO)).collect()
@@ -106,7 +106,7 @@ pub(super) fn between(looks: [usize; 2], from: &[Mark], to: &[Mark], ratio: f64)
 }
 
 /// Measures every convention; `poses` are those of the looks in each, the first as read.
-pub(super) fn measure(matches: &[Match], looks: &[Look], poses: &[Option<Vec<Se3>>]) -> Vec<Measure> {
+pub(super) fn measure(matches: &[Match], looks: &[SmallImage], poses: &[Option<Vec<Se3>>]) -> Vec<Measure> {
     let fits: Vec<Vec<bool>> = poses
         .iter()
         .map(|poses| match poses {
@@ -130,7 +130,7 @@ pub(super) fn measure(matches: &[Match], looks: &[Look], poses: &[Option<Vec<Se3
 }
 
 /// How many of the matches of two looks their poses fit.
-pub(super) fn fitting(matches: &[Match], looks: &[Look], poses: &[Se3]) -> usize {
+pub(super) fn fitting(matches: &[Match], looks: &[SmallImage], poses: &[Se3]) -> usize {
     let centers: Vec<[f64; 3]> = poses.iter().map(|p| p.inverse().translation).collect();
     let least = least(&centers);
     matches.iter().filter(|m| fits(m, looks, poses, least)).count()
@@ -144,7 +144,7 @@ fn least(centers: &[[f64; 3]]) -> f64 {
 
 /// How far every match is from its epipolar line if focal lengths are `times` as long, pixels of the small image; infinite
 /// where the rays do not meet in front of both cameras.
-pub(super) fn residuals(matches: &[Match], looks: &[Look], poses: &[Se3], times: f64) -> Vec<f64> {
+pub(super) fn residuals(matches: &[Match], looks: &[SmallImage], poses: &[Se3], times: f64) -> Vec<f64> {
     let centers: Vec<[f64; 3]> = poses.iter().map(|p| p.inverse().translation).collect();
     let least = least(&centers);
     let residual = |m: &Match| {
@@ -160,7 +160,7 @@ pub(super) fn residuals(matches: &[Match], looks: &[Look], poses: &[Se3], times:
 }
 
 /// The distance of a match from the place or line where a static scene has it, pixels of the small image.
-pub(super) fn distance(m: &Match, looks: &[Look], poses: &[Se3]) -> f64 {
+pub(super) fn distance(m: &Match, looks: &[SmallImage], poses: &[Se3]) -> f64 {
     let [a, b] = m.looks;
     let motion = poses[b].after(&poses[a].inverse());
     let centers = [a, b].map(|k| norm(poses[k].inverse().translation));
@@ -187,7 +187,7 @@ fn offset(m: &Match, motion: &Se3, in_one_place: bool) -> f64 {
 }
 
 /// Whether two rays meet, in front of both cameras.
-fn fits(m: &Match, looks: &[Look], poses: &[Se3], least: f64) -> bool {
+fn fits(m: &Match, looks: &[SmallImage], poses: &[Se3], least: f64) -> bool {
     let [a, b] = m.looks;
     let motion = poses[b].after(&poses[a].inverse());
     let tolerance = NEAR * 2.0 / (looks[a].focal() + looks[b].focal());

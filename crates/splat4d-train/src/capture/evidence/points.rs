@@ -4,7 +4,7 @@ use super::super::account::Severity;
 use super::super::lens::Distortion;
 use super::super::preflight::Finding;
 use super::super::{Aspect, Capture, DepthFile, DepthKind, Frame, PointCloud, depth};
-use super::look::{Look, pixel_of};
+use super::look::{SmallImage, pixel_of};
 use super::pairs;
 use rayon::prelude::*;
 use splat4d::Error;
@@ -117,7 +117,7 @@ pub(super) fn frames(capture: &Capture) -> Vec<usize> {
 pub(super) fn measure(
     capture: &Capture,
     (frames, poses): (&[usize], &[Se3]),
-    (looks, look_poses): (&[Look], &[Se3]),
+    (looks, look_poses): (&[SmallImage], &[Se3]),
 ) -> Measure {
     let Some(cloud) = &capture.points else { return Measure::default() };
     let chosen: Vec<usize> = (0..cloud.points.len()).step_by(step(cloud)).collect();
@@ -330,12 +330,12 @@ pub(super) fn unreadable_depth(capture: &Capture) -> Option<Error> {
 }
 
 /// How much nearer colours of some points are to the images there than to those at other points.
-pub(super) fn gain_of(capture: &Capture, looks: &[Look], poses: &[Se3]) -> Option<f64> {
+pub(super) fn gain_of(capture: &Capture, looks: &[SmallImage], poses: &[Se3]) -> Option<f64> {
     gain_of_focal(capture, looks, poses, 1.0)
 }
 
 /// The same if focal lengths are `times` as long.
-pub(super) fn gain_of_focal(capture: &Capture, looks: &[Look], poses: &[Se3], times: f64) -> Option<f64> {
+pub(super) fn gain_of_focal(capture: &Capture, looks: &[SmallImage], poses: &[Se3], times: f64) -> Option<f64> {
     let cloud = capture.points.as_ref()?;
     let chosen: Vec<usize> = (0..cloud.points.len()).step_by(step(cloud)).collect();
     gain(capture, &chosen, looks, poses, times).map(|(gain, _)| gain)
@@ -343,7 +343,7 @@ pub(super) fn gain_of_focal(capture: &Capture, looks: &[Look], poses: &[Se3], ti
 
 /// How much nearer colours are to the image there than to that at other points, and how many were compared; focal lengths
 /// are `times` as long as read. `None`: points have one colour, or too few are in images.
-fn gain(capture: &Capture, chosen: &[usize], looks: &[Look], poses: &[Se3], times: f64) -> Option<(f64, usize)> {
+fn gain(capture: &Capture, chosen: &[usize], looks: &[SmallImage], poses: &[Se3], times: f64) -> Option<(f64, usize)> {
     let cloud = capture.points.as_ref()?;
     let apart = |a: &[f32; 3], b: &[f32; 3]| a.iter().zip(b).map(|(x, y)| f64::from((x - y).abs())).sum::<f64>();
     let (mut own, mut other, mut count) = (0.0, 0.0, 0);

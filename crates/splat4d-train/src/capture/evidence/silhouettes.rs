@@ -1,6 +1,6 @@
 //! Foregrounds: right poses of cameras around an object see it at one place in front of them.
 
-use super::look::{Look, Shown};
+use super::look::{Shown, SmallImage};
 use splat4d::math::Se3;
 use splat4d::math::mat3::solve;
 use splat4d::math::se3::{dot, norm, normalize, sub};
@@ -26,7 +26,7 @@ const AIMED: f64 = 0.35;
 const ONE_MASK: f64 = 0.01;
 
 /// Part of the images whose foreground is at the place that is nearest to all; `None`: too few have one.
-pub(super) fn measure(looks: &[Look], poses: &[Se3]) -> Option<f64> {
+pub(super) fn measure(looks: &[SmallImage], poses: &[Se3]) -> Option<f64> {
     at_one_place(looks, poses, |look| look.foreground).map(|(share, _)| share)
 }
 
@@ -41,7 +41,7 @@ pub(super) enum Masks {
 }
 
 /// Whether masks or alpha hide what cameras look at, and show what is around it.
-pub(super) fn masks(looks: &[Look], poses: &[Se3]) -> Masks {
+pub(super) fn masks(looks: &[SmallImage], poses: &[Se3]) -> Masks {
     let shown: Vec<&Shown> = looks.iter().filter_map(|l| l.shown.as_ref()).collect();
     if shown.is_empty() || measure(looks, poses).is_some_and(|share| share >= CONVINCES) {
         return Masks::Fine;
@@ -64,7 +64,11 @@ pub(super) fn masks(looks: &[Look], poses: &[Se3]) -> Masks {
 
 /// Part of the images that have `what` at the place that is nearest to all, and the median angle between that place and the
 /// cameras' axes, radians; `None`: too few have it.
-fn at_one_place(looks: &[Look], poses: &[Se3], what: impl Fn(&Look) -> Option<[f64; 2]>) -> Option<(f64, f64)> {
+fn at_one_place(
+    looks: &[SmallImage],
+    poses: &[Se3],
+    what: impl Fn(&SmallImage) -> Option<[f64; 2]>,
+) -> Option<(f64, f64)> {
     let mut rays = Vec::new();
     for (look, pose) in looks.iter().zip(poses) {
         let Some([x, y]) = what(look) else { continue };

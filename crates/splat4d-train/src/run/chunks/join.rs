@@ -215,7 +215,7 @@ impl Chunked {
             cameras.sort_unstable();
             cameras.dedup();
             let scene = self.some(cut..cut + 2)?;
-            let mut look = Look {
+            let mut look = CameraRenders {
                 store: ImageStore::new(capture.clone(), 0),
                 backend: device::cpu(config),
                 capture: &capture,
@@ -238,7 +238,7 @@ impl Chunked {
 }
 
 /// Draws what cameras saw.
-struct Look<'a> {
+struct CameraRenders<'a> {
     store: ImageStore,
     backend: Box<dyn splat4d::render::Backend<f32>>,
     capture: &'a Capture,
@@ -246,7 +246,7 @@ struct Look<'a> {
     scene: &'a Scene<f32>,
 }
 
-impl Look<'_> {
+impl CameraRenders<'_> {
     /// The sum over neighbouring frames of a window of the mean |(R' − R) − (G' − G)|·255, and their number.
     fn flicker(&mut self, camera: usize, window: Range<usize>) -> Result<[f64; 2]> {
         let (mut sum, mut pairs) = (0.0, 0.0);

@@ -27,7 +27,7 @@ const NOT_FINITE: u32 = u32::MAX;
 
 /// A view of a step that was begun.
 #[derive(Debug)]
-pub(super) struct Seen {
+pub(super) struct PendingView {
     camera: Camera,
     pub t: Time,
     background: [f32; 3],
@@ -40,7 +40,7 @@ pub(super) struct Seen {
 /// All that a step is of.
 #[derive(Debug)]
 pub(super) struct Begun {
-    pub views: Vec<Seen>,
+    pub views: Vec<PendingView>,
     sh_degree: usize,
     pub alpha_min: f64,
     pub rules: Vec<[Option<ResidentRule>; KEPT]>,
@@ -156,7 +156,7 @@ impl GpuRenderer {
             }
             let held = self.pictures.hold(&self.gpu, target)?;
             able &= held.weight > 0.0;
-            views.push(Seen {
+            views.push(PendingView {
                 camera: view.camera.clone(),
                 t: view.t,
                 background: view.background,
@@ -381,7 +381,7 @@ impl GpuRenderer {
     fn stepped(&mut self, step: &Begun, words: &[u32]) -> ResidentStepped {
         let tables = self.resident.as_ref().expect("tables are kept");
         let status = tables.status(step.views.len());
-        let view = |(i, view): (usize, &Seen)| {
+        let view = |(i, view): (usize, &PendingView)| {
             let at = STEP_WORDS + VIEW_WORDS * i;
             let sums = [0, 1, 2].map(|k| f64::from(f32::from_bits(words[at + k])));
             (self.stats.visible, self.stats.pairs) = (words[at + 3] as usize, words[at + 4] as usize);
