@@ -44,7 +44,7 @@ pub(crate) fn command(seconds: &str, folder: &Path) -> Result<()> {
             write_file(&folder.join(format!("images/{}/{t:06}.jpg", camera.name)), &jpeg(&rgb, WIDTH, HEIGHT)?)
         })?;
     }
-    // Points of what stands still: of a long take no moment's characters are worth starting from.
+    // Points of what stands still: of a long take no moment's characters are a useful start.
     let hall = stage.with(&Mesh::default(), Vec::new());
     let seen: Vec<(Visibility, Vec<u8>)> = (cameras.par_iter())
         .map(|camera| {

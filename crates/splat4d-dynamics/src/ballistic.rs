@@ -4,7 +4,7 @@ use crate::paths::{Moment, Paths, Pose, exp, turn};
 use splat4d::math::quat;
 use splat4d::math::se3::{add, scale};
 
-/// Frames that tell velocities (methods of robust finite differences: three to five).
+/// Frames from which velocities are estimated (methods of robust finite differences: three to five).
 pub(crate) const WINDOW: usize = 5;
 /// Share of the acceleration that is left after a frame.
 pub(crate) const DAMPING: f64 = 0.9;
@@ -48,7 +48,7 @@ impl Rates {
             }
         }
         let det = m[0] * m[2] - m[1] * m[1];
-        // Two frames tell no curve.
+        // Two frames determine no curve.
         let (velocity, acceleration) = if curved && n > 2 {
             (
                 std::array::from_fn(|c| (m[2] * b[0][c] - m[1] * b[1][c]) / det),

@@ -98,7 +98,7 @@ impl Fitted {
     pub fn fit(model: Model, paths: &Paths, actions: Option<&Actions>, settings: &Settings) -> Result<Self> {
         if paths.len() < LEAST_TICKS {
             return Err(Error::input(format!("{} observed frames are too few to predict from", paths.len()))
-                .remedy(format!("Observe {LEAST_TICKS} at least, and some periods of whatever repeats")));
+                .remedy(format!("Observe {LEAST_TICKS} at least, and several periods of periodic motion")));
         }
         if let Some(actions) = actions {
             actions.check(paths.len(), 1)?;
@@ -108,10 +108,8 @@ impl Fitted {
             Model::Velocity => Self::Ballistic(None),
             Model::Acceleration => Self::Ballistic(Some(DAMPING)),
             Model::Extrapolate => {
-                return Err(Error::input(
-                    "what a motion model says of later times is asked of the scene, not of nodes",
-                )
-                .remedy("Follow the nodes through the scene"));
+                return Err(Error::input("forecasts of a motion model come from the scene, not from nodes")
+                    .remedy("Follow the nodes through the scene"));
             }
             Model::Koopman => Self::Koopman(Box::new(Linear(Koopman::fit(paths)))),
             Model::Causal => {

@@ -77,7 +77,7 @@ fn look(scene: &Scene<f32>, t: f64) -> Look {
 pub fn observe(scene: &Scene<f32>, ticks: &[f64], count: usize) -> Result<Observed> {
     if ticks.len() < LEAST_TICKS {
         return Err(Error::input(format!("{} observed frames are too few to predict from", ticks.len()))
-            .remedy(format!("Observe {LEAST_TICKS} at least: train with a larger --observe, or a longer take")));
+            .remedy(format!("Observe {LEAST_TICKS} at least: train with a larger --observe, or a longer capture")));
     }
     if !(1..=MAX_NODES).contains(&count) {
         return Err(Error::input(format!("{count} nodes cannot be")).remedy(format!("Give 1 to {MAX_NODES}")));
@@ -93,7 +93,7 @@ pub fn observe(scene: &Scene<f32>, ticks: &[f64], count: usize) -> Result<Observ
     let carriers = sociable(carriers);
     if carriers.len() < 2 {
         return Err(Error::input("nothing moves in the observed part: there is nothing to predict")
-            .remedy("Give a take in which something moves, or a run of a motion model that shows it"));
+            .remedy("Give a capture with motion, or a run whose motion model represents it"));
     }
     let mut table = Table::new(&[("mean", 3)], carriers.len());
     carriers.iter().enumerate().for_each(|(i, x)| table.write(i, 0, *x));

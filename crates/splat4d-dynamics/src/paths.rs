@@ -112,7 +112,7 @@ pub fn turn(a: [f64; 4], b: [f64; 4]) -> [f64; 3] {
 /// Neighbours of every node, by which rotations follow from positions.
 pub struct Neighbours(Vec<Vec<usize>>);
 
-/// Neighbours that tell a node's rotation.
+/// Neighbours that determine a node's rotation.
 const FRAME_NEIGHBOURS: usize = 6;
 /// Weight of the rotation before, of the neighbours' covariance: decides where these lie on a line.
 const KEEP: f64 = 1e-3;

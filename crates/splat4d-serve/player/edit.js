@@ -314,7 +314,7 @@ export class Editing {
     this.#properties();
     this.#diamonds();
     this.#state();
-    // What was made again under somebody's keys is theirs again.
+    // A keyframe made again keeps its owner.
     if (focused && !this.panel.contains(this.ui.focused())) this.panel.querySelector(`[aria-label="${CSS.escape(focused)}"]`)?.focus();
   }
 

@@ -100,7 +100,7 @@ export class Stream {
     return this.#flight.size;
   }
 
-  /// Tells what is shown. Cheap where nothing changed: call it every frame.
+  /// Reports what is shown. Cheap where nothing changed: call it every frame.
   update(time, { playing = false, speed = 1, loop = true } = {}) {
     if (this.#over) return;
     const t = this.#file.clamp(time);

@@ -131,7 +131,7 @@ fn file_etag(meta: &Metadata) -> String {
 }
 
 impl Version {
-    /// The same, as long as its file has become: one of an unfinished take is appended to while somebody plays it, and what
+    /// The same, as long as its file has become: one of an unfinished take is appended to while it is played, and what
     /// was there stays as it was.
     fn grown(&self) -> Self {
         let Source::File(file) = &self.source else { return self.clone() };

@@ -338,7 +338,7 @@ impl Cooked {
 }
 
 /// Bakes and packs a scene within its bytes and time, and compares it with its model. Cuts it again where the first cut was
-/// further off than a comparison can tell, without sampling the model again.
+/// further off than a comparison can measure, without sampling the model again.
 pub fn bake_like(source: &Source, title: &str, baking: &Baking, console: &dyn Listener) -> Result<Cooked> {
     let (scene, deadline) = (&source.scene, &baking.deadline);
     let views = source.views()?;

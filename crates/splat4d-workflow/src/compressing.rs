@@ -626,7 +626,7 @@ fn say(told: &Compressed, size: [usize; 2], console: &dyn Listener) {
         let plain = plain.map_or_else(String::new, |plain| {
             format!("{:.1} times smaller than the plain playback file, ", plain.bytes as f64 / told.after.bytes as f64)
         });
-        // Nobody ships floats: their figure stands alone only where there is no plain file.
+        // Floats are never shipped: their figure stands alone only where there is no plain file.
         let smaller = match plain.is_empty() {
             true => format!("{times:.1} times smaller than 32-bit floats, "),
             false => plain,

@@ -20,7 +20,7 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Width and height of the images unless told: the frame rates of docs/benchmarks.md are at this size.
+/// Width and height of the images by default: the frame rates of docs/benchmarks.md are at this size.
 pub const SIZE: [usize; 2] = [800, 800];
 /// Images of a round: enough that every side of the scene and all parts of the clip take part.
 const LOOKS: usize = 24;
@@ -253,7 +253,7 @@ impl<'a> Seat<'a> {
     }
 }
 
-/// Sizes and counts that can be told without drawing.
+/// Sizes and counts that are known without rendering.
 fn weighed(scene: &Scene<f32>, bytes: usize) -> Side {
     let numbers = |l: &splat4d::layers::Layer| l.params.keys().map(|k| l.params[k].data().len()).sum::<usize>();
     let seconds = scene.clip[1] - scene.clip[0];
@@ -286,7 +286,7 @@ fn first_picture(subject: &Subject<'_>, stored: &Arc<[u8]>, look: &MeasuredView)
     match &subject.what {
         What::Scene(_) => {
             let (scene, mut moment) = (scene_file::read(stored)?, Evaluation::default());
-            // A player would look up first when everybody lives, which pays from the second image on.
+            // A player would first look up which Gaussians are alive, which pays from the second image on.
             scene.at(look.time, &mut moment);
             renderer.render(&Shot::new(&scene.splats(&moment), &look.camera, scene.background), &mut image);
         }

@@ -19,7 +19,7 @@ use std::sync::Arc;
 
 /// Rows that share one test of whether any of them is alive: the blocks of the playback file.
 const BLOCK: usize = crate::format::playback::BLOCK_GAUSSIANS;
-/// Memory for unpacked pages unless told, bytes.
+/// Memory for unpacked pages by default, bytes.
 pub const DEFAULT_BUDGET: usize = 1 << 30;
 
 /// An image of a scene at a time, on the CPU, over the scene's own background. To render many, keep a [`Player`], a
@@ -64,7 +64,7 @@ struct Alive {
 
 impl Alive {
     fn of(layer: &Layer) -> Self {
-        // Asked within its span, because outside of it nobody is alive.
+        // Evaluated within its span, because outside of it no Gaussian is alive.
         let inside = if layer.span[0].is_finite() { layer.span[0] } else { 0.0 };
         if layer.active(Time(inside), &mut Vec::new()) {
             return Self { all: true, ..Self::default() };

@@ -259,7 +259,7 @@ mod tests {
     #[test]
     fn the_same_bytes_come_out_everywhere() {
         let all: Vec<String> = NAMES.iter().map(|(name, _)| format!("{name} {}", print_of(name))).collect();
-        // Whoever changes what is drawn also changes `VERSION`, so that old drawings are not taken for new ones.
+        // A change of what is drawn must also change `VERSION`, so that old drawings are not taken for new ones.
         assert_eq!((VERSION, all.join("\n")), (2, PRINTS.trim().to_owned()));
     }
 

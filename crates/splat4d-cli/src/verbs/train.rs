@@ -28,7 +28,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-/// A new image of the learning scene about so often: sooner than anybody would reload, later than they could follow.
+/// A new image of the learning scene about so often: shorter than a user would wait before reloading, longer than a
+/// page needs to update.
 const SNAPSHOT_INTERVAL: Duration = Duration::from_secs(3);
 
 /// Time between two looks whether the worker that begins a long take is done with that.
@@ -238,12 +239,12 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             extract(&source, &stop, console)?;
         }
         console.phase("reading the capture", 0, 0);
-        // Of a long take no more is listed than tells that it is one.
+        // Of a long take no more is listed than is needed to recognise it.
         let capture = Arc::new(open_frames(&source, &recipe, look_ahead(&recipe), &Lenses::default())?);
         let output = again.as_ref().map(|(run, _)| run).or(args.output.as_ref());
         let asked = RunRequest::of(&capture, &recipe, minutes, predict);
         let place = || place(args, output, &capture, &asked, console);
-        // A take that is not told to be cut keeps to its minutes at once.
+        // A capture without requested chunks keeps to its minutes directly.
         let at_once = minutes.is_some() && recipe.chunks.frames == 0;
         let is_begun = || output.filter(|run| Chunked::is(run) && !args.force);
         // Steps that were fitted to minutes are those of the worker that began.
@@ -281,7 +282,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             console.say(&chunked::in_words(&outlook));
             let watch = watch(&capture.name, Some(&capture));
             let begun = Chunked::begin(&capture, &outlook.recipe, &run, &mut |event| listen(event, &watch))?;
-            let chunked = begun.expect("a take that has a plan is learnt by it").paced(outlook.pacing);
+            let chunked = begun.expect("a capture with a plan is trained by it").paced(outlook.pacing);
             let _folder = match folder {
                 Ok(own) => {
                     write_cameras(&run, &once(&capture))?;

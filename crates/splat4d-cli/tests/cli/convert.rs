@@ -87,7 +87,7 @@ fn a_moving_scene_goes_everywhere() {
     let z = p[GEOMETRY].get(7, 2) + 0.25 * p[v].get(7, 2);
     assert!((own[GEOMETRY].get(7, 1) + z).abs() < 1e-5, "{} {z}", own[GEOMETRY].get(7, 1));
     assert_eq!(own[SH].width(), 3);
-    // ... unless told to keep its axes.
+    // ... by default to keep its axes.
     convert("birds.safetensors", "kept.ply", &["--time", "0.5", "--up", "keep"]);
     assert_eq!(open(&at("kept.ply")).layers[0].params[GEOMETRY].read::<3>(7, 0), p[GEOMETRY].read::<3>(7, 0));
     convert("birds.safetensors", "z.spz", &["--time", "0.5", "--up=-z", "--spz-version", "4"]);

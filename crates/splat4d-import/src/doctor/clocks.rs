@@ -95,7 +95,7 @@ pub(super) fn clocks(capture: &Capture, seen: &[Seen], report: &mut Report, prog
             let name = &capture.cameras[c].name;
             let way = if off > 0.0 { "early" } else { "late" };
             let what = format!(
-                "Camera {name}: its clock is {:.1} ± {:.1} ms {way}: what moves is {blur:.1} px (of 1920) off.",
+                "Camera {name}: its time offset is {:.1} ± {:.1} ms {way}: motion is displaced by {blur:.1} px (of 1920).",
                 1e3 * off.abs(),
                 1e3 * sigma
             );
@@ -121,7 +121,7 @@ pub(super) fn clocks(capture: &Capture, seen: &[Seen], report: &mut Report, prog
                 1e3 * sigma
             );
             let words = (
-                "What moves fast leans, and differently in each view.",
+                "Fast motion leans, and differently in each view.",
                 "Film at a higher rate: it reads its rows faster.",
             );
             Told { report }.add((g, "rolling-shutter"), Some(name), (1e3 * seconds, "ms"), what, words);

@@ -47,7 +47,7 @@ pub(super) struct Seen {
     pub(super) clipped: [f64; 2],
     /// Step across the borders of blocks of 8 pixels over that elsewhere.
     pub(super) blocks: f64,
-    /// Pixels that what stands still went.
+    /// Pixels that the background moved.
     pub(super) moved: Option<f64>,
     /// Detail of the take's last third relative to its first.
     pub(super) focus: Option<f64>,
@@ -158,9 +158,9 @@ fn focus(pictures: &[Rgb8]) -> Option<f64> {
     (first > 0.0).then(|| last / first)
 }
 
-/// How far what stands still went from the first images to the last, pixels: the median of corners next to which
+/// How far the background moved from the first images to the last, pixels: the median of corners next to which
 /// nothing
-/// moves in either of them. `None` if there are too few to tell.
+/// moves in either of them. `None` if there are too few.
 fn moved(ends: [&[Rgb8]; 2]) -> Option<f64> {
     let still = ends.map(|end| Grey::of(&median_of(end)));
     let across = still[0].width.div_ceil(CELL);
@@ -230,7 +230,7 @@ pub(super) fn camera(capture: &Capture, store: &ImageStore, camera: usize, optio
         }
     }
     let first = (frames.len() - frames.len().min(options.window)) / 2;
-    // Of a moving camera only its darkness is asked, which a few images tell.
+    // Of a moving camera only the darkness is needed, for which a few images suffice.
     let row = if fixed { &frames[first..first + frames.len().min(options.window)] } else { &chosen[..] };
     let still = (fixed && same && frames.len() >= MEDIAN_FROM).then(|| Grey::of(&seen.stands[0].picture));
     let mut tracker = Tracker::new(options.tracks, APART);

@@ -24,7 +24,7 @@ pub(super) fn target(views: &[&Camera]) -> Option<[f64; 3]> {
 }
 
 /// Of the visual hull of what moves (Laurentini 1994; moment by moment, as far as two cameras see it) the part that three see;
-/// None where too little moves to tell.
+/// None where too little moves.
 pub(super) fn seen_by_three(seen: &[&Seen], target: [f64; 3]) -> Option<f64> {
     let views: Vec<&Camera> = seen.iter().map(|s| &s.stands[0].view).collect();
     let mut far: Vec<f64> = views.iter().map(|v| norm(sub(v.center(), target))).collect();

@@ -30,7 +30,7 @@ const UNLIKE: f64 = 0.03;
 /// Directions farther than this from the mean are left out (cosine of 10 degrees).
 const ASKEW: f64 = 0.985;
 
-/// What tags tell.
+/// Results from tags.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Found {
     /// Metres of the unit that lengths had.
@@ -222,7 +222,7 @@ impl Placed {
     }
 }
 
-/// What placed tags tell.
+/// Results from placed tags.
 fn of(board: &Board, placed: &[Placed], held: [f64; 3]) -> Result<Found> {
     let contradicts = |what: String| {
         Error::input(what).remedy(

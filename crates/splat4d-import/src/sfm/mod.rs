@@ -107,9 +107,9 @@ pub struct Solution {
 
 /// Finds where images were taken from.
 ///
-/// The world's unit is the median distance of the cameras from what they see; its axes are those of the camera that was placed
-/// first. Lengths and the vertical must come from elsewhere. Where all places are known, so are unit and axes: then only points
-/// and clocks are found.
+/// The world's unit is the median distance of the cameras from the points; its axes are those of the camera that was
+/// placed first. Lengths and the vertical must come from elsewhere. Where all places are known, so are unit and axes:
+/// then only points and clocks are found.
 ///
 /// Errors: images that cannot be read; no two that show one scene.
 pub fn solve(pictures: &dyn Pictures, options: &Options, progress: &mut Progress<'_>) -> Result<Solution> {

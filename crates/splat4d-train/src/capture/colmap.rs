@@ -60,7 +60,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     let names: Vec<&str> = shots.iter().map(|(name, _)| name.as_str()).collect();
     let base = if of_rig { root.clone() } else { lookup.folder_of(&names) };
     let mut files = files(&lookup, &base, &names)?;
-    // Names tell cameras apart by forward slashes.
+    // Names separate cameras by forward slashes.
     shots.iter_mut().for_each(|(name, _)| *name = name.replace('\\', "/"));
     if !of_rig {
         unregistered::settle(&base, &mut shots, &mut files, options, &mut account);

@@ -137,7 +137,7 @@ pub trait Frames: Send + Sync {
     fn has_depth(&self) -> bool {
         false
     }
-    /// How far matches of frames of moving cameras agree with a static scene; `None`: that cannot be told.
+    /// How far matches of frames of moving cameras agree with a static scene; `None`: undetermined.
     fn agreement(&self) -> Option<Agreement> {
         None
     }

@@ -203,7 +203,7 @@ pub struct Capture {
     pub kind: CaptureKind,
     /// The cameras; a moving camera is one entry that is not `fixed`.
     pub cameras: Vec<Rig>,
-    /// Whether the data set, or the names of its images (`cam07`), tell cameras apart; else an entry is one camera's
+    /// Whether the data set, or the names of its images (`cam07`), separate cameras; else an entry is one camera's
     /// photo of a
     /// moment, or stands for many.
     pub named: bool,
@@ -264,7 +264,7 @@ struct RawCapture {
     take: Extent,
     /// The first image of each camera, where the reader listed a part of the take.
     firsts: BTreeMap<usize, PathBuf>,
-    /// The data set's convention, where it is not told by the frames' splits.
+    /// The data set's convention, where the frames' splits do not give it.
     hold_out: Option<HoldOut>,
     fps: f64,
     points: Option<PointCloud>,

@@ -19,7 +19,7 @@ impl Capture {
         let (first, last) = times().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), t| (a.min(t), b.max(t)));
         if last <= first {
             return Err(place(Error::input("all images of the capture have the same time, so there is no future"))
-                .remedy("Leave --observe away, or give a moving take"));
+                .remedy("Leave --observe away, or give a capture with motion"));
         }
         if !(share > 0.0 && share < 1.0) {
             return Err(place(Error::input("the observed share leaves nothing to train on, or no future"))

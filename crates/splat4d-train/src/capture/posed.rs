@@ -63,7 +63,7 @@ fn of_pictures(shots: &[(String, Camera)]) -> Result<Vec<PosedCamera>> {
             None => out.push(PosedCamera { name, camera: camera.clone() }),
             Some(known) if alike(&known.camera, camera) => {}
             Some(_) => {
-                return Err(Error::input(format!("camera {name:.80} is in several places, as {path:.200} shows"))
+                return Err(Error::input(format!("camera {name:.80} has several positions, as {path:.200} shows"))
                     .remedy("A calibration describes fixed cameras: give a reconstruction of one time."));
             }
         }

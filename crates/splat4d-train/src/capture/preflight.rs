@@ -93,7 +93,7 @@ impl Capture {
             let remedy = match aspect(warning) {
                 // The remark says what to do.
                 Some(_) => "",
-                None => "docs/capture-format.md says what the layout expects.",
+                None => "See docs/capture-format.md for the layout.",
             };
             let found = finding(Severity::Warning, warning.clone(), remedy);
             findings.push(Finding { aspect: aspect(warning), ..found });
@@ -186,7 +186,7 @@ impl Capture {
         }
         findings.push(finding(
             Severity::Note,
-            format!("The instants are unevenly spaced: gaps from {low:.4} s to {high:.4} s."),
+            format!("The times are unevenly spaced: gaps from {low:.4} s to {high:.4} s."),
             "Check frame numbers and time offsets; missing frames and unsynchronised cameras blur fast motion.",
         ));
     }
@@ -209,7 +209,7 @@ impl Capture {
             findings.push(finding(
                 Severity::Warning,
                 format!("Cameras recorded at other times than most others: {}.", first_names(&late)),
-                "Check their clocks: what moves is seen by them at no time that others see.",
+                "Check their clocks: they have no time in common with the other cameras.",
             ));
         }
     }

@@ -1,4 +1,4 @@
-//! Localisation: from where and when an image was taken, told by a scene that stays as it is.
+//! Localisation: pose and time of an image in a fixed scene.
 //!
 //! The best of some starts, at some moments, are found in small images. Each is then moved to where the scene
 //! differs least
@@ -24,7 +24,7 @@ const MOMENTS: usize = 12;
 const MOST_STARTS: usize = 128;
 /// Steps of Newton's method in images of a size, at most.
 const STEPS: usize = 15;
-/// Pixels by which what is seen moves when a derivative is taken, and the movement that is no longer worth a step.
+/// Pixels by which what is seen moves when a derivative is taken, and the movement below which no step is made.
 const DIFFERENCE: f64 = 0.5;
 const SMALL: f64 = 0.01;
 /// Damping at first, its factor from step to step, and how often a step is tried again with more of it.

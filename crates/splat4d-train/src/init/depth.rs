@@ -1,6 +1,6 @@
 //! Points that depth maps show: pixels of training images, unprojected. A point through which an image of another time
 //! sees what is farther away belongs to something that moves: it lives about its moment, and begins with the velocity that
-//! optical flow and the depth at both of its ends tell ([`super::scene_flow`]). All others stand still.
+//! optical flow and the depth at both of its ends determine ([`super::scene_flow`]). All others stand still.
 
 use super::map::Map;
 use super::{Seeds, scene_flow};

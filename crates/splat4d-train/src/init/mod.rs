@@ -305,7 +305,7 @@ pub fn scene(
             let (center, mut width) = beginnings[i].life;
             let mut softness = INITIAL_SOFTNESS_FRAMES / plan.fps;
             if life == LifeKind::Interval && seeds.times[i].is_none() {
-                // Flat ends outside the clip would never be felt: nobody could learn to come or go.
+                // Flat ends outside the clip would have no gradient: no Gaussian could learn to appear or vanish.
                 (width, softness) = (OPEN_LIFE.0 * plan.seconds(), OPEN_LIFE.1 * plan.seconds());
             }
             params[LIFE].write(i, 0, [center as f32, width.ln() as f32]);

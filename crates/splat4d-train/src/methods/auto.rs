@@ -21,8 +21,7 @@ pub struct CaptureStats {
     pub times: usize,
     /// Training images a moment.
     pub cameras: f64,
-    /// Share of the pixels of fixed cameras that change from one of their frames to the next; none where that cannot be
-    /// told.
+    /// Share of the pixels of fixed cameras that change from one of their frames to the next; none where undetermined.
     pub changing: Option<f64>,
     /// How far matches of frames of a moving camera agree with a static scene; none where cameras are fixed, or too little
     /// matches.

@@ -114,7 +114,7 @@ impl Method for DeformMethod {
         if warmup > 0 {
             let mut first = self.stage(plan, 0, warmup);
             first.name = "deform-mlp, still".into();
-            // A network that rests and learns nothing is not asked; nobody need wait for it.
+            // A network that is frozen is not evaluated.
             first.start = Some(learns(false));
             first.end = Some(learns(true));
             out.push(first);

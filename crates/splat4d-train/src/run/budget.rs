@@ -170,7 +170,7 @@ mod tests {
     const STEPS: usize = 6000;
     const START: usize = 5000;
     const CAP: usize = 30_000;
-    /// Steps' worth of what follows the last.
+    /// Time of what follows the last step, in steps.
     const FINISH: f64 = 200.0;
 
     /// A run on a machine with a clock of its own: seconds in all, and the plans.

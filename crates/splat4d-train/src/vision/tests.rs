@@ -215,7 +215,7 @@ fn images_without_texture_and_single_cameras_give_no_points() {
 fn wrong_poses_give_few_points() {
     let right = Room::new(6, 1.0);
     let mut wrong = Room::new(6, 1.0);
-    // The images are those of the right cameras: only what is told of them is wrong.
+    // The images are those of the right cameras: only what is stated about them is wrong.
     struct Told<'a>(&'a Room, &'a Room);
     impl Frames for Told<'_> {
         fn len(&self) -> usize {

@@ -16,7 +16,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-/// Nodes unless told (SC-GS).
+/// Nodes by default (SC-GS).
 const NODES: usize = 512;
 /// Rounds of turning and moving: after these no eye sees a difference.
 const ROUNDS: usize = 8;
@@ -204,7 +204,7 @@ fn unmoved(rest: &[[f64; 3]]) -> Vec<NodeOffset> {
 
 /// A drag under the hand: one moment of a scene, of which nodes are pulled again and again. What is shown is what a step with
 /// the same nodes, handles and pins makes of that moment; away from the second at which places are meant nearly so, because who
-/// follows which node is then told by where all are now.
+/// follows which node then depends on their current positions.
 #[derive(Clone, Debug)]
 pub struct Dragging {
     scene: Scene<f32>,
@@ -417,7 +417,7 @@ fn pulls(layer: &Layer<f32>, bend: &Bend<'_>, neighbours: usize) -> Vec<(u32, f3
     let mut out = vec![(0, 0.0); spans.len() * neighbours];
     let questions: Vec<(Rows<'_>, Time)> =
         asked.iter().zip(bend.times).map(|(ids, t)| (Rows::Some(ids), Time(*t))).collect();
-    // Tables that pull nobody yet: the answer is that of the model inside.
+    // Tables without any pull yet: the result is that of the model inside.
     sweep(layer, &questions, |k, tape| {
         let nodes = &bend.paths[k];
         let one = |j: usize| {

@@ -666,7 +666,7 @@ fn the_preview_of_a_drag_equals_its_step() {
                 Step::Drag { select: "all".into(), at: 0.5, nodes: 24, handles: vec![handle], pins: pins.to_vec() };
             let (bent, _) = replay(&[step], scene.clone(), &bench, &mut |_, _| {}).unwrap();
             let same = psnr(&draw(&bent, now), &draw(dragging.scene(), 0.0));
-            // Elsewhere in time it is told by other places who follows whom.
+            // Elsewhere in time other positions decide which Gaussian follows which node.
             assert!(same > if now == 0.5 { 50.0 } else { 36.0 }, "{same} dB at {now}");
             assert!(psnr(&draw(&scene, now), &draw(dragging.scene(), 0.0)) < 35.0, "something was bent");
             dragging.pull(&[], &[]).unwrap();

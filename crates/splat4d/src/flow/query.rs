@@ -89,7 +89,7 @@ pub fn follow(scene: &Scene<f32>, queries: &[Query], times: &[f64]) -> Followed 
     };
     let columns: Vec<(usize, usize)> = times.iter().enumerate().map(|(c, &t)| (index(t), c)).collect();
     let column = |k: usize| columns.binary_search_by_key(&k, |c| c.0).ok().map(|i| columns[i].1);
-    // Before the first query and behind the last nobody is on the way in the one direction and the other.
+    // Before the first query and behind the last nothing moves in either direction.
     let (first, last) = (begins.iter().min().copied().unwrap_or(0), begins.iter().max().copied().unwrap_or(0));
     let forwards: Vec<usize> = (first..moments.len()).collect();
     let backwards: Vec<usize> = (0..(last + 1).min(moments.len())).rev().collect();

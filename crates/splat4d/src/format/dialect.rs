@@ -137,7 +137,7 @@ impl Dialect {
         DIALECTS.iter().rev().find(|d| d.mark.is_some_and(|mark| mark(bytes))).copied()
     }
 
-    /// What a file is by its content; by the ending of its name where nothing in the content could tell it.
+    /// What a file is by its content; by the ending of its name where the content does not decide.
     pub fn of_file(name: &str, bytes: &[u8]) -> Option<Self> {
         Self::of(bytes).or_else(|| Self::by_ending(name).filter(|d| d.mark.is_none()))
     }
@@ -310,7 +310,7 @@ mod tests {
         assert_eq!(Dialect::by_ending("a.COMPRESSED.ply"), Some(ply::COMPRESSED));
         assert_eq!(Dialect::by_ending("a.b.ply"), Some(ply::DIALECT));
         assert_eq!(Dialect::by_ending("ply"), None);
-        // An ending counts only where nothing else can tell.
+        // An ending counts only where nothing else decides.
         assert_eq!(Dialect::of_file("a.splat", b"GIF89a"), Some(splat::DIALECT));
         assert_eq!(Dialect::of_file("a.splat", &splatv::MAGIC), Some(splatv::DIALECT));
         assert_eq!(Dialect::of_file("a.ply", b"GIF89a"), None);

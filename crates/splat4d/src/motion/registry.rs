@@ -110,7 +110,7 @@ impl Polynomial {
     ///
     /// Panics: the layer's Gaussians live for ever.
     pub fn recentre<F: Real>(&self, p: &mut Params<F>, row: usize, shift: f64) {
-        assert!(p[LIFE].width() > 0, "who lives for ever has no centre of life to move");
+        assert!(p[LIFE].width() > 0, "a Gaussian without lifespan has no temporal centre to move");
         let travel = self.travel(p, row, shift);
         p[GEOMETRY].add(row, 0, travel.map(F::of));
         if let Some(key) = self.velocities {
@@ -213,7 +213,7 @@ macro_rules! registry {
                 $(Spec::$w_variant($w_bound) => Model::build($wrapper, p),)*
                 Spec::Custom(name) => outside::build(name, p).unwrap_or_else(|| {
                     Err(Error::input(format!("motion model `{name}` is not one of this version's"))
-                        .remedy(format!("It knows: {}. A newer splat4d may know more", BUILT_IN.join(", "))))
+                        .remedy(format!("Known are: {}. A newer splat4d may have more", BUILT_IN.join(", "))))
                 }),
             }
         }

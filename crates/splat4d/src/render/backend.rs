@@ -117,7 +117,7 @@ pub trait Backend<F: Real = f32>: Send {
     }
 
     /// Radius of every splat of the last render that was taken back: 3σ of the larger axis, pixels; 0: not drawn. Empty
-    /// where the backend has no way back.
+    /// where the backend has no backward pass.
     fn radii(&self) -> &[F];
 
     /// The limits that it draws with.

@@ -34,7 +34,7 @@ impl Map<'_> {
 /// moves: a share fits that is small against the other cameras', where what stands still fits. It shows another time, or another
 /// take. Of four cameras of the bundled capture, one of them half a second apart, 23 % and 57 to 62 %; together 64 to 73 %.
 pub(super) fn of(told: &[[[usize; 2]; 2]]) -> Vec<bool> {
-    /// Matches that tell.
+    /// Matches that are needed.
     const TELL: usize = 40;
     /// Of the others' share.
     const LEAST: f64 = 0.5;

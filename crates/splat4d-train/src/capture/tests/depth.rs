@@ -53,7 +53,7 @@ fn maps_are_read_in_scene_units_and_reduced_on_one_surface_only() {
     assert!(load(&sample, 1, 0).unwrap().is_none(), "camera 0 has none");
     let (half, _) = load(&sample, 2, 2).unwrap().unwrap();
     assert!((half.get(0, 1, 3) - 1.0675).abs() < 1e-6 && half.get(0, 1, WIDTH / 2 - 1) == 0.0);
-    // An edge between a near and a far surface is nobody's depth.
+    // An edge between a near and a far surface is no surface's depth.
     let edge: Vec<f32> = (0..WIDTH * HEIGHT).map(|p| if p % WIDTH < 7 { 1.0 } else { 3.0 }).collect();
     write_npy(&sample, &[HEIGHT, WIDTH], &edge);
     sample.edit("capture.json", |v| v["cameras"][1]["depth_scale"] = json!(2.0));

@@ -184,7 +184,7 @@ pub(crate) fn palette_rate(rates: &RateSettings, share: f64) -> Rate {
 }
 
 /// A stage on the pages of a file, whatever model they were baked from: all groups of kinematic primitives with a life,
-/// in every layer. Its `start` is still to be told: it ends with [`Quantised::begin`].
+/// in every layer. Its `start` is still to be set: it ends with [`Quantised::begin`].
 pub(crate) fn stage(
     recipe: &Recipe,
     plan: &TrainContext,

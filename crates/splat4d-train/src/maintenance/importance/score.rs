@@ -1,4 +1,4 @@
-//! Importance scores of Gaussians: how much of the training images each is, at instants that its life serves well.
+//! Importance scores of Gaussians: how much of the training images each is, at times that its life serves well.
 //!
 //! Source: 4DGS-1K (Yuan et al. 2025, §4.1); the volume as LightGaussian (Fan et al. 2024).
 
@@ -19,7 +19,7 @@ use splat4d::scene::Time;
 const VOLUME_PERCENTILE: f64 = 0.9;
 /// Power of the relative volume (LightGaussian).
 const VOLUME_POWER: f64 = 0.1;
-/// Variances below this share of the largest are not told apart: covariances are f32.
+/// Variances below this share of the largest are not distinguished: covariances are f32.
 const THINNEST: f64 = 1e-6;
 /// Frames of a unit of time: a second at the 30 frames a second of 4DGS-1K's captures.
 pub const UNIT_FRAMES: f64 = 30.0;

@@ -36,7 +36,7 @@ pub(super) const FILE: &str = "still.safetensors";
 pub(super) const LAYER: &str = "still";
 /// Folder of the medians.
 const CAPTURE: &str = "capture";
-/// Parts of the take, each of which has a median: more than one, so that exposures can be told from the scene.
+/// Parts of the take, each of which has a median: more than one, so that exposures can be separated from the scene.
 const PARTS: usize = 4;
 /// Frames whose median that is.
 const MEDIAN_OF: usize = 9;
