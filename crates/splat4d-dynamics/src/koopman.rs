@@ -88,7 +88,7 @@ impl Koopman {
         Self { pairs: (0..count).fold(Vec::new(), |pairs, _| grown(&pairs, &components)) }
     }
 
-    /// The moments after the last of `paths`.
+    /// The times after the last of `paths`.
     pub(crate) fn rollout(&self, paths: &Paths, horizon: usize) -> Vec<Moment> {
         let (y, ticks) = (numbers(paths), paths.len());
         let basis = columns(&self.pairs, ticks + horizon);

@@ -266,7 +266,7 @@ impl<N: Network> Learnt<N> {
         parts.zip(&self.units).flat_map(|(part, unit)| part.iter().map(move |x| (x * unit) as f32)).collect()
     }
 
-    /// The moments after the last of `paths`; row t of the actions acts after tick t.
+    /// The times after the last of `paths`; row t of the actions acts after tick t.
     pub fn rollout(&self, paths: &Paths, actions: Option<&Actions>, horizon: usize) -> Vec<Moment> {
         let ticks = paths.len();
         let mut hidden = vec![0.0; self.net.memory() * paths.nodes()];

@@ -13,7 +13,7 @@ use splat4d::scene::Params;
 /// Rungs of the ladder, lowest first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Model {
-    /// B0: the last moment for ever.
+    /// B0: the last time for ever.
     Freeze,
     /// B1: constant velocity and turn.
     Velocity,
@@ -136,7 +136,7 @@ impl Fitted {
         })
     }
 
-    /// The `horizon` moments after the last of `paths`. Row t of the actions acts after tick t.
+    /// The `horizon` times after the last of `paths`. Row t of the actions acts after tick t.
     pub fn rollout(&self, paths: &Paths, actions: Option<&Actions>, horizon: usize) -> Vec<Moment> {
         match self {
             Self::Freeze => freeze(paths, horizon),

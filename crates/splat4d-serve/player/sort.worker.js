@@ -168,7 +168,7 @@ class Sorter {
   }
 
   /// Writes the visible Gaussians (row·1024 + column) at `time` into `out`, the farthest first, by the camera's depth
-  /// z = a·x + b·y + c·z + d for `depth` [a, b, c, d]. Returns {count, active: Gaussians of this moment's
+  /// z = a·x + b·y + c·z + d for `depth` [a, b, c, d]. Returns {count, active: Gaussians of this time's
   /// pages that their key masks admit}.
   sort({ time, depth: [a, b, c, d], near }, out) {
     const total = this.total;

@@ -91,7 +91,7 @@ impl Scene {
 
     /// Replaces the bytes; returns the new version's number.
     pub(crate) fn set(&self, bytes: Arc<[u8]>) -> u64 {
-        // The process and the moment are in the tag: a server started again counts from 1 again.
+        // The process and the time are in the tag: a server started again counts from 1 again.
         let now = UNIX_EPOCH.elapsed().unwrap_or_default().as_nanos();
         let length = bytes.len() as u64;
         let etag = format!("\"m{now:x}-{length:x}\"");

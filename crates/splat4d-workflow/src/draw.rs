@@ -439,7 +439,7 @@ fn field_rgb(raw: &Planes<f32>, channel: Channel, [low, high]: [f32; 2]) -> Rgb 
         }
         match channel {
             Channel::Flow => {
-                // Right is red, down yellow-green, left cyan, up violet; what stands still is white.
+                // Right is red, down yellow-green, left cyan, up violet; the static background is white.
                 let turn = at(1).atan2(at(0)) / std::f32::consts::TAU;
                 hue(turn.rem_euclid(1.0), (at(0).hypot(at(1)) / span).min(1.0), 1.0)
             }

@@ -28,7 +28,7 @@ const LOOKS: usize = 24;
 const ROUNDS: usize = 5;
 /// Times that the first image is drawn from bytes; the best counts.
 const DECODES: usize = 3;
-/// Most moments at which Gaussians are counted: ten seconds at 30 frames a second.
+/// Most times at which Gaussians are counted: ten seconds at 30 frames a second.
 const COUNTED: usize = 300;
 
 /// One side of a comparison. Its JSON is part of `compress.json` and of what `bench --playback` prints.
@@ -119,7 +119,7 @@ pub fn measured_views_of(source: &Source, size: [usize; 2]) -> Result<Vec<Measur
     Ok(measured_views(&(0..LOOKS).map(orbit).collect::<Vec<_>>(), source.scene.clip, size))
 }
 
-/// Moments in the middle of equal parts of the clip, each from another camera: images of this size with the camera's
+/// Times in the middle of equal parts of the clip, each from another camera: images of this size with the camera's
 /// vertical field of view. Panics: no views.
 pub fn measured_views(views: &[View], clip: [f64; 2], [width, height]: [usize; 2]) -> Vec<MeasuredView> {
     let mut seen = BTreeSet::new();
@@ -237,7 +237,7 @@ impl<'a> Seat<'a> {
     fn side(mut self) -> Result<Side> {
         let counts = frames(self.player.meta().clip, self.player.meta().fps)
             .into_iter()
-            // The pages of a moment come into memory with its image.
+            // The pages of a time come into memory with its image.
             .map(|t| self.player.at(t).map(|_| ()).map(|()| self.player.alive(t)))
             .collect::<Result<Vec<usize>>>()?;
         let rate = |k: usize| self.best.len() as f64 / self.best.iter().map(|b| b[k]).sum::<f64>().max(f64::EPSILON);

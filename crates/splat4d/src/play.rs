@@ -195,7 +195,7 @@ impl<'a> Player<'a> {
     }
 
     /// Plays a playback file of `length` bytes, of which only the index is read now. Pages stay in memory up to `budget`
-    /// bytes; those that one moment needs stay in any case.
+    /// bytes; those that one time needs stay in any case.
     ///
     /// Errors: those of [`Index::parse`] and of the source.
     pub fn open(mut source: Box<dyn ReadAt + Send>, length: u64, budget: usize) -> Result<Self> {

@@ -1,4 +1,4 @@
-//! `export`: moments of a scene as plain 3DGS .ply files, the whole of it as one page with its player, or where its
+//! `export`: times of a scene as plain 3DGS .ply files, the whole of it as one page with its player, or where its
 //! Gaussians, or points that are asked for, go as JSON or CSV.
 
 use crate::console::Console;
@@ -188,7 +188,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Numbers of a file of tracks, at most: three for a Gaussian and a moment. As text they are some gigabytes.
+/// Numbers of a file of tracks, at most: three for a Gaussian and a time. As text they are some gigabytes.
 const MOST_NUMBERS: usize = 300_000_000;
 /// Fainter Gaussians than this are not near anything.
 const LEAST_OPACITY: f64 = 0.1;

@@ -6,7 +6,7 @@ use super::{Grade, Report};
 use crate::sync::median;
 use splat4d_train::capture::Capture;
 
-/// What stands still went so far, pixels of 1920, and at least so many own ones.
+/// The static background went so far, pixels of 1920, and at least so many own ones.
 pub(super) const MOVED: [f64; 2] = [0.5, 2.0];
 pub(super) const MOVED_PIXELS: [f64; 2] = [0.35, 1.0];
 /// Brightness that jumps from image to image, stops.

@@ -141,7 +141,7 @@ fn take(capture: &Capture, seen: &[Seen], report: &mut Report) {
     volume_of(&own, target, report);
 }
 
-/// What three cameras see of what moves about a place.
+/// What three cameras see of dynamic regions about a place.
 pub(super) fn volume_of(seen: &[&Seen], target: [f64; 3], report: &mut Report) {
     report.seen_by_three = volume::seen_by_three(seen, target);
     let Some(share) = report.seen_by_three else {

@@ -1,4 +1,4 @@
-//! Clocks of cameras against each other, by what moves.
+//! Clocks of cameras against each other, by motion.
 
 use super::Report;
 use super::finding::{AGREE, MATCHES, Told, grade, unit};
@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use splat4d_train::capture::Capture;
 use splat4d_train::event::Progress;
 
-/// Blur of what moves by a wrong clock, pixels of 1920.
+/// Blur of dynamic regions by a wrong clock, pixels of 1920.
 const OFFSET: [f64; 2] = [0.5, 1.5];
 /// Standard deviations from which an offset is one, and the least part of a frame: of a hall whose cameras one clock drives up
 /// to 0.59 frames were found, other cameras with other settings, so that less than this is no evidence.

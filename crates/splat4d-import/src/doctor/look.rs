@@ -10,9 +10,9 @@ use splat4d::math::median_by;
 use splat4d::scene::{Camera, Planes};
 use splat4d_train::capture::{Capture, ImageStore, Rgb8};
 
-/// Images over the take whose median is what stands still.
+/// Images over the take whose median is the static background.
 const SPREAD: usize = 15;
-/// From so many on a median knows what stands still.
+/// From so many on a median knows the static background.
 const MEDIAN_FROM: usize = 3;
 /// Images of a moving camera that are compared with others.
 const STANDS: usize = 16;
@@ -25,7 +25,7 @@ pub(super) const CELL: usize = 8;
 /// A cell moves from this part of its pixels on.
 const MOVING: f64 = 0.25;
 
-/// An image from a place: of what stands still, or one of a moving camera.
+/// An image from a place: of the static background, or one of a moving camera.
 pub(super) struct Stand {
     pub(super) view: Camera,
     pub(super) picture: Rgb8,
@@ -128,7 +128,7 @@ fn blocks(g: &Grey) -> f64 {
     255.0 * (mean(1) - mean(0))
 }
 
-/// The cells of an image that differ from what stands still.
+/// The cells of an image that differ from the static background.
 fn cells(picture: &Grey, still: &Grey) -> Vec<bool> {
     let (across, down) = (picture.width.div_ceil(CELL), picture.height.div_ceil(CELL));
     let mut counts = vec![[0usize; 2]; across * down];

@@ -25,7 +25,7 @@ pub(super) struct Pair {
     pub(super) found: EpipolarLag,
 }
 
-/// A moment of a pair of tracks: distance from the line, how fast it grows with the lag, rows of both cameras (−½ to ½).
+/// A time of a pair of tracks: distance from the line, how fast it grows with the lag, rows of both cameras (−½ to ½).
 struct Sighting {
     off: f64,
     speed: f64,

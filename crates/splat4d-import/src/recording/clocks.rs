@@ -111,8 +111,9 @@ pub(super) fn by_motion(
     Ok(Guessed { evidence: out, moves })
 }
 
-/// Refuses a take in which something moves and too few clocks are known: it would be seen at other moments by every camera, and
-/// nothing later could show. How much moves is a guess that other evidence has to confirm, and counts for nothing here.
+/// Refuses a take in which something moves and too few clocks are known: it would be seen at other times by every
+/// camera, and nothing later could show. How much moves is a guess that other evidence has to confirm, and counts for
+/// nothing here.
 pub(super) fn check(names: &[&str], solved: &Solved, told: &[Option<f64>], motion: &[String]) -> Result<()> {
     let known = |c: usize| {
         let measured = |o: &Offset| o.kinds.iter().any(|k| *k != Kind::Motion);

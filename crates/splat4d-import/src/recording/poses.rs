@@ -52,7 +52,7 @@ pub(super) struct Solved {
     pub moving: bool,
     /// See [`sfm::Solution::contradiction`].
     pub contradiction: Vec<Option<f64>>,
-    /// Cameras whose clock adjusting did not find, for what moves in them contradicts the others.
+    /// Cameras whose clock adjusting did not find, for motion in them contradicts the others.
     pub stray: Vec<bool>,
 }
 
@@ -160,7 +160,7 @@ pub(super) fn once(
     Ok(cache.or("solved", &made_of, || Ok(Note::of(&solve()?)))?.solved(stored))
 }
 
-/// Places cameras that stand still, and refines their clocks.
+/// Places fixed cameras, and refines their clocks.
 pub(super) fn standing(
     stored: &Stored<'_>,
     clock: graph::Solution,

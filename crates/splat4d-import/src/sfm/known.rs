@@ -107,7 +107,7 @@ pub(crate) fn about(sights: &[Sight], links: &[Link], how: &Mapping, progress: &
     Mapped { contradiction: errors(sights, links), moving: clocks.moving, ..map.result() }
 }
 
-/// Matches of what stands still that a pair of cameras must have before it shows whether poses are right.
+/// Matches of the static background that a pair of cameras must have before it shows whether poses are right.
 const SURE: usize = 12;
 /// Cameras whose axes are farther apart see other sides of things: what seems alike there is chance, degrees.
 const APART: f64 = 70.0;

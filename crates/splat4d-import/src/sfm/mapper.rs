@@ -734,7 +734,7 @@ pub struct Mapped {
     pub contradiction: Vec<Option<f64>>,
     /// Of each camera, the points that move by which its clock was found.
     pub moving: Vec<usize>,
-    /// Of each camera, whether what moves in it contradicts the others: it shows another time.
+    /// Of each camera, whether motion in it contradicts the others: it shows another time.
     pub stray: Vec<bool>,
 }
 

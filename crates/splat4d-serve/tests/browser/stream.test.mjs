@@ -270,7 +270,7 @@ test('a first moment and a seek fetch their own bytes and no others', async () =
     const file = await SceneFile.open(server.url + 'a');
     const head = server.sent;
     const backend = { addPalette: () => {}, addPage: () => {}, dropPage: () => {} };
-    // No room for more than the fullest moment: nothing is fetched ahead, so that every byte can be accounted for.
+    // No room for more than the fullest time: nothing is fetched ahead, so that every byte can be accounted for.
     const stream = new Stream(file, backend, { budget: 32 * 8 * (700 + 1025 + 511) });
     const outside = (ids) =>
       ids.reduce(

@@ -591,7 +591,7 @@ fn split(take: &mut RawCapture, cameras: &[Rig], options: &CaptureOptions) -> Re
             let train = of(Split::Train);
             return non_empty(train, by_convention, validation);
         }
-        // Photos of one moment are no rig: one of them is too few to measure on.
+        // Photos of one time are no rig: one of them is too few to measure on.
         None if take.timing == Timing::Moment && !take.named => HoldOut::Every(HOLD_EVERY),
         None if cameras.len() >= 2 && cameras.iter().all(|c| c.fixed) => {
             HoldOut::Cameras(vec![cameras[0].name.clone()])

@@ -2,7 +2,7 @@
 //!
 //! COLMAP knows no time. Image names `cam/frame` or `cam_frameN` give camera and frame number; where each camera has
 //! only one registered image, the other images of that camera on disk share its pose: the usual way to calibrate a
-//! fixed rig is to reconstruct one instant.
+//! fixed rig is to reconstruct one time.
 
 mod multiview;
 mod unregistered;

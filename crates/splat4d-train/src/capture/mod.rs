@@ -120,7 +120,7 @@ pub struct Frame {
     pub source: Camera,
     /// Seconds on the scene clock.
     pub time: Time,
-    /// Frame number in the take, from 0; frames of several cameras with one number belong to one instant unless the
+    /// Frame number in the take, from 0; frames of several cameras with one number belong to one time unless the
     /// cameras have time offsets.
     pub index: usize,
     /// The image file.
@@ -205,7 +205,7 @@ pub struct Capture {
     pub cameras: Vec<Rig>,
     /// Whether the data set, or the names of its images (`cam07`), separate cameras; else an entry is one camera's
     /// photo of a
-    /// moment, or stands for many.
+    /// time, or stands for many.
     pub named: bool,
     /// All images, or those that were asked for ([`CaptureOptions::frames`]).
     pub frames: Vec<Frame>,

@@ -86,7 +86,7 @@ choices! {
     pub enum Sequence {
         /// By their names: a film where they are numbered like its frames, else photos.
         Auto = "auto",
-        /// Photos of one moment.
+        /// Photos of one time.
         Photos = "photos",
         /// The frames of a film, or of one for each camera of a rig.
         Video = "video",

@@ -18,13 +18,13 @@ pub struct Finding {
     pub remedy: String,
 }
 
-/// Below this many views of an instant, surfaces are not pinned down between them.
+/// Below this many views of a time, surfaces are not pinned down between them.
 const FEW_CAMERAS: usize = 6;
 /// Narrower rigs see little parallax, degrees.
 const NARROW_DEGREES: f64 = 20.0;
 /// Seconds from which f32 has steps of a millisecond.
 const FAR_CLOCK: f64 = 1e4;
-/// Gaps between instants may differ by this factor before the clock is called uneven.
+/// Gaps between times may differ by this factor before the clock is called uneven.
 const UNEVEN: f64 = 1.5;
 /// Angle and relative distance below which two cameras add little to each other.
 const CLOSE_DEGREES: f64 = 0.5;

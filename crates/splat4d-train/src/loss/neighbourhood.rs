@@ -74,7 +74,7 @@ impl<F: Real> Neighbourhood<F> {
         Self { weights, unit: 1.0 / extent, frame: 1.0 / fps, clip, near: Near::default(), graphs: Mutex::default() }
     }
 
-    /// Instants of a step: two a frame apart from the first view's time on; then, if asked for, one frame before and one
+    /// Times of a step: two a frame apart from the first view's time on; then, if asked for, one frame before and one
     /// after them; then any other.
     fn times(&self, info: &StepInfo, layer: usize) -> Option<Vec<Time>> {
         let seconds = self.clip[1] - self.clip[0];
@@ -139,12 +139,12 @@ impl<F: Real> ProbeLoss<F> for Neighbourhood<F> {
             let (w, unit) = (&self.weights, self.unit);
             let wide = w.wide();
             if w.least > 0.0 {
-                let [before, now, ..] = &mut g[..] else { unreachable!("two instants are always asked for") };
+                let [before, now, ..] = &mut g[..] else { unreachable!("two times are always requested") };
                 loss += motion::least([&x[1], &x[0]], w.least * unit, [now, before]);
             }
             if w.rigid > 0.0 || w.rot > 0.0 || w.velocity > 0.0 {
                 let rotations = arap::rotations(graph, &x[1], &x[0]);
-                let [before, now, ..] = &mut g[..] else { unreachable!("two instants are always asked for") };
+                let [before, now, ..] = &mut g[..] else { unreachable!("two times are always requested") };
                 if w.rigid > 0.0 {
                     let way = [&x[1][..], &x[0][..]];
                     loss += motion::rigidity(graph, &rotations, way, w.rigid * unit, [now, before]);
@@ -167,7 +167,7 @@ impl<F: Real> ProbeLoss<F> for Neighbourhood<F> {
             }
             if wide {
                 // In the order of time: before, at, after, after that.
-                let [at, after, before, last, ..] = &mut g[..] else { unreachable!("four instants were asked for") };
+                let [at, after, before, last, ..] = &mut g[..] else { unreachable!("four times were requested") };
                 let x = [&x[2][..], &x[0][..], &x[1][..], &x[3][..]];
                 if w.jerk > 0.0 {
                     loss += motion::jerk(x, w.jerk * unit, [before, at, after, last]);
@@ -181,7 +181,7 @@ impl<F: Real> ProbeLoss<F> for Neighbourhood<F> {
                 }
             }
             if w.iso > 0.0 || w.arap > 0.0 {
-                let (far, others) = g.split_last_mut().expect("instants were asked for");
+                let (far, others) = g.split_last_mut().expect("times were requested");
                 let pair = [&x[0][..], &x[x.len() - 1][..]];
                 if w.iso > 0.0 {
                     loss += motion::isometry(graph, pair, w.iso * unit, [&mut others[0], far]);

@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 const LOOKS: f64 = 32.0;
 /// Of the time, what the end may be off before a run is planned again.
 const TOLERANCE: f64 = 0.015;
-/// Weight of what was measured since the last look in the machine's speed: one busy moment is not taken for the rest.
+/// Weight of what was measured since the last look in the machine's speed: one busy time is not taken for the rest.
 const NEWEST: f64 = 0.5;
 /// Steps of the schedule that a step may stand for, and steps that may stand for one of the schedule: with fewer the scene
 /// would be taken apart by rates and densifications meant for many.

@@ -61,7 +61,7 @@ pub struct Options {
     /// Most samples of Gaussians at a time, over all Gaussians whose motion is not straight: bounds the time of baking.
     /// At least the clip's ends are sampled.
     pub samples: usize,
-    /// Most renders each, of cameras that stand still and of one that moves, that measure how strongly images react to errors:
+    /// Most renders each, of fixed cameras and of one that moves, that measure how strongly images react to errors:
     /// bounds the time as well.
     pub renders: usize,
     /// The take is played so many times over.

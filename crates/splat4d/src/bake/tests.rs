@@ -1,4 +1,4 @@
-//! Baking whole scenes: what is straight stays exact, what is not stays within the tolerance, and every moment shows
+//! Baking whole scenes: what is straight stays exact, what is not stays within the tolerance, and every time shows
 //! every Gaussian once.
 
 use super::*;

@@ -115,7 +115,7 @@ pub(super) fn run(step: &Step, scene: &mut Scene<f32>, context: &dyn Context) ->
                     .remedy(format!("It goes from {} to {} s", scene.clip[0], scene.clip[1])));
             }
             let before = scene.len();
-            // The clip's last moment is seen, a window's end is not.
+            // The clip's last time is seen, a window's end is not.
             let part = [clip[0], clip[1].next_up()];
             let open = |layer: Layer<f32>, own: [f64; 2]| Layer { span: own, ..layer };
             let cut = |layer: &Layer<f32>| window(layer, part).map(|w| open(w, layer.span));

@@ -46,7 +46,7 @@ pub struct Dialect {
 /// How a dialect is written. Writers say what was left out.
 #[derive(Clone, Copy)]
 pub enum Writer {
-    /// One moment.
+    /// One time.
     Moment(fn(&Params, &WriteOptions, &mut dyn Write) -> Result<Warnings>),
     /// A moving scene.
     Moving(fn(&Scene<f32>, &WriteOptions, &mut dyn Write) -> Result<Warnings>),
@@ -183,7 +183,7 @@ impl Dialect {
     }
 
     /// Writes a scene, whose axes are taken as they are; of a scene that moves, a dialect that does not gets the clip's
-    /// first moment. Says what was left out.
+    /// first time. Says what was left out.
     ///
     /// Errors: it is only read; it cannot hold the scene, or what it should of it; a number is NaN or infinite; the sink's.
     pub fn write(&self, scene: &Scene<f32>, options: &WriteOptions, out: &mut dyn Write) -> Result<Warnings> {

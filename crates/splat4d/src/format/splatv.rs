@@ -49,7 +49,7 @@ pub fn write(scene: &Scene<f32>, options: &WriteOptions, out: &mut impl Write) -
     let mut warnings = Warnings::default();
     let span = scene.clip[1] - scene.clip[0];
     let fps = if scene.fps > 0.0 { scene.fps } else { crate::scene::time::DEFAULT_FPS };
-    // A single moment still needs a clock to stand on.
+    // A single time still needs a clock to stand on.
     let clock = Clock { clip: scene.clip, fps, duration: if span > 0.0 { span } else { 1.0 } };
     let rows = rows(scene, clock, ".splatv", options.exact, &mut warnings)?;
     let height = (rows.len() * ROW / 16).div_ceil(TEXTURE_WIDTH).max(1);

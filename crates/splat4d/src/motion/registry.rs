@@ -33,7 +33,7 @@ pub struct Capabilities {
     /// State runs forward in time: an answer at t depends on no number that stands for a later time, so that what follows
     /// can be learnt or cut off without a change of what was.
     pub causal: bool,
-    /// Fixed cameras that must see every moment for the model to be learnt.
+    /// Fixed cameras that must see every time for the model to be learnt.
     pub fixed_cameras: usize,
     /// Blocks of spherical harmonics in the layer's SH table.
     pub color_blocks: usize,

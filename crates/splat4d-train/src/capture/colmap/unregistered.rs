@@ -13,7 +13,7 @@ const FEW_REGISTERED: [f64; 2] = [0.9, 0.7];
 /// Adds the images that share a pose to `shots` and `files`, and says how many are without one.
 ///
 /// A pose can be shared where every camera has exactly one registered image: the usual way to calibrate a fixed rig is to
-/// reconstruct one instant.
+/// reconstruct one time.
 pub(super) fn settle(
     base: &Path,
     shots: &mut Vec<Shot>,

@@ -142,7 +142,7 @@ impl Capture {
         self.conclude(&conventions, &measures)
     }
 
-    /// The frames that are looked at: cameras of one instant in their order, or frames of a moving camera in a row.
+    /// The frames that are looked at: cameras of one time in their order, or frames of a moving camera in a row.
     fn looked_at(&self) -> Vec<usize> {
         let pixels = self.frames.first().map_or(1, |f| f.source.width * f.source.height).max(1);
         let most = (PIXELS / pixels).clamp(LOOKS[0], LOOKS[1]);

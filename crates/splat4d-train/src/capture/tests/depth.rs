@@ -169,7 +169,7 @@ fn what_is_no_depth_is_refused_by_file_and_frame() {
     write_npy(&sample, &[HEIGHT, WIDTH], &values);
     assert_says(&message(&sample), &["0005.npy", "(3, 1) is -0.001"]);
     write_npy(&sample, &[HEIGHT, WIDTH], &all(0.0));
-    assert_says(&message(&sample), &["0005.npy", "knows no pixel"]);
+    assert_says(&message(&sample), &["0005.npy", "depth map is empty"]);
     write_npy(&sample, &[WIDTH, HEIGHT], &all(2.0));
     assert_says(&message(&sample), &["0005.npy", "16x24", "24x16"]);
     write_npy(&sample, &[2, HEIGHT, WIDTH / 2], &all(2.0));

@@ -196,7 +196,7 @@ fn report(reading: &Reading, instants: &[f64], rate: Rate, account: &mut Account
     account.add(Aspect::Assumed, severity, what);
 }
 
-/// The number of the instant that is nearest to `t`, of two the later.
+/// The number of the time that is nearest to `t`, of two the later.
 fn nearest(instants: &[f64], t: f64) -> usize {
     let after = instants.partition_point(|&i| i < t);
     let earlier = after > 0 && instants.get(after).is_none_or(|&i| t - instants[after - 1] < i - t);

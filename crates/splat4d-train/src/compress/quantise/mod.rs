@@ -210,7 +210,7 @@ pub(crate) fn stage(
         name: "quantised".into(),
         iterations,
         groups: tuned(base.groups, share).into_iter().map(|g| Group { layer: EVERY, ..g }).collect(),
-        // Pages say with a width next to nothing that a life is an instant.
+        // Pages say with a width next to nothing that a life is a time.
         min_log_life: None,
         half_size_steps: 0,
         sh_interval: 0,

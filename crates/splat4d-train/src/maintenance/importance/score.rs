@@ -47,7 +47,7 @@ pub struct ScoreConfig {
 }
 
 impl Default for ScoreConfig {
-    /// Per-instant product of |p''| and the spatial score, with the volume, from all views.
+    /// Per-time product of |p''| and the spatial score, with the volume, from all views.
     fn default() -> Self {
         Self {
             spatial: Spatial::default(),
@@ -99,7 +99,7 @@ pub fn score(
     let lives: Vec<Lives> = scene.layers.iter().map(|l| Lives::new(l, clip, config.unit / fps)).collect();
 
     let zeros = || -> Vec<Vec<f64>> { scene.layers.iter().map(|l| vec![0.0; l.params.len()]).collect() };
-    // Σ_t S(t), Σ_t S(t)·T(t) and Σ of T(t) over the instants at which S(t) > 0.
+    // Σ_t S(t), Σ_t S(t)·T(t) and Σ of T(t) over the times at which S(t) > 0.
     let (mut spatial, mut product, mut served) = (zeros(), zeros(), zeros());
     let mut touched = zeros();
     let (mut weighing, mut done) = (Weighing::new(config.spatial, config.antialias), 0);
@@ -126,7 +126,7 @@ pub fn score(
         }
     }
 
-    // A score of all views together takes the place of the sum; how its instants are served is as the views felt it.
+    // A score of all views together takes the place of the sum; how its times are served is as the views felt it.
     for layer in 0..scene.layers.len() {
         let Some(whole) = weighing.whole(layer) else { continue };
         for ((spatial, product), whole) in spatial[layer].iter_mut().zip(&mut product[layer]).zip(whole) {

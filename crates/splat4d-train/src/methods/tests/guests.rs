@@ -19,7 +19,7 @@ const FPS: f64 = 10.0;
 const RADIUS: f64 = 0.4;
 const SKY: [f32; 3] = [0.15, 0.2, 0.3];
 
-/// Centre, colour, and whether it is there at moment k.
+/// Centre, colour, and whether it is there at time k.
 type Guest = ([f64; 3], [f32; 3], fn(usize) -> bool);
 
 const GUESTS: [Guest; 3] = [

@@ -186,7 +186,7 @@ impl Chunked {
         Ok(())
     }
 
-    /// How well chunks meet, by cameras that stand still: those that training never saw, where there are any. `None`: there
+    /// How well chunks meet, by fixed cameras: those that training never saw, where there are any. `None`: there
     /// is no such camera, or no time. Before each cut `go_on` is asked; it hears how many are done. Errors: chunks
     /// or images that
     /// cannot be read.

@@ -59,7 +59,7 @@ pub(super) const MADE_BY: &str = "train --chunk";
 /// A part of the work on a take.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Part {
-    /// What stands still, and the cameras' exposures.
+    /// The static background, and the cameras' exposures.
     Shared,
     /// A chunk.
     Chunk(usize),

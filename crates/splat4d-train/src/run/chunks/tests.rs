@@ -271,7 +271,7 @@ fn every_motion_model_goes_through_two_chunks() {
         assert_eq!(run.plan.len(), 2, "{motion}");
         let own = whole.layers.iter().filter(|l| l.name != shared::LAYER);
         assert!(own.clone().count() == 2 && own.clone().all(|l| l.motion.spec().name() == motion), "{motion}");
-        // Every moment is seen, those that both show too.
+        // Every time is seen, those that both show too.
         for t in [0.0, 0.55, 1.1] {
             let mut seen = splat4d::layers::Evaluation::default();
             whole.at(Time(t), &mut seen);
