@@ -16,7 +16,7 @@ let site;
 before(async () => { site = await serve({ folders: { '/': fileURLToPath(new URL('dist/', import.meta.url)) } }); });
 after(async () => { await browser?.close(); site.close(); });
 
-/** What a page says besides that there is no WebGPU. */
+/** Errors of a page, except for missing WebGPU. */
 const serious = errors => errors.filter(text => !/WebGPU|adapter/i.test(text));
 
 for (const [name, size] of [['docs/gallery.html', { width: 1400, height: 900 }], ['index.html', PHONE]]) {

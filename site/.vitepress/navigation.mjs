@@ -7,6 +7,7 @@ const CRATES = [
   ['splat4d_dynamics', 'forecasts'],
   ['splat4d_import', 'captures of videos'],
   ['splat4d_serve', 'player and server'],
+  ['splat4d_workflow', 'bake, convert, evaluate, compress …'],
 ];
 export const crates = CRATES.map(([name]) => name);
 

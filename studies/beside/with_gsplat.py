@@ -3,7 +3,7 @@
     python with_gsplat.py FOLDER/A [FOLDER/B ...]
 
 Needs PyTorch for CUDA, gsplat 1.5.3 (whose sources are compiled at the first import) and, for its fused SSIM, fused-ssim. Writes
-gsplat.json beside scene.json: milliseconds a step by the wall and by CUDA events, and the loss of every step. The next
+gsplat.json next to scene.json: milliseconds a step by the wall and by CUDA events, and the loss of every step. The next
 `studies bench --beside` tells how the two compare, if their losses agree.
 
 Same Gaussians, cameras, pictures, order, loss, rates and Adam as splat4d's; one picture a step; nothing is born and nothing dies.

@@ -31,7 +31,7 @@ const ROUNDS: usize = 5;
 const FEW_ROUNDS: usize = 2;
 /// Gaussians from which a scene is large.
 const LARGE: usize = 200_000;
-/// Threads unless told: what a second core gains is one of the figures.
+/// Threads by default: what a second core gains is one of the figures.
 const THREADS: [usize; 2] = [1, 2];
 
 const EXAMPLES: &str = "\

@@ -27,13 +27,13 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-/// Steps of a run unless told: on two cores the bundled capture takes about two minutes at half resolution.
+/// Steps of a run by default: on two cores the bundled capture takes about two minutes at half resolution.
 const STEPS: usize = 1500;
 /// The same with `--quick`.
 const QUICK_STEPS: usize = 300;
 /// Runs of every variant, from seed 1 on.
 const SEEDS: usize = 3;
-/// Factor by which images are reduced unless told.
+/// Factor by which images are reduced by default.
 const DOWNSCALE: usize = 2;
 /// The form of the file; another is refused.
 const VERSION: u32 = 1;

@@ -25,7 +25,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Share of the source's own training steps that fine-tuning takes unless told: 4DGS-1K takes 5,000 after 30,000.
+/// Share of the source's own training steps that fine-tuning takes by default: 4DGS-1K takes 5,000 after 30,000.
 const STEPS_SHARE: f64 = 1.0 / 6.0;
 /// The same with `--quick`.
 const QUICK_SHARE: f64 = 1.0 / 30.0;

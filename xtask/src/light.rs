@@ -22,7 +22,7 @@ const SHADOW_SOFTNESS: i64 = 3;
 /// Shift along the normal that keeps surfaces from shadowing themselves, scene units.
 const SHADOW_OFFSET: f64 = 0.035;
 
-/// The light of one instant.
+/// The light of one time.
 pub(crate) struct Light {
     key: V3,
     fill: V3,

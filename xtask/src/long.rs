@@ -1,5 +1,5 @@
 //! `capture --long SECONDS FOLDER`: the hall with both characters for as long as one likes, filmed by twenty cameras. Every
-//! part goes round at a pace of its own, so that no two moments are alike; one frame is in memory at a time.
+//! part goes round at a pace of its own, so that no two times are alike; one frame is in memory at a time.
 
 use crate::camera::Camera;
 use crate::capture::{CAMERAS, HELD_OUT, bundled_folder, jpeg, rig_of};
@@ -44,7 +44,7 @@ pub(crate) fn command(seconds: &str, folder: &Path) -> Result<()> {
             write_file(&folder.join(format!("images/{}/{t:06}.jpg", camera.name)), &jpeg(&rgb, WIDTH, HEIGHT)?)
         })?;
     }
-    // Points of what stands still: of a long take no moment's characters are worth starting from.
+    // Points of the static background: of a long take no time's characters are a useful start.
     let hall = stage.with(&Mesh::default(), Vec::new());
     let seen: Vec<(Visibility, Vec<u8>)> = (cameras.par_iter())
         .map(|camera| {

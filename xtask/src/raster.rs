@@ -146,7 +146,7 @@ mod tests {
         let point = corners[0] * weights[0] + corners[1] * weights[1] + corners[2] * weights[2];
         assert!((point - v3(-0.02, 0.05, 1.0) * z).length() < 1e-12, "the weighted corners lie on the ray");
         assert!((weights.iter().sum::<f64>() - 1.0).abs() < 1e-12);
-        // Interpolation linear on the screen would give another depth: the test must tell the two apart.
+        // Interpolation linear on the screen would give another depth: the test must distinguish the two.
         let screen = |c: V3| (c.x / c.z, c.y / c.z);
         let [(ax, ay), (bx, by), (cx, cy)] = corners.map(screen);
         let det = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay);

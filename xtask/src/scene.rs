@@ -48,7 +48,7 @@ pub(crate) struct Stage {
     props: Mesh,
 }
 
-/// One instant of the scene.
+/// One time of the scene.
 pub(crate) struct Frame {
     /// All triangles, the static set first.
     pub mesh: Mesh,

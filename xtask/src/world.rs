@@ -115,7 +115,7 @@ fn rig() -> Vec<Camera> {
     (0..CAMERAS).map(camera).collect()
 }
 
-/// The hall with what moves in it.
+/// The hall with motion in it.
 fn scene(stage: &Stage, world: &World, t: usize) -> Frame {
     let mut moving = Mesh::default();
     let mut feet = Vec::new();

@@ -132,7 +132,7 @@ fn written(stub: &str, words: &BTreeMap<String, String>) -> String {
                 (None, true) => format!("{name}: {}", plain.rsplit(" -> ").next().unwrap_or_default()),
                 (None, false) => plain,
             };
-            // What begins with an underscore and is no operator is nobody's; `main` is the command's own entry.
+            // Names with an underscore that are not operators are private; `main` is the command's own entry.
             if spoken.is_some() || !(name.starts_with('_') || name == "main") {
                 if owner.is_empty() {
                     let _ = write!(functions, "\n### {name}\n{}", block(&shown, words.get(&name)));

@@ -1,5 +1,5 @@
-//! Tidy: what the compiler does not check. Imports (`tidy/imports.rs`), file sizes, `unsafe`, printing, and that the documents tell the
-//! truth about paths and flags. Reads files only: no network, a second or two.
+//! Tidy: what the compiler does not check. Imports (`tidy/imports.rs`), file sizes, `unsafe`, printing, and that the
+//! documents are right about paths and flags. Reads files only: no network, a second or two.
 
 #[path = "tidy/imports.rs"]
 mod imports;
@@ -359,7 +359,8 @@ fn flags_in_documents_exist() {
     report(troubles, "Write the flag as `splat4d VERB --help` shows it.");
 }
 
-/// Where a motion model may be told by its name or its spec: the list and the models' own files, and how each is learnt.
+/// Where a motion model may be matched by its name or its spec: the list and the models' own files, and how each is
+/// learnt.
 const MODEL_ROOMS: [&str; 2] = ["crates/splat4d/src/motion/", "crates/splat4d-train/src/methods/"];
 /// In addition to these, each with its reason.
 const MODEL_NAMES: [(&str, &str); 1] = [("crates/splat4d/src/layers/convert.rs", "turns one model into another")];

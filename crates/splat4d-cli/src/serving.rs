@@ -55,7 +55,7 @@ pub(crate) fn start_for(config: Config, place: &Place, token: Option<&str>, cons
     let right = if config.editing.is_some() { "edit" } else { "control" };
     let running =
         Server::start(Config { host, port: place.port, player_folder: place.player_folder.clone(), ..config })?;
-    // Behind `#` a browser sends nothing to anybody, and pages that are linked to do not see it.
+    // Behind `#` a browser sends nothing to other sites, and linked pages do not see it.
     let url = token.map_or(running.url().to_owned(), |token| format!("{}#{right}={token}", running.url()));
     console.say(&format!("the player is at {url}"));
     console.emit(&json!({"type": "serving", "url": url}));

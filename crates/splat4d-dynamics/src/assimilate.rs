@@ -43,7 +43,7 @@ pub struct Filter<'a> {
 }
 
 impl<'a> Filter<'a> {
-    /// At the last observed moment, of which everything is known.
+    /// At the last observed time, of which everything is known.
     pub fn new(scene: &'a Scene<f32>, observed: &'a Observed, clock: Clock) -> Self {
         Self { scene, observed, clock, variance: vec![0.0; observed.paths.nodes()] }
     }

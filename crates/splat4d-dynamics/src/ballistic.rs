@@ -4,25 +4,25 @@ use crate::paths::{Moment, Paths, Pose, exp, turn};
 use splat4d::math::quat;
 use splat4d::math::se3::{add, scale};
 
-/// Frames that tell velocities (methods of robust finite differences: three to five).
+/// Frames from which velocities are estimated (methods of robust finite differences: three to five).
 pub(crate) const WINDOW: usize = 5;
 /// Share of the acceleration that is left after a frame.
 pub(crate) const DAMPING: f64 = 0.9;
 
-/// The last moment for ever.
+/// The last time for ever.
 pub(crate) fn freeze(paths: &Paths, horizon: usize) -> Vec<Moment> {
     vec![paths.last().clone(); horizon]
 }
 
-/// The last moment goes on with the velocities and turns of the last frames, and with accelerations that fade by `damping`
-/// a frame; without `damping` with none.
+/// The last time goes on with the velocities and turns of the last frames, and with accelerations that fade by
+/// `damping` a frame; without `damping` with none.
 pub(crate) fn ballistic(paths: &Paths, horizon: usize, damping: Option<f64>) -> Vec<Moment> {
     let rates: Vec<Rates> = (0..paths.nodes()).map(|k| Rates::of(paths, k, damping.is_some())).collect();
     let step = |h: usize| paths.last().iter().zip(&rates).map(|(p, r)| r.after(p, h, damping.unwrap_or(0.0))).collect();
     (1..=horizon).map(step).collect()
 }
 
-/// How a node moves at the last moment, a frame.
+/// How a node moves at the last time, a frame.
 struct Rates {
     velocity: [f64; 3],
     acceleration: [f64; 3],
@@ -48,7 +48,7 @@ impl Rates {
             }
         }
         let det = m[0] * m[2] - m[1] * m[1];
-        // Two frames tell no curve.
+        // Two frames determine no curve.
         let (velocity, acceleration) = if curved && n > 2 {
             (
                 std::array::from_fn(|c| (m[2] * b[0][c] - m[1] * b[1][c]) / det),

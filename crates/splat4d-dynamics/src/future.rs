@@ -1,5 +1,5 @@
-//! The predicted scene: up to the last observed moment the scene as it was learnt, after it what moves is carried on by the
-//! nodes, with the looks of that moment, among what stands still.
+//! The predicted scene: up to the last observed time the scene as it was learnt, after it what moves is carried on by
+//! the nodes, with the looks of that time, among the static background.
 
 use crate::nodes::Observed;
 use crate::paths::{Moment, Paths};
@@ -20,19 +20,19 @@ const CARRIERS: usize = 4;
 /// When the observed part ends and how fast time goes on.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Clock {
-    /// The last observed moment, seconds.
+    /// The last observed time, seconds.
     pub until: f64,
     /// Frames a second.
     pub fps: f64,
 }
 
 impl Clock {
-    /// The h-th predicted moment, seconds; the 0th is the last observed one.
+    /// The h-th predicted time, seconds; the 0th is the last observed one.
     pub fn at(&self, h: usize) -> f64 {
         self.until + h as f64 / self.fps
     }
 
-    /// From when on the prediction is shown: half a frame after the last observed moment.
+    /// From when on the prediction is shown: half a frame after the last observed time.
     fn cut(&self) -> f64 {
         self.until + 0.5 / self.fps
     }
@@ -40,9 +40,9 @@ impl Clock {
 
 /// The scene that goes on as predicted: `moments` are the frames after the last observed one.
 ///
-/// Its layers are the scene's, which end at the last observed moment, and for each of them up to two that begin there: what
-/// stands still ([`PREDICTED`] and the layer's name), and what moves, as a `control` layer whose nodes have given poses at
-/// every frame. Errors: colours that a pixel head makes, no moment, nothing to carry.
+/// Its layers are the scene's, which end at the last observed time, and for each of them up to two that begin there:
+/// what is static ([`PREDICTED`] and the layer's name), and what moves, as a `control` layer whose nodes have given
+/// poses at every frame. Errors: colours that a pixel head makes, no time, nothing to carry.
 pub fn predicted(scene: &Scene<f32>, observed: &Observed, moments: &[Moment], clock: Clock) -> Result<Scene<f32>> {
     scene.without_head("a predicted scene")?;
     if moments.is_empty() {
@@ -74,7 +74,7 @@ pub fn predicted(scene: &Scene<f32>, observed: &Observed, moments: &[Moment], cl
     Ok(out)
 }
 
-/// Gaussians at the last observed moment on nodes whose motion is given.
+/// Gaussians at the last observed time on nodes whose motion is given.
 fn carried(
     frozen: Params<f32>,
     paths: &Paths,

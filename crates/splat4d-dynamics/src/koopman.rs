@@ -30,7 +30,7 @@ const TICKS_A_NUMBER: usize = 3;
 const STARTS: [f64; 7] = [0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8];
 const AHEAD: f64 = 0.2;
 const FEWEST: usize = 4;
-/// The shortest period, ticks: faster swings are noise, or are sampled too rarely to be told apart.
+/// The shortest period, ticks: faster swings are noise, or are sampled too rarely to be distinguished.
 const SHORTEST: f64 = 4.0;
 /// Frequencies that are tried for a new pair, to a resolution (2π over the ticks).
 const FINENESS: usize = 4;
@@ -44,7 +44,7 @@ const DAMPING: f64 = 1e-3;
 const DAMPING_CHANGE: f64 = 10.0;
 const MOST_DAMPING: f64 = 1e8;
 const LEAST_GAIN: f64 = 1e-12;
-/// Neighbours that tell how far a node's Gaussians are from it.
+/// Neighbours from which the distance of a node's Gaussians is estimated.
 const NEIGHBOURS: usize = 6;
 
 /// A pair of eigenvalues e^(−root² ± i turn) a tick.
@@ -54,7 +54,7 @@ pub(crate) struct Pair {
     pub turn: f64,
 }
 
-/// A fitted model: its eigenvalues. What they are worth of each node follows from the paths that it goes on from.
+/// A fitted model: its eigenvalues. Their amplitudes at each node follow from the paths that it continues.
 #[derive(Clone, Debug)]
 pub(crate) struct Koopman {
     pub(crate) pairs: Vec<Pair>,
@@ -88,7 +88,7 @@ impl Koopman {
         Self { pairs: (0..count).fold(Vec::new(), |pairs, _| grown(&pairs, &components)) }
     }
 
-    /// The moments after the last of `paths`.
+    /// The times after the last of `paths`.
     pub(crate) fn rollout(&self, paths: &Paths, horizon: usize) -> Vec<Moment> {
         let (y, ticks) = (numbers(paths), paths.len());
         let basis = columns(&self.pairs, ticks + horizon);
@@ -108,7 +108,7 @@ impl Koopman {
     }
 }
 
-/// How many pairs so many ticks can tell: one at least.
+/// How many pairs so many ticks determine: one at least.
 fn most_pairs(ticks: usize) -> usize {
     ((ticks / TICKS_A_NUMBER).saturating_sub(1) / 2).clamp(1, PAIRS)
 }

@@ -1,4 +1,4 @@
-//! Networks that tell accelerations: what is asked of one, its training over whole rollouts, and its forecasts.
+//! Networks that predict accelerations: their interface, training over whole rollouts, and forecasts.
 //!
 //! Time is counted in frames: v ← v + a, x ← x + v (semi-implicit Euler). A network may remember (`hidden`): then it first
 //! sees the ticks before a window as they were observed.
@@ -166,7 +166,7 @@ impl<N: Network> Learnt<N> {
         let ticks = paths.len();
         if ticks < LEAST_TICKS {
             return Err(Error::input(format!("{ticks} observed frames are too few to learn motion from"))
-                .remedy(format!("Observe more: {LEAST_TICKS} at least, and some periods of whatever repeats")));
+                .remedy(format!("Observe more: {LEAST_TICKS} at least, and several periods of periodic motion")));
         }
         let columns = actions.map(Actions::columns).unwrap_or_default();
         let velocities = paths.velocities();
@@ -266,7 +266,7 @@ impl<N: Network> Learnt<N> {
         parts.zip(&self.units).flat_map(|(part, unit)| part.iter().map(move |x| (x * unit) as f32)).collect()
     }
 
-    /// The moments after the last of `paths`; row t of the actions acts after tick t.
+    /// The times after the last of `paths`; row t of the actions acts after tick t.
     pub fn rollout(&self, paths: &Paths, actions: Option<&Actions>, horizon: usize) -> Vec<Moment> {
         let ticks = paths.len();
         let mut hidden = vec![0.0; self.net.memory() * paths.nodes()];

@@ -13,7 +13,7 @@ use splat4d::scene::Params;
 /// Rungs of the ladder, lowest first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Model {
-    /// B0: the last moment for ever.
+    /// B0: the last time for ever.
     Freeze,
     /// B1: constant velocity and turn.
     Velocity,
@@ -98,7 +98,7 @@ impl Fitted {
     pub fn fit(model: Model, paths: &Paths, actions: Option<&Actions>, settings: &Settings) -> Result<Self> {
         if paths.len() < LEAST_TICKS {
             return Err(Error::input(format!("{} observed frames are too few to predict from", paths.len()))
-                .remedy(format!("Observe {LEAST_TICKS} at least, and some periods of whatever repeats")));
+                .remedy(format!("Observe {LEAST_TICKS} at least, and several periods of periodic motion")));
         }
         if let Some(actions) = actions {
             actions.check(paths.len(), 1)?;
@@ -108,10 +108,8 @@ impl Fitted {
             Model::Velocity => Self::Ballistic(None),
             Model::Acceleration => Self::Ballistic(Some(DAMPING)),
             Model::Extrapolate => {
-                return Err(Error::input(
-                    "what a motion model says of later times is asked of the scene, not of nodes",
-                )
-                .remedy("Follow the nodes through the scene"));
+                return Err(Error::input("forecasts of a motion model come from the scene, not from nodes")
+                    .remedy("Follow the nodes through the scene"));
             }
             Model::Koopman => Self::Koopman(Box::new(Linear(Koopman::fit(paths)))),
             Model::Causal => {
@@ -138,7 +136,7 @@ impl Fitted {
         })
     }
 
-    /// The `horizon` moments after the last of `paths`. Row t of the actions acts after tick t.
+    /// The `horizon` times after the last of `paths`. Row t of the actions acts after tick t.
     pub fn rollout(&self, paths: &Paths, actions: Option<&Actions>, horizon: usize) -> Vec<Moment> {
         match self {
             Self::Freeze => freeze(paths, horizon),

@@ -1,6 +1,6 @@
 //! Nodes with identity on whatever moves in a scene, whichever motion model moves it.
 //!
-//! A node is tied to the Gaussians around it. From the last observed moment it is followed tick by tick: its pose is the
+//! A node is tied to the Gaussians around it. From the last observed time it is followed tick by tick: its pose is the
 //! rigid motion that fits its members best. Where members fade (models whose Gaussians live for a moment), others around
 //! the node take over at the tick before, so that the node goes on although no Gaussian does.
 
@@ -38,7 +38,7 @@ const SEEN: u32 = 3;
 /// Neighbours whose majority says whether a Gaussian moves.
 const VOTERS: usize = 8;
 
-/// Everything that is known at the last observed moment.
+/// Everything that is known at the last observed time.
 #[derive(Clone, Debug)]
 pub struct Observed {
     /// Smooth paths of the nodes, up to the last observed tick.
@@ -70,14 +70,14 @@ fn look(scene: &Scene<f32>, t: f64) -> Snapshot {
     Snapshot { x, alpha }
 }
 
-/// At most `count` nodes on what moves over the `ticks` (seconds, ascending, one a frame), of which the last is the last
-/// observed one. Nothing is asked of the scene at any other time.
+/// At most `count` nodes on dynamic regions over the `ticks` (seconds, ascending, one a frame), of which the last is
+/// the last observed one. Nothing is asked of the scene at any other time.
 ///
 /// Errors: too few ticks, no nodes or more than [`MAX_NODES`], nothing that moves.
 pub fn observe(scene: &Scene<f32>, ticks: &[f64], count: usize) -> Result<Observed> {
     if ticks.len() < LEAST_TICKS {
         return Err(Error::input(format!("{} observed frames are too few to predict from", ticks.len()))
-            .remedy(format!("Observe {LEAST_TICKS} at least: train with a larger --observe, or a longer take")));
+            .remedy(format!("Observe {LEAST_TICKS} at least: train with a larger --observe, or a longer capture")));
     }
     if !(1..=MAX_NODES).contains(&count) {
         return Err(Error::input(format!("{count} nodes cannot be")).remedy(format!("Give 1 to {MAX_NODES}")));
@@ -93,7 +93,7 @@ pub fn observe(scene: &Scene<f32>, ticks: &[f64], count: usize) -> Result<Observ
     let carriers = sociable(carriers);
     if carriers.len() < 2 {
         return Err(Error::input("nothing moves in the observed part: there is nothing to predict")
-            .remedy("Give a take in which something moves, or a run of a motion model that shows it"));
+            .remedy("Give a capture with motion, or a run whose motion model represents it"));
     }
     let mut table = Table::new(&[("mean", 3)], carriers.len());
     carriers.iter().enumerate().for_each(|(i, x)| table.write(i, 0, *x));
@@ -109,8 +109,8 @@ pub fn observe(scene: &Scene<f32>, ticks: &[f64], count: usize) -> Result<Observ
     Ok(Observed { moving: moving.collect(), paths: smooth(&Paths { moments }), size })
 }
 
-/// Follows nodes through a scene from where they are at the first of `ticks`, which may go either way: a moment a tick. So
-/// a motion model extrapolates to later times, and a scene that saw them what was true.
+/// Follows nodes through a scene from where they are at the first of `ticks`, which may go either way: a time a tick.
+/// So a motion model extrapolates to later times, and a scene that saw them what was true.
 pub fn follow(scene: &Scene<f32>, start: &Moment, ticks: &[f64]) -> Vec<Moment> {
     if ticks.len() < 2 {
         return vec![start.clone()];
@@ -265,7 +265,7 @@ fn sociable(points: Vec<[f32; 3]>) -> Vec<[f32; 3]> {
     points.into_iter().zip(square).filter(|(_, s)| *s <= most).map(|p| p.0).collect()
 }
 
-/// The centre of the points nearest to one: corners of what moves are poor places to be carried at.
+/// The centre of the points nearest to one: corners of dynamic regions are poor places to be carried at.
 fn centre(of: [f32; 3], points: &[[f32; 3]]) -> [f64; 3] {
     let square = |p: &[f32; 3]| (0..3).map(|c| f64::from(p[c] - of[c]).powi(2)).sum::<f64>();
     let mut order: Vec<(f64, usize)> = points.iter().enumerate().map(|(i, p)| (square(p), i)).collect();

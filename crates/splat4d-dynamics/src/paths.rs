@@ -12,7 +12,7 @@ const SMALL_ANGLE: f64 = 1e-6;
 pub struct Pose {
     /// Position in the world, scene units.
     pub x: [f64; 3],
-    /// Unit quaternion of the rotation since the last observed moment.
+    /// Unit quaternion of the rotation since the last observed time.
     pub q: [f64; 4],
 }
 
@@ -23,7 +23,7 @@ impl Pose {
     }
 }
 
-/// All nodes at one moment.
+/// All nodes at one time.
 pub type Moment = Vec<Pose>;
 
 /// Paths of nodes at even ticks, one a frame.
@@ -74,7 +74,7 @@ impl Paths {
         self
     }
 
-    /// The size of what moves: the largest distance of a node from the centroid over all ticks, scene units.
+    /// The size of dynamic regions: the largest distance of a node from the centroid over all ticks, scene units.
     pub fn extent(&self) -> f64 {
         let all = || self.moments.iter().flatten().map(|p| p.x);
         let n = all().count().max(1) as f64;
@@ -112,7 +112,7 @@ pub fn turn(a: [f64; 4], b: [f64; 4]) -> [f64; 3] {
 /// Neighbours of every node, by which rotations follow from positions.
 pub struct Neighbours(Vec<Vec<usize>>);
 
-/// Neighbours that tell a node's rotation.
+/// Neighbours that determine a node's rotation.
 const FRAME_NEIGHBOURS: usize = 6;
 /// Weight of the rotation before, of the neighbours' covariance: decides where these lie on a line.
 const KEEP: f64 = 1e-3;

@@ -1,7 +1,7 @@
 //! Smoothing of observed paths: a cubic smoothing spline on even ticks, as strong as generalised cross-validation wants.
 //!
 //! z = argmin ‖y − z‖² + λ‖D³z‖² (Whittaker 1923, Eilers 2003), whose ends stay free: parabolas pass unchanged, so that the
-//! velocity at the last observed moment is not pulled to zero. λ minimises n·RSS/(n − tr H)² (Craven and Wahba 1978) over
+//! velocity at the last observed time is not pulled to zero. λ minimises n·RSS/(n − tr H)² (Craven and Wahba 1978) over
 //! all nodes together. No tick after the last observed one exists here.
 
 use crate::paths::{Moment, Paths};

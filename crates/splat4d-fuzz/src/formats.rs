@@ -61,7 +61,7 @@ const SOG: &[u8] = include_bytes!("../seeds/few.sog");
 /// Most pieces of a streamed scene that are put together: each is the whole seed.
 const PIECES: usize = 64;
 
-/// Opens a file of any kind and shows a moment of it.
+/// Opens a file of any kind and shows a time of it.
 fn open(bytes: &[u8]) {
     if let Ok(scene) = splat4d::open(bytes) {
         show(&scene);

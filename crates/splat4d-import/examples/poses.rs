@@ -1,7 +1,8 @@
 //! Throws the poses of a capture away, finds them again in its images, and prints how far they are from the truth.
 //!
 //! ```sh
-//! cargo run --release -p splat4d-import --example poses -- examples/knight [--downscale 2] [--walking 100] [--no-clocks] [--shared] [--moments 10]
+//! cargo run --release -p splat4d-import --example poses -- examples/knight [--downscale 2] [--walking 100]
+//! [--no-clocks] [--shared] [--times 10]
 //! ```
 
 use splat4d::math::align::apart;

@@ -12,22 +12,19 @@ pub const FILE: &str = "import.toml";
 /// The version of the file.
 const VERSION: u32 = 1;
 /// What stands above.
-const HEAD: &str = "# What `import` found of every camera. Correct what is wrong and run the same command again: it \
-                    goes on from here.
+const HEAD: &str =
+    "# What `import` found for every camera. Correct it and run the same command again: `import` continues
+# from here.
 #
-#   offset        seconds that are added to the camera's clock; an event \
-                    that the camera notes at t is at t + offset
-#   keep_offset   true: take the offset as it stands \
-                    here, and do not look for it again
-#   rate          how slow the camera's clock is, seconds a \
-                    second
+#   offset        seconds added to the camera's clock: an event at t on its clock is at t + offset
+#   keep_offset   true: keep this offset instead of measuring it again
+#   rate          drift of the camera's clock, seconds a second
 #   lens          pixels of the stored images, OpenCV's distortion
-#   keep_lens     true: \
-                    take the lens as it stands here
+#   keep_lens     true: keep this lens
 #   use           false: leave the camera out
 #
 # `sigma`, `by` \
-                    and `checked` say how sure the offset is, and are not read.
+                    and `checked` describe the accuracy of the offset and are not read.
 
 ";
 
@@ -56,7 +53,7 @@ pub struct Camera {
     /// Whether the offset is the user's.
     #[serde(default)]
     pub keep_offset: bool,
-    /// How slow its clock is, seconds a second.
+    /// Drift of its clock, seconds a second.
     #[serde(default)]
     pub rate: f64,
     /// Standard deviation of the offset, seconds: to read.
@@ -182,7 +179,7 @@ impl Camera {
             number(key, value)?;
             if key.starts_with('f') && value <= 0.0 {
                 return Err(
-                    Error::input(format!("{key} is {value}")).remedy("Focal lengths are above zero, in pixels.")
+                    Error::input(format!("{key} is {value}")).remedy("Focal lengths must be above zero, in pixels.")
                 );
             }
         }

@@ -72,7 +72,7 @@ impl Capture {
         let mut recipe = Recipe::default();
         for name in set(&mut recipe, settings)? {
             if !Recipe::key_of(&name).starts_with("capture.") {
-                return Err(bad_input(format!("`{name}` says nothing of a capture"), "Give it to train"));
+                return Err(bad_input(format!("`{name}` names no capture"), "Give it to train"));
             }
         }
         Self::open(py, path, &recipe, None)

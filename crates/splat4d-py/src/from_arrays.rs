@@ -13,7 +13,7 @@ use splat4d_train::capture::PointCloud;
 use splat4d_train::run::checkpoint::write_atomically;
 use std::path::{Path, PathBuf};
 
-/// Steps of a float image in its file: 16 bits a sample, whose rounding is far below what cameras tell apart.
+/// Steps of a float image in its file: 16 bits a sample, whose rounding is far below a camera's resolution.
 const LEVELS: f32 = 65535.0;
 
 /// What the caller gave.
@@ -182,7 +182,7 @@ fn times(
     fps: Option<f64>,
 ) -> PyResult<Option<Vec<f64>>> {
     let Some(times) = times else {
-        // One moment needs no times, and a frame rate tells all others.
+        // One frame needs no times, and a frame rate gives all others.
         return match count > 1 && fps.is_none() {
             true => Err(bad_input("there are no times", "Give times in seconds, or fps")),
             false => Ok(None),
@@ -194,7 +194,7 @@ fn times(
             let lists = items(times, "times")?;
             let list = lists.get(camera).cloned();
             let list =
-                list.ok_or_else(|| bad_input(format!("there are no times of camera {camera}"), "Give a list each"))?;
+                list.ok_or_else(|| bad_input(format!("no times are given for camera {camera}"), "Give a list each"))?;
             (list, format!("times[{camera}]"))
         }
         false => (times.clone(), "times".to_owned()),
@@ -231,7 +231,7 @@ fn samples(image: &Bound<'_, PyAny>, what: &str, camera: &scene::Camera) -> PyRe
     let fits = |shape: &[usize]| match shape == [camera.height, camera.width, 3] {
         true => Ok(()),
         false => {
-            let wanted = format!("Its camera says [{}, {}, 3]", camera.height, camera.width);
+            let wanted = format!("Its camera has [{}, {}, 3]", camera.height, camera.width);
             Err(bad_input(format!("{what} has the shape {shape:?}"), &wanted))
         }
     };

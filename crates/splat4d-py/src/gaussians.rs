@@ -1,4 +1,4 @@
-//! The scene at one moment.
+//! The scene at one time.
 
 use crate::arrays::{rows, shaped};
 use crate::errors::bad_input;

@@ -59,7 +59,7 @@ impl Hook {
         let dict = |name: &'static str| {
             get(name)?
                 .cast_into::<PyDict>()
-                .map_err(|_| bad_input(format!("`{name}` of the motion is no dict"), "Give a dict"))
+                .map_err(|_| bad_input(format!("`{name}` of the motion is not a dict"), "Give a dict"))
         };
         let (name, warmup, colors) = (get("name")?.extract()?, get("warmup")?.extract()?, get("colors")?.extract()?);
         let mut hook = Self {
@@ -343,7 +343,7 @@ impl Motion for PyMotion {
         }
         let answer = Python::attach(|py| self.request(py, q)).unwrap_or_else(|error| {
             self.hook.raised.raise(error);
-            // The canonical Gaussians: whoever asked hears of the error.
+            // The canonical Gaussians: the caller gets the error.
             let raw = |j| q.p[GEOMETRY].read::<11>(q.rows.id(j), 0);
             let mut colors = Table::default();
             if self.colors() {

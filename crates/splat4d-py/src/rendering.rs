@@ -236,7 +236,7 @@ pub(crate) fn check(scene: &Scene<f32>) -> PyResult<()> {
     if scene.layers.iter().any(|l| l.span != splat4d::layers::ALWAYS) {
         let error = splat4d::Error::new(
             splat4d::ErrorKind::Unsupported,
-            "a playback file holds what was made of a scene's parameters, piece by piece, and no parameters",
+            "a playback file stores the baked segments of a scene, not its parameters",
         );
         return Err(error.remedy("Open the run or its scene.safetensors")).or_raise();
     }

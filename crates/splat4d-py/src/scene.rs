@@ -321,7 +321,7 @@ impl Scene {
             let shot = Shot { depth, ..Shot::new(&splats, &camera.0, background) };
             let mut trouble: Vec<String> = opened.fell_back.then_some(opened.why).into_iter().collect();
             let failed = device::draw(&mut opened.backend, &shot, &mut image);
-            trouble.extend(failed.map(|e| format!("drawn on the CPU: {}", e.cause())));
+            trouble.extend(failed.map(|e| format!("rendered on the CPU: {}", e.cause())));
             (image, trouble)
         });
         raise(scene)?;

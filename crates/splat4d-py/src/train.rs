@@ -130,7 +130,7 @@ struct Listener {
 }
 
 impl Listener {
-    /// `progress`: a function, False for none, or nothing for a bar where somebody looks.
+    /// `progress`: a function, False for none, or nothing for a bar on a terminal or in a notebook.
     fn new(
         py: Python<'_>,
         progress: Option<Py<PyAny>>,

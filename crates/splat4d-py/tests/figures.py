@@ -7,7 +7,7 @@ import sys
 import tempfile
 import time
 
-# Times that a figure is measured: the median, and the least, which tells more where others use the machine.
+# Times that a figure is measured: the median, and the least, which is more robust where others use the machine.
 ROUNDS = 60
 MANY = 150_000
 KNIGHT = pathlib.Path(__file__).resolve().parents[3] / "examples/knight"

@@ -160,7 +160,7 @@ class Gradients(InFolder):
         with self.assertRaisesRegex(splat4d.Error, "depth has no gradients"):
             scene.render(CAMERA, 0, channel="depth", requires_grad=True)
         scene.bake(self.folder / "a.s4d")
-        with self.assertRaisesRegex(splat4d.Error, "no parameters"):
+        with self.assertRaisesRegex(splat4d.Error, "not its parameters"):
             splat4d.open(self.folder / "a.s4d").parameters()
 
 

@@ -171,7 +171,7 @@ class Errors(InFolder):
     def test_captures(self):
         with self.assertRaises(splat4d.Error):
             splat4d.Capture(self.folder)
-        self.refuses("says nothing of a capture", splat4d.Capture, KNIGHT, iterations=3)
+        self.refuses("names no capture", splat4d.Capture, KNIGHT, iterations=3)
         capture = splat4d.Capture(KNIGHT, downscale=8)
         self.assertEqual(capture.image(-1).shape, (37, 50, 3))
         with self.assertRaises(IndexError):

@@ -334,7 +334,7 @@ export class Splat4D extends THREE.Mesh {
     const now = performance.now(),
       accepted = this.#schedule.arrived(now);
     if (accepted) {
-      // The order goes back to the worker.
+      // The order is returned to the worker.
       if (!(this.#next.order?.length >= order.length)) this.#next.order = new Uint32Array(order.length);
       this.#next.order.set(order.subarray(0, count));
       Object.assign(this.#next, { count, generation });
@@ -361,7 +361,7 @@ export class Splat4D extends THREE.Mesh {
     this.#retired = this.#retired.filter((r) => r.generation > generation || (this.#rows.give(r.row, r.count), false));
   }
 
-  // The stream gives pages to whoever draws them.
+  // The stream gives pages to the renderer.
 
   /// A texture of 8192 rows, which every WebGL2 device of today has, holds 8 million Gaussians.
   capacity = 8192 * ROW * 32;

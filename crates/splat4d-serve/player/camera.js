@@ -4,7 +4,7 @@
 export const DEGREE = Math.PI / 180;
 /** Nothing as near as this is drawn where cameras do not say, scene units. */
 export const NEAR = 0.01;
-/** Field of view where nobody states one: that of a normal lens. */
+/** Field of view where none is given: that of a normal lens. */
 const FOV_DEFAULT = 45;
 /** Widest and narrowest image, degrees: wider is a fisheye's business, narrower shows single Gaussians. */
 export const FOV_RANGE = [5, 120];

@@ -32,7 +32,7 @@ export class Controls {
   #velocity = [0, 0];
   #moved = 0;
 
-  /** `host`: {camera, radius, moved(), loosen()}; loosen() is told before the camera leaves its place. */
+  /** `host`: {camera, radius, moved(), loosen()}; loosen() is called before the camera leaves its place. */
   constructor(stage, host) {
     this.stage = stage;
     this.host = host;

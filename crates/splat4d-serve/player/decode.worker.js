@@ -10,7 +10,7 @@ const BLOCK = 256,
   HEADER = 24;
 /// 32-bit words a Gaussian (docs/format.md).
 const WORDS = 8;
-/// Bytes given to the inflater at a time. A browser inflates a piece whole, at most 1 : 1032, before anybody can stop
+/// Bytes given to the inflater at a time. A browser inflates a piece whole, at most 1 : 1032, before it can be stopped
 /// it: so a hostile section costs 16 MB and no more.
 const PIECE = 16384;
 
@@ -110,7 +110,7 @@ function mask(data, { count, from, to }) {
   for (let k = 0, at = 8 + 8 * number; k < number; k++) {
     const row = 4 * stride * k;
     for (let i = 0; i < packed; i++, at++) bytes[row + i] = data[at] ^ (k ? bytes[row - 4 * stride + i] : 0);
-    // Bits beyond the last Gaussian mean nothing, and nobody shall count them.
+    // Bits beyond the last Gaussian mean nothing, and are not counted.
     if (count % 8) bytes[row + packed - 1] &= (1 << (count % 8)) - 1;
   }
   return { count, keys, rows: new Uint32Array(bytes.buffer), stride };

@@ -9,7 +9,7 @@ import { clamp } from './camera.js';
 
 /** Longer side of images that the program draws, pixels: at rest, and while something is pulled. */
 const SIDE = 960, SIDE_PULLING = 384;
-/** Rest after which the selection is looked up at another moment, ms. */
+/** Rest after which the selection is looked up at another time, ms. */
 const REST = 180;
 /** Nodes of a bend. */
 const NODES = 512;
@@ -314,7 +314,7 @@ export class Editing {
     this.#properties();
     this.#diamonds();
     this.#state();
-    // What was made again under somebody's keys is theirs again.
+    // A keyframe made again keeps its owner.
     if (focused && !this.panel.contains(this.ui.focused())) this.panel.querySelector(`[aria-label="${CSS.escape(focused)}"]`)?.focus();
   }
 
@@ -448,7 +448,7 @@ export class Editing {
     this.refresh();
   }
 
-  /** Looks up who is selected, at this moment. */
+  /** Looks up who is selected, at this time. */
   async #select() {
     const run = ++this.#lookup, text = this.text.trim();
     if (!text) return this.#tell(null);

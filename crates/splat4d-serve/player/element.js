@@ -72,7 +72,7 @@ export class Splat4D extends HTMLElement {
     }
     if (this.hasAttribute('page')) {
       addEventListener('hashchange', this.#hash);
-      // While the page still asks what to show. A failure is told when there is a scene to be drawn.
+      // While the page still asks what to show. A failure is reported when there is a scene to render.
       player.prepare().catch(() => {});
     }
     this.#load();

@@ -8,7 +8,7 @@ export class SceneError extends Error {
   }
 }
 
-/// Whether `error` only says that somebody no longer wants the answer.
+/// Whether `error` only says that the result is no longer wanted.
 export function isAbort(error) {
   return error?.name === 'AbortError';
 }

@@ -83,7 +83,7 @@ export function check(gl, what) {
   }
 }
 
-/// Measures how long the graphics processor works on what lies between `begin` and `end`, where the browser tells.
+/// Measures how long the graphics processor works on what lies between `begin` and `end`, where the browser reports it.
 export class Timer {
   /// The latest answer, ms; 0 where there is none.
   ms = 0;

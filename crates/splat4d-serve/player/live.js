@@ -5,7 +5,7 @@ import { icon } from './icons.js';
 
 /** Milliseconds before another try to reach the server, doubled up to the second. */
 const RETRY = [500, 8000];
-/** Snapshots told within this time, ms, are one piece of news. */
+/** Snapshots within this time, ms, are one update. */
 const TOGETHER = 30;
 /** Points of the curve that are kept; beyond it every second one goes. */
 const CURVE_MAX = 2000;
@@ -50,7 +50,7 @@ export class Feed {
   }
 }
 
-/** A step as the server tells it, by either of its two sets of names. */
+/** A step as the server sends it, by either of its two sets of names. */
 function readStep({ psnr, loss, gaussians, held_out: held, ...s }) {
   const [step, of, left] = [s.iteration ?? s.step, s.iterations ?? s.of, s.seconds_left ?? s.left_s].map(Number);
   return { step, of, left, psnr: +psnr, loss: +loss, gaussians, held: held == null ? NaN : +held };
@@ -103,7 +103,7 @@ export class Training {
     let newest = null;
     const show = number => {
       clearTimeout(this.timer);
-      // A server that tells what was missed may name several: only the last is worth loading.
+      // A server that reports missed snapshots may name several: only the last is loaded.
       this.timer = setTimeout(() => {
         if (number === newest) return;
         newest = number;
@@ -121,7 +121,7 @@ export class Training {
       snapshot: show,
       state: state => {
         this.#show(state);
-        // Whoever joins late, or was away, asks for what was missed.
+        // A page that joins late or was disconnected asks for what it missed.
         if (state === 'live') past();
       },
       other: data => {

@@ -17,7 +17,7 @@ export class Order {
   #sorter = null;
   /// [message, what moves with it], until the worker says that it runs: a page's policy may forbid workers.
   #early = [];
-  /// The array that goes back and forth.
+  /// The array that is passed back and forth.
   #array = null;
 
   /// `onorder({order, count, active, ms, generation})`: the first `count` of `order` are the Gaussians that are visible at
@@ -94,7 +94,7 @@ export class Order {
     const array = this.#sorter.room(order);
     const { count, active } = this.#sorter.sort(sort, array);
     const ms = performance.now() - begin;
-    // Later, as a worker's answer would come: whoever asks is not in the middle of something then.
+    // Later, as a worker's result would come: the caller has finished its own work then.
     setTimeout(() => this.#arrived({ order: array, count, active, ms, generation }), 0);
   }
 

@@ -89,7 +89,7 @@ export class Pace {
 
   /** A frame took `ms`, drawn at the present scale unless `fixed`; `now` in ms. */
   frame(ms, now, fixed = false) {
-    // The first frame after a change is still one of before.
+    // The first frame after a change still has the previous resolution.
     this.frameMs = this.#frames++ > 1 ? this.frameMs + SMOOTH * (ms - this.frameMs) : ms;
     const since = now - this.#changed, enough = since > 4 * EVERY ? FEW : FRAMES;
     if (fixed || this.#frames < enough || since < EVERY) return;

@@ -136,7 +136,7 @@ export function cameraPanel(ui) {
     allow(play, n < 2 && !player.film && 'A path needs two keys');
     play.lastChild.textContent = player.film && !player.film.frozen ? 'Stop path' : 'Play path';
     bullet.lastChild.textContent = player.film?.frozen ? 'Stop bullet time' : 'Bullet time';
-    allow(out, !n && 'There is no key to export', 'Save the path for splat4d render --path path.json');
+    allow(out, !n && 'No key to export', 'Save the path for splat4d render --path path.json');
     note.hidden = n > 1;
     keys.hidden = !n;
     if (!keys.contains(ui.focused())) keys.replaceChildren(...player.track.keys.map((key, i) => pathKey(ui, key, i)));

@@ -657,7 +657,7 @@ export class Player extends EventTarget {
     return [Math.max(middle - radius, 0.02 * radius), Math.max(middle, 0) + radius];
   }
 
-  /** What a backend is told to draw now, at a size in px. */
+  /** What a backend is to render now, at a size in px. */
   drawing(width, height, camera = this.camera) {
     // The capture's cameras saw no haze right before them. Who comes closer to look at something wants to see it.
     const least = this.meta.near ?? NEAR;

@@ -1,4 +1,4 @@
-// Bytes of a source by offset: HTTP ranges of a URL (adjacent ones in one request, few at a time, once more after a
+// Bytes of a source by offset: HTTP ranges of a URL (adjacent ones in one request, few at a time, again after a
 // network error), or slices of what is in memory already.
 
 import { SceneError } from './errors.js';
@@ -205,7 +205,7 @@ export class Remote {
     response.body?.cancel().catch(() => {});
     const error = new SceneError(
       response.status === 416
-        ? 'The file is shorter than its index says, or empty'
+        ? 'The file is shorter than its index states, or empty'
         : `The server answered ${response.status} ${response.statusText}`.trimEnd(),
       this.url,
       response.status === 404 ? 'Check the address.' : '',
@@ -234,7 +234,7 @@ export class Remote {
       progress?.(n);
       answer?.(bytes, n);
       if (more.length < value.length) {
-        // It sends more than was asked for: nobody waits for the rest.
+        // It sends more than requested: the rest is not read.
         reader.cancel().catch(() => {});
         return bytes;
       }

@@ -334,7 +334,7 @@ export class SceneFile {
     const refuse = (what, remedy) => this.#refuse(`Section ${id} (${kind.replace(/[^ -~]/g, '?')}) ${what}`, remedy);
     if (!(offset >= HEAD && offset + stored <= length)) refuse('lies outside the file');
     if (!['PAGE', 'PALT', 'POST', 'MASK', 'LABL'].includes(kind)) {
-      if (section.flags & 1) refuse('is of a kind that this player does not know', 'Use a newer player.');
+      if (section.flags & 1) refuse('is of a kind that this player does not support', 'Use a newer player.');
       return section;
     }
     if (codec > 1) refuse(`has the unknown compression method ${codec}`, 'Use a newer player.');

@@ -41,7 +41,7 @@ export class Schedule {
   #asked = null;
   #skipped = false;
   #least = 0;
-  /// When the last order was requested, and the moment it was requested for, ms.
+  /// When the last order was requested, and the time it was requested for, ms.
   #askedAt = 0;
   #due = -Infinity;
   #rendered = null;

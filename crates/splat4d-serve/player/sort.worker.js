@@ -14,7 +14,7 @@ const ROW = 1024;
 const TRACK = 8;
 /// Keys of the counting sort: 16 bits.
 const KEYS = 65536;
-/// A window of visibility is widened by this, s: rounding must lose nobody, the shader decides exactly.
+/// A window of visibility is widened by this, s: rounding must lose no Gaussian, the shader decides exactly.
 const SLACK = 1e-5;
 /// Opacity below which nothing is drawn (Kerbl et al. 2023).
 const ALPHA_MIN = 1 / 255;
@@ -156,7 +156,7 @@ class Sorter {
     if (page) page.mask = new KeyMask(mask);
   }
 
-  /// `order` where it has room for everybody, else a new one: whole rows of ROW numbers.
+  /// `order` where it has room for all, else a new one: whole rows of ROW numbers.
   room(order) {
     const rows = Math.ceil(this.total / ROW);
     return order?.length >= rows * ROW ? order : new Uint32Array(rows * ROW);
@@ -168,7 +168,7 @@ class Sorter {
   }
 
   /// Writes the visible Gaussians (row·1024 + column) at `time` into `out`, the farthest first, by the camera's depth
-  /// z = a·x + b·y + c·z + d for `depth` [a, b, c, d]. Returns {count, active: Gaussians of this moment's
+  /// z = a·x + b·y + c·z + d for `depth` [a, b, c, d]. Returns {count, active: Gaussians of this time's
   /// pages that their key masks admit}.
   sort({ time, depth: [a, b, c, d], near }, out) {
     const total = this.total;

@@ -1,5 +1,5 @@
-// Keeps the right pages in a backend: first those of this moment (most important tier first), then those just ahead;
-// above its budget it lets go of what is farthest in time, never of what this moment needs.
+// Keeps the right pages in a backend: first those of this time (most important tier first), then those just ahead;
+// above its budget it lets go of what is farthest in time, never of what this time needs.
 
 import { isAbort } from './errors.js';
 import { painted } from './labels.js';
@@ -50,7 +50,7 @@ export class Stream {
   #palettes = new Map();
   #now = [];
   #later = [];
-  /// The pages of the last update's moment: the same list as long as no span begins or ends.
+  /// The pages of the last update's time: the same list as long as no span begins or ends.
   #active = [];
   #begun = -1;
   #ended = -1;
@@ -67,8 +67,8 @@ export class Stream {
 
   /// `file`: SceneFile. `backend`: of PLAYER's interface; it owns the arrays it is given. `budget`: bytes of words.
   /// `onchange()` after each page that came or went, `onerror(SceneError)` for a page that is given up for now,
-  /// `onleft(Gaussians)` when a moment first does not fit into the budget. `show`: labels as `painted` wants it, null: pages
-  /// are shown as they are.
+  /// `onleft(Gaussians)` when a time first does not fit into the budget. `show`: labels as `painted` wants it, null:
+  /// pages are shown as they are.
   constructor(file, backend, { budget = defaultBudget(), onchange, onerror, onleft, show = null } = {}) {
     this.#show = show;
     this.#file = file;
@@ -92,7 +92,7 @@ export class Stream {
     return this.#bytes;
   }
 
-  /// Gaussians of this moment that the budget has no room for: those of the last tiers.
+  /// Gaussians of this time that the budget has no room for: those of the last tiers.
   left = 0;
 
   /// Pages on their way.
@@ -100,7 +100,7 @@ export class Stream {
     return this.#flight.size;
   }
 
-  /// Tells what is shown. Cheap where nothing changed: call it every frame.
+  /// Reports what is shown. Cheap where nothing changed: call it every frame.
   update(time, { playing = false, speed = 1, loop = true } = {}) {
     if (this.#over) return;
     const t = this.#file.clamp(time);
@@ -237,7 +237,7 @@ export class Stream {
     return !failed || failed.tries < TRIES || performance.now() - failed.at >= REST;
   }
 
-  /// Starts what is to be fetched now: this moment's pages all at once, and only when those are there, later ones.
+  /// Starts what is to be fetched now: this time's pages all at once, and only when those are there, later ones.
   #pump() {
     if (this.#over) return;
     let open = false;
@@ -314,7 +314,7 @@ export class Stream {
     return there;
   }
 
-  /// Answers `settled` where nothing of this moment is on its way any more.
+  /// Answers `settled` where nothing of this time is on its way any more.
   #wake() {
     if (!this.#waiting.length) return;
     if (this.#now.some((page) => this.#flight.has(page.id) || this.#wants(page))) return;

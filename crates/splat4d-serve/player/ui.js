@@ -67,7 +67,7 @@ export class Interface {
     this.bar = h('div', { class: 'card bar', role: 'toolbar', 'aria-label': 'Playback' }, this.scrub,
       h('div', { class: 'row' }, this.play, ...steps, this.timeLabel, h('div', { class: 'space' }),
         this.embed ? null : this.loopTool, this.embed ? null : this.speed, ...spare, this.xrTool, this.arTool, this.full));
-    // Without room, an element of somebody's page keeps what plays.
+    // Without room, an element of a user's page keeps what plays.
     for (const item of [this.back, this.next, this.loopTool, this.speed, ...spare]) item.classList.add('spare');
     this.root.classList.toggle('page', this.page);
     this.panels = { cameras: cameraPanel(this), view: viewPanel(this) };

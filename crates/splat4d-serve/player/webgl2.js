@@ -419,7 +419,7 @@ export class WebGL2Backend {
       this.#flight.begin(begin);
       gl.flush();
     }
-    // Where the browser tells nothing, at least what giving the orders took.
+    // Where the browser reports nothing, at least the time of submission.
     this.stats.drawMs = this.#timer.ms || performance.now() - begin;
     return true;
   }

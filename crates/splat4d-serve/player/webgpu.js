@@ -533,7 +533,7 @@ export class WebGPUBackend {
     for (const page of listed) {
       const bits = page.mask?.bits;
       for (let k = 0; k < page.blocks; k++) {
-        // A block of which nobody is admitted needs no look.
+        // A block without admitted Gaussians is skipped.
         if (!bits || bits.subarray(MASK_WORDS * k, MASK_WORDS * (k + 1)).some((word) => word)) list[n++] = page.at + k;
       }
       gaussians += page.mask?.count ?? page.count;

@@ -205,7 +205,7 @@ fn scene(shared: &Shared, request: &Parts) -> Response<Body> {
         (header::ETAG, version.etag.as_str()),
         (header::ACCEPT_RANGES, "bytes"),
         (header::CONTENT_TYPE, splat4d::format::playback::MEDIA_TYPE),
-        // The player keeps what it needs; a second copy of a large file in the browser's cache helps nobody.
+        // The player keeps what it needs; a second copy of a large file in the browser's cache is useless.
         (header::CACHE_CONTROL, "no-store"),
     ];
     if headers.get(header::IF_NONE_MATCH).is_some_and(|tags| matches(tags, &version.etag)) {

@@ -39,7 +39,7 @@ const LEAST_TOKEN: usize = 16;
 /// What a program answers to a page that edits.
 #[derive(Clone, Debug, Default)]
 pub struct EditAnswer {
-    /// Told to the page.
+    /// Sent to the page.
     pub told: Value,
     /// The scene from now on, a `.s4d`; `told` gets its number as `version`.
     pub scene: Option<Arc<[u8]>>,
@@ -101,7 +101,7 @@ impl Editing {
 
 const TOO_LARGE: (StatusCode, &str) = (StatusCode::PAYLOAD_TOO_LARGE, "a list of edits has at most 1 MB");
 
-/// Compares in a time that does not tell where two texts differ.
+/// Compares in a time that does not reveal where two texts differ.
 fn same(a: &[u8], b: &[u8]) -> bool {
     a.len() == b.len() && a.iter().zip(b).fold(0, |sum, (a, b)| sum | (a ^ b)) == 0
 }

@@ -19,7 +19,7 @@ const MAX_STEPS: usize = 2000;
 const MAX_NOTES: usize = 100;
 /// Longest piece of news, bytes of JSON; a longer one is not sent. Steps have some 200.
 const MAX_NEWS: usize = 16 << 10;
-/// Least time between two packets to a client: faster than anybody reads, slow enough for many clients.
+/// Least time between two packets to a client: faster than a person reads, slow enough for many clients.
 const PACE: Duration = Duration::from_millis(50);
 /// Time after which an empty line says that the connection lives; proxies cut silent ones after about 30 s.
 const HEARTBEAT: Duration = Duration::from_secs(15);
@@ -35,7 +35,7 @@ pub enum News {
     /// `kind: "step"`: training went on: `iteration`, `iterations`, `loss`, `psnr`, `gaussians`, `seconds`,
     /// `seconds_left`, `stage`.
     Step(Value),
-    /// `kind: "note"`: something to be told: `message`.
+    /// `kind: "note"`: an event to be sent: `message`.
     Note(Value),
     /// `kind: "control"`: the run was paused, continued or stopped: `state`.
     Control(Value),

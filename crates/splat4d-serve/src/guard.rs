@@ -10,7 +10,7 @@ use std::net::IpAddr;
 /// Names under which the server may be asked.
 #[derive(Clone, Debug)]
 pub(crate) struct Guard {
-    /// The host that the user told, as typed.
+    /// The host that the user gave, as typed.
     told: String,
     /// Bound to more than loopback: an address in numbers is no name, so that no resolver could have been tricked.
     open: bool,

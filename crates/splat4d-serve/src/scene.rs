@@ -91,7 +91,7 @@ impl Scene {
 
     /// Replaces the bytes; returns the new version's number.
     pub(crate) fn set(&self, bytes: Arc<[u8]>) -> u64 {
-        // The process and the moment are in the tag: a server started again counts from 1 again.
+        // The process and the time are in the tag: a server started again counts from 1 again.
         let now = UNIX_EPOCH.elapsed().unwrap_or_default().as_nanos();
         let length = bytes.len() as u64;
         let etag = format!("\"m{now:x}-{length:x}\"");
@@ -131,7 +131,7 @@ fn file_etag(meta: &Metadata) -> String {
 }
 
 impl Version {
-    /// The same, as long as its file has become: one of an unfinished take is appended to while somebody plays it, and what
+    /// The same, as long as its file has become: one of an unfinished take is appended to while it is played, and what
     /// was there stays as it was.
     fn grown(&self) -> Self {
         let Source::File(file) = &self.source else { return self.clone() };

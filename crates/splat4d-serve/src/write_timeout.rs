@@ -12,7 +12,7 @@ use tokio::time::{Instant, Sleep};
 
 /// A client must take [`LEAST`] bytes in this time, or it is cut off.
 const WINDOW: Duration = Duration::from_secs(20);
-/// 3 kB a second: a tenth of the slowest line on which anybody would watch a scene.
+/// 3 kB a second: a tenth of the slowest line on which a scene is watchable.
 const LEAST: usize = 64 << 10;
 
 /// A stream that fails where its reader stalls.

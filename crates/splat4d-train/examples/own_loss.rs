@@ -50,7 +50,7 @@ impl ImageTerm for Labels {
     }
 }
 
-/// Two grey balls that colours do not tell apart.
+/// Two grey balls that colours do not separate.
 fn balls() -> Result<Scene<f32>> {
     let mut params = Params::<f32>::new(GAUSSIANS, 1, LifeKind::Infinite.columns());
     let motion = build(&Spec::Still, &mut params)?;

@@ -150,7 +150,7 @@ pub enum Event {
         seconds: f64,
         /// Gaussians at the end.
         gaussians: usize,
-        /// Peak resident memory of the process, bytes; 0 where the system does not tell.
+        /// Peak resident memory of the process, bytes; 0 where the system does not report it.
         peak_memory: u64,
         /// What would improve the result, if the run ended too early or with too few Gaussians.
         advice: Option<String>,

@@ -18,11 +18,11 @@ use splat4d::layers::Scene;
 use splat4d::scene::features::{self, FEATURES};
 use splat4d::scene::{Planes, Table};
 
-/// Rounds unless told.
+/// Rounds by default.
 pub const ROUNDS: usize = 8;
 /// Most images of a round, evenly chosen: more say the same again.
 pub const MOST_PICTURES: usize = 240;
-/// ε, pixels' worth of features that are 0: what no image shows has none.
+/// ε, weight in pixels of features that are 0: what no image shows has none.
 const PRIOR: f64 = 1e-3;
 
 /// How well features are learnt.
@@ -291,7 +291,7 @@ mod tests {
             let at = |k: usize| (k as f32 / 19.0 - 0.5) * 4.0;
             p[GEOMETRY].write(r, 0, [at(r % 20), at(r / 20), 0.0]);
         }
-        // Nobody ever sees the last one.
+        // No view ever sees the last one.
         p[GEOMETRY].write(400, 0, [0.0, 0.0, -9.0]);
         for r in 0..401 {
             p[GEOMETRY].write(r, QUAT, [1.0, 0.0, 0.0, 0.0]);

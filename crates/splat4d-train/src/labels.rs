@@ -19,11 +19,11 @@ use splat4d::layers::Scene;
 use splat4d::scene::labels::{self, LABEL_LOGITS};
 use splat4d::scene::{Planes, Table};
 
-/// Rounds unless told: the cross-entropy of the bundled capture then changes by less than a percent a round.
+/// Rounds by default: the cross-entropy of the bundled capture then changes by less than a percent a round.
 pub const ROUNDS: usize = 4;
 /// Most images of a round, evenly chosen: more say the same again.
 pub const MOST_PICTURES: usize = 240;
-/// Pixels' worth of an even vote that every Gaussian has: what no image shows keeps no label.
+/// Weight in pixels of the even vote that every Gaussian has: what no image shows keeps no label.
 const PRIOR: f64 = 1e-3;
 /// Probabilities are kept this far from 0: a wrong mask must not forbid a label for ever.
 const LEAST: f64 = 1e-6;
@@ -248,7 +248,7 @@ mod tests {
             let at = |k: usize| (k as f32 / 19.0 - 0.5) * 4.0;
             p[GEOMETRY].write(r, 0, [at(r % 20), at(r / 20), 0.0]);
         }
-        // Nobody ever sees the last one.
+        // No view ever sees the last one.
         p[GEOMETRY].write(400, 0, [0.0, 0.0, -9.0]);
         for r in 0..401 {
             p[GEOMETRY].write(r, QUAT, [1.0, 0.0, 0.0, 0.0]);

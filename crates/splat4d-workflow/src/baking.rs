@@ -27,7 +27,7 @@ use std::path::Path;
 /// Cameras that stand still and times at which baked and model are compared; every one costs two renders.
 const COMPARED_CAMERAS: usize = 4;
 const COMPARED_TIMES: usize = 6;
-/// The same of poses of a camera that moves, each at its own time; and of cameras that stand still next to it.
+/// The same of poses of a camera that moves, each at its own time; and of fixed cameras next to it.
 const COMPARED_POSES: usize = 12;
 const COMPARED_BESIDE: usize = 2;
 /// Longer side of those renders, pixels.
@@ -63,7 +63,7 @@ const SPARE: f64 = 2.0;
 /// Of the seconds that are left for baking, what the first sampling of the model may take. Sampling between frames, fitting,
 /// packing and comparing take the rest.
 const SAMPLING: f64 = 0.25;
-/// The same of renders that measure how strongly images react to errors, of cameras that stand still and of one that moves; and
+/// The same of renders that measure how strongly images react to errors, of fixed cameras and of one that moves; and
 /// how many ordinary renders one of them takes.
 const WEIGHING: f64 = 0.1;
 /// See [`WEIGHING`].
@@ -340,7 +340,7 @@ impl Cooked {
 }
 
 /// Bakes and packs a scene within its bytes and time, and compares it with its model. Cuts it again where the first cut was
-/// further off than a comparison can tell, without sampling the model again.
+/// further off than a comparison can measure, without sampling the model again.
 pub fn bake_like(source: &Source, title: &str, baking: &Baking, console: &dyn Listener) -> Result<Cooked> {
     let (scene, deadline) = (&source.scene, &baking.deadline);
     let views = source.views()?;
@@ -461,7 +461,7 @@ pub fn compared(source: &Source) -> Result<Vec<(f64, Camera)>> {
     Ok(shots(&source.scene, &source.stage(&views), &views))
 }
 
-/// Cameras and times of a comparison: cameras that stand still at times over the clip, one that moves where it was at each.
+/// Cameras and times of a comparison: fixed cameras at times over the clip, one that moves where it was at each.
 fn shots(scene: &Scene<f32>, stage: &Stage, views: &[View]) -> Vec<(f64, Camera)> {
     let small = |c: &Camera| c.downscaled(c.width.max(c.height).div_ceil(COMPARED_SIDE).max(1));
     let Cameras { still, path } = Cameras::of(views);

@@ -18,6 +18,7 @@ use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::capture::{Capture, ImageStore};
 use splat4d_train::compress::{self, Compression, Job, Level};
 use splat4d_train::eval::run::{EvalOptions, Scores, assess};
+use splat4d_train::event::Event;
 use splat4d_train::output::{FolderContent, Input, Mixes, OutputFolder, Request};
 use splat4d_train::path_text::in_command;
 use splat4d_train::recipe::Recipe;
@@ -139,9 +140,7 @@ impl CompressOptions {
             settings.set(assignment).map_err(|e| e.at("option `set`"))?;
         }
         if !settings.codec {
-            return Err(
-                Error::input("`codec` = false is for studies: it makes no file").remedy("Use `splat4d lab e03`.")
-            );
+            return Err(Error::input("`codec` = false is for studies: it makes no file").remedy("Leave it out."));
         }
         Ok(settings)
     }
@@ -199,6 +198,15 @@ impl CompressJob {
 const SAVING: &str = "stopping: a checkpoint is being saved";
 /// What an owner's record calls this verb.
 const COMMAND: &str = "compress";
+
+/// Reports whether the stop flag is polled after this event: steps poll it, the start of a stage (scores, baking, masks) does
+/// not for seconds.
+fn report_polling(event: &Event, kept: &str, console: &dyn Listener) {
+    match event {
+        Event::Phase { .. } => console.stop_not_polled(kept),
+        _ => console.stop_polled(SAVING),
+    }
+}
 
 /// A compression in its folder.
 pub struct Work {
@@ -425,7 +433,10 @@ impl Work {
         console.say("training the unpruned scene on for as many steps, to compare");
         let job = original.job(&settings);
         let options = TrainOptions { device: self.device, ..TrainOptions::default() };
-        let done = compress::compress(&job, &folder, &options, stop, &mut |event| console.event(event))?;
+        let done = compress::compress(&job, &folder, &options, stop, &mut |event| {
+            report_polling(event, &self.kept(), console);
+            console.event(event);
+        })?;
         console.clear();
         if done.outcome.interrupted {
             return Err(self.interrupted(done.outcome.iteration));
@@ -480,6 +491,7 @@ impl Work {
         let options = TrainOptions { device: self.device, ..TrainOptions::default() };
         let compressed = compress::compress(&job, &self.dir, &options, stop, &mut |event| {
             run_folder::on_event(&self.folder, event);
+            report_polling(event, &self.kept(), console);
             console.event(event);
         })?;
         console.clear();
@@ -626,11 +638,33 @@ fn say(told: &Compressed, size: [usize; 2], console: &dyn Listener) {
         let plain = plain.map_or_else(String::new, |plain| {
             format!("{:.1} times smaller than the plain playback file, ", plain.bytes as f64 / told.after.bytes as f64)
         });
-        // Nobody ships floats: their figure stands alone only where there is no plain file.
+        // Floats are never shipped: their figure stands alone only where there is no plain file.
         let smaller = match plain.is_empty() {
             true => format!("{times:.1} times smaller than 32-bit floats, "),
             false => plain,
         };
         console.say(&format!("{smaller}{faster:.2} times as fast"));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::events;
+    use std::cell::RefCell;
+
+    #[test]
+    fn the_start_of_a_stage_may_be_ended_and_its_steps_are_saved() {
+        let seen = RefCell::new(Vec::new());
+        let listen = |event: &events::Event<'_>| match event {
+            events::Event::StopPolled(_) => seen.borrow_mut().push("polled"),
+            events::Event::StopNotPolled(kept) => seen.borrow_mut().push(if *kept == "kept" { "ends" } else { "?" }),
+            _ => {}
+        };
+        let scoring = Event::Phase { name: "scoring Gaussians".into(), done: 1, total: 2 };
+        for event in [scoring, Event::Warning { message: "a step's".into() }] {
+            report_polling(&event, "kept", &listen);
+        }
+        assert_eq!(*seen.borrow(), ["ends", "polled"]);
     }
 }

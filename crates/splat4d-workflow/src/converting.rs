@@ -440,7 +440,7 @@ struct Writer {
 }
 
 impl Writer {
-    /// A scene as a file; where the format holds one moment, the scene stands still.
+    /// A scene as a file; where the format holds one time, the scene stands still.
     fn bytes(&self, scene: &Scene<f32>) -> Result<(Vec<u8>, Warnings)> {
         let mut out = Vec::new();
         let warnings = match self.target {

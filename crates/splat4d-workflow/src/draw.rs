@@ -115,7 +115,7 @@ impl Channel {
     }
 }
 
-/// Alpha below which a pixel has no depth, and no other number, worth showing.
+/// Alpha below which a pixel has no depth, and no other value to show.
 const DEPTH_ALPHA: f32 = 0.1;
 /// Colours from little to much, sRGB: dark blue to pale yellow, brightness rising throughout.
 const RAMP: [[f32; 3]; 6] = [
@@ -132,7 +132,7 @@ const GOLDEN: f32 = 0.618_034;
 /// Most training images that are asked for the uncertainty of a scene, evenly chosen.
 const WITNESSES: usize = 48;
 
-/// Pixels that a thread turns into bytes at once: enough to be worth its while.
+/// Pixels that a thread turns into bytes at once: enough to amortise the overhead.
 const CHUNK: usize = 1 << 14;
 
 /// An image of 8-bit samples, rows from the top.
@@ -158,7 +158,7 @@ impl Rgb {
     }
 }
 
-/// Draws, on the CPU unless told; memory is reused from image to image.
+/// Draws, on the CPU by default; memory is reused from image to image.
 pub struct Painter<'a> {
     player: Player<'a>,
     scene: &'a Scene<f32>,
@@ -439,7 +439,7 @@ fn field_rgb(raw: &Planes<f32>, channel: Channel, [low, high]: [f32; 2]) -> Rgb 
         }
         match channel {
             Channel::Flow => {
-                // Right is red, down yellow-green, left cyan, up violet; what stands still is white.
+                // Right is red, down yellow-green, left cyan, up violet; the static background is white.
                 let turn = at(1).atan2(at(0)) / std::f32::consts::TAU;
                 hue(turn.rem_euclid(1.0), (at(0).hypot(at(1)) / span).min(1.0), 1.0)
             }

@@ -34,7 +34,7 @@ const COMPARED: usize = 40;
 /// Above this a mask's pixel is white, of 1.
 const WHITE: f32 = 0.5;
 
-/// Moments of the clip at which [`EditOptions::count`] counts what is visible.
+/// Times of the clip at which [`EditOptions::count`] counts what is visible.
 const MOMENTS: usize = 5;
 
 /// Options of [`edit`].

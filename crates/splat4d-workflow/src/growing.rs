@@ -78,7 +78,7 @@ fn complete_from(
     Ok(length)
 }
 
-/// Whether a playback file is one that grows, or none that anybody could play.
+/// Whether a playback file is one that grows, or one that cannot be played.
 fn grows(path: &Path) -> Result<bool> {
     let mut header = Vec::new();
     let file = files::open(path)?;

@@ -20,7 +20,7 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Width and height of the images unless told: the frame rates of docs/benchmarks.md are at this size.
+/// Width and height of the images by default: the frame rates of docs/benchmarks.md are at this size.
 pub const SIZE: [usize; 2] = [800, 800];
 /// Images of a round: enough that every side of the scene and all parts of the clip take part.
 const LOOKS: usize = 24;
@@ -28,7 +28,7 @@ const LOOKS: usize = 24;
 const ROUNDS: usize = 5;
 /// Times that the first image is drawn from bytes; the best counts.
 const DECODES: usize = 3;
-/// Most moments at which Gaussians are counted: ten seconds at 30 frames a second.
+/// Most times at which Gaussians are counted: ten seconds at 30 frames a second.
 const COUNTED: usize = 300;
 
 /// One side of a comparison. Its JSON is part of `compress.json` and of what `bench --playback` prints.
@@ -119,7 +119,7 @@ pub fn measured_views_of(source: &Source, size: [usize; 2]) -> Result<Vec<Measur
     Ok(measured_views(&(0..LOOKS).map(orbit).collect::<Vec<_>>(), source.scene.clip, size))
 }
 
-/// Moments in the middle of equal parts of the clip, each from another camera: images of this size with the camera's
+/// Times in the middle of equal parts of the clip, each from another camera: images of this size with the camera's
 /// vertical field of view. Panics: no views.
 pub fn measured_views(views: &[View], clip: [f64; 2], [width, height]: [usize; 2]) -> Vec<MeasuredView> {
     let mut seen = BTreeSet::new();
@@ -237,7 +237,7 @@ impl<'a> Seat<'a> {
     fn side(mut self) -> Result<Side> {
         let counts = frames(self.player.meta().clip, self.player.meta().fps)
             .into_iter()
-            // The pages of a moment come into memory with its image.
+            // The pages of a time come into memory with its image.
             .map(|t| self.player.at(t).map(|_| ()).map(|()| self.player.alive(t)))
             .collect::<Result<Vec<usize>>>()?;
         let rate = |k: usize| self.best.len() as f64 / self.best.iter().map(|b| b[k]).sum::<f64>().max(f64::EPSILON);
@@ -253,7 +253,7 @@ impl<'a> Seat<'a> {
     }
 }
 
-/// Sizes and counts that can be told without drawing.
+/// Sizes and counts that are known without rendering.
 fn weighed(scene: &Scene<f32>, bytes: usize) -> Side {
     let numbers = |l: &splat4d::layers::Layer| l.params.keys().map(|k| l.params[k].data().len()).sum::<usize>();
     let seconds = scene.clip[1] - scene.clip[0];
@@ -286,7 +286,7 @@ fn first_picture(subject: &Subject<'_>, stored: &Arc<[u8]>, look: &MeasuredView)
     match &subject.what {
         What::Scene(_) => {
             let (scene, mut moment) = (scene_file::read(stored)?, Evaluation::default());
-            // A player would look up first when everybody lives, which pays from the second image on.
+            // A player would first look up which Gaussians are alive, which pays from the second image on.
             scene.at(look.time, &mut moment);
             renderer.render(&Shot::new(&scene.splats(&moment), &look.camera, scene.background), &mut image);
         }

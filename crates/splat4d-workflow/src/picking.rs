@@ -11,7 +11,7 @@ use splat4d::scene::splats::SPLAT_OPACITY;
 use splat4d::scene::{Camera, Intrinsics, Time};
 use splat4d::{Error, Result};
 
-/// Fainter ones are not told of, and carry no depth.
+/// Fainter ones are not reported, and have no depth.
 const FAINT: f32 = 0.1;
 /// Below this a pixel shows nothing.
 const SEEN: f32 = 0.5;

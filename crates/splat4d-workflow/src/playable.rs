@@ -70,7 +70,7 @@ fn ready(path: &Path) -> Result<Option<PathBuf>> {
         let current = baked.is_file() && scene.is_none_or(|scene| changed(&scene) <= changed(&baked));
         return Ok(current.then_some(baked));
     }
-    // A folder or pattern of files, or nothing: whoever opens scenes knows what to say.
+    // A folder or pattern of files, or nothing: opening reports the error.
     if !path.is_file() {
         return Ok(None);
     }
@@ -80,7 +80,7 @@ fn ready(path: &Path) -> Result<Option<PathBuf>> {
     Ok((start == MAGIC).then(|| path.to_owned()))
 }
 
-/// A playback file's index; the rest is not read. A damaged file is better told of here than in a browser.
+/// A playback file's index; the rest is not read. A damaged file is reported here rather than in a browser.
 fn index(path: &Path) -> Result<Index> {
     let fail = |e| cannot_read(path, e);
     let file = files::open(path)?;

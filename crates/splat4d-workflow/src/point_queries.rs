@@ -141,7 +141,7 @@ pub struct QueryResult {
 }
 
 impl QueryResult {
-    /// Follows points to some moments. `progress` hears how many moments of how many are done.
+    /// Follows points to some times. `progress` hears how many times of how many are done.
     pub fn of(
         scene: &Scene<f32>,
         asked: Vec<PointQuery>,
@@ -184,8 +184,8 @@ impl QueryResult {
         self.len() == 0
     }
 
-    /// As CSV: `point,time,x,y,z,camera,u,v,visible`, a line for every moment at which a point is there. `point` counts the
-    /// file's lines from 0; without a camera the last four are empty.
+    /// As CSV: `point,time,x,y,z,camera,u,v,visible`, a line for every time at which a point is there. `point` counts
+    /// the file's lines from 0; without a camera the last four are empty.
     pub fn to_csv(&self) -> String {
         let mut out = csv::Writer::from_writer(Vec::new());
         let header = ["point", "time", "x", "y", "z", "camera", "u", "v", "visible"];

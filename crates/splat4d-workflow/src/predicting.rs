@@ -1,6 +1,5 @@
-//! The work behind `predict`: nodes of what was observed, the ladder's forecasts, their scenes, and what they are
-//! worth next to
-//! the images that training never saw.
+//! The work behind `predict`: nodes of what was observed, the ladder's forecasts, their scenes, and their
+//! scores on the images that training never saw.
 
 mod assimilate;
 mod score;

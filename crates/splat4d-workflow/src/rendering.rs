@@ -17,7 +17,7 @@ use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// Frames a second of films unless told.
+/// Frames a second of films by default.
 const FPS: f64 = 30.0;
 /// Shots that are looked at to find the range of a channel.
 const PROBES: usize = 8;

@@ -363,7 +363,7 @@ fn read_view(value: &Value) -> Option<View> {
     })
 }
 
-/// Where a run of the capture with this name goes unless told.
+/// Where a run of the capture with this name goes by default.
 pub fn usual_folder(capture: &str) -> PathBuf {
     let name: String =
         capture.chars().map(|c| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '-' }).collect();

@@ -1,4 +1,4 @@
-//! Numbered files, one a frame: finding them, naming them, and the moments they stand for.
+//! Numbered files, one a frame: finding them, naming them, and the times they stand for.
 
 use crate::files::{cannot_read, either};
 use crate::run_folder::Run;
@@ -261,7 +261,7 @@ fn only_scene(folder: &Path, endings: &[&str]) -> Option<PathBuf> {
     found.next().filter(|_| found.next().is_none())
 }
 
-/// Endings of files that may be frames: those of one moment, of the kinds that `--frames` writes.
+/// Endings of files that may be frames: those of one time, of the kinds that `--frames` writes.
 pub fn endings() -> Vec<&'static str> {
     dialect::extensions(|d| !d.moves && d.is_written())
 }
@@ -280,7 +280,7 @@ fn number_in(name: &OsStr) -> Option<u64> {
     stem.get(start..end)?.parse().ok()
 }
 
-/// The moments, in seconds, of a sequence of a scene: `fps` a second from `from` to `to`.
+/// The times, in seconds, of a sequence of a scene: `fps` a second from `from` to `to`.
 ///
 /// Errors: there are none, or too many.
 pub fn timestamps(scene: &Scene<f32>, fps: Option<f64>, range: [Option<f64>; 2]) -> Result<(f64, Vec<f64>)> {

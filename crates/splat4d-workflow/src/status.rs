@@ -26,7 +26,7 @@ pub enum State {
     Open,
 }
 
-/// A part of a run: a chunk, what stands still, or all of it.
+/// A part of a run: a chunk, the static background, or all of it.
 #[derive(Clone, Debug, Serialize)]
 pub struct PartStatus {
     /// What `train --chunk` calls it; `all`: the run is not in chunks.

@@ -46,7 +46,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let scene = load(&bytes)?;
     let t = Time(args.get(2).map_or(Ok(scene.clip[0]), |s| s.parse())?);
 
-    // The motion models answer for this instant; the renderer sees only splats.
+    // The motion models answer for this time; the renderer sees only splats.
     let mut instant = Evaluation::default();
     scene.at(t, &mut instant);
     let splats = scene.splats(&instant);

@@ -87,7 +87,7 @@ pub fn on_cpu(config: RenderConfig, reason: &dyn std::fmt::Display) -> Opened {
 pub fn draw(backend: &mut Box<dyn Backend>, shot: &Shot<'_>, out: &mut Image) -> Option<Error> {
     let error = backend.render(shot, out).err()?;
     *backend = cpu(*backend.config());
-    backend.render(shot, out).expect("the CPU draws everything");
+    backend.render(shot, out).expect("the CPU renders everything");
     Some(error)
 }
 
@@ -128,7 +128,7 @@ impl WithCpu {
             Err(refusal) => {
                 let why = refusal.cause();
                 if !self.refused.contains(&why) {
-                    self.notices.push(format!("the CPU draws what the GPU does not: {why}"));
+                    self.notices.push(format!("the CPU renders what the GPU does not: {why}"));
                     self.refused.push(why);
                 }
                 None
@@ -288,7 +288,7 @@ fn gpu(_: Device, _: RenderConfig, _: &Wanted, _: Tables) -> Result<(Box<dyn Bac
 
 #[cfg(feature = "gpu")]
 fn gpu(device: Device, config: RenderConfig, wanted: &Wanted, tables: Tables) -> Result<(Box<dyn Backend>, String)> {
-    // Cheap, where opening a driver takes a moment. Nobody needs to be told to take the CPU, which is taken.
+    // Cheap, where opening a driver takes a moment. The CPU is chosen without advice to choose it.
     GpuRenderer::refuses(wanted).map_err(|refusal| Error::new(refusal.kind(), refusal.cause()))?;
     let adapters = if device == Device::Gpu { Adapters::Any } else { Adapters::Hardware };
     let open = || Gpu::open(adapters);

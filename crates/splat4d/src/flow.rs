@@ -1,8 +1,8 @@
-//! Scene flow: velocities of Gaussians, rendered 3D velocity, and rendered 2D flow between two instants and cameras.
+//! Scene flow: velocities of Gaussians, rendered 3D velocity, and rendered 2D flow between two times and cameras.
 //!
 //! A motion model already *is* scene flow; everything here is written once over [`Motion::at`] and
 //! [`Motion::velocity`](crate::motion::Motion::velocity) and drawn as further channels of the renderer, with the blend
-//! weights w_i = α_i T_i of the first instant's image.
+//! weights w_i = α_i T_i of the first time's image.
 //!
 //! [`Motion::at`]: crate::motion::Motion::at
 
@@ -36,7 +36,7 @@ pub struct Flow<F = f32> {
     pub vectors: Planes<F>,
     /// Σ w_i over splats that have a vector, [1, h, w]; where it is small the vector means nothing.
     pub weight: Planes<F>,
-    /// The first instant's image.
+    /// The first time's image.
     pub image: Image<F>,
 }
 

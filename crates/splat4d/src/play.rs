@@ -19,7 +19,7 @@ use std::sync::Arc;
 
 /// Rows that share one test of whether any of them is alive: the blocks of the playback file.
 const BLOCK: usize = crate::format::playback::BLOCK_GAUSSIANS;
-/// Memory for unpacked pages unless told, bytes.
+/// Memory for unpacked pages by default, bytes.
 pub const DEFAULT_BUDGET: usize = 1 << 30;
 
 /// An image of a scene at a time, on the CPU, over the scene's own background. To render many, keep a [`Player`], a
@@ -64,7 +64,7 @@ struct Alive {
 
 impl Alive {
     fn of(layer: &Layer) -> Self {
-        // Asked within its span, because outside of it nobody is alive.
+        // Evaluated within its span, because outside of it no Gaussian is alive.
         let inside = if layer.span[0].is_finite() { layer.span[0] } else { 0.0 };
         if layer.active(Time(inside), &mut Vec::new()) {
             return Self { all: true, ..Self::default() };
@@ -195,7 +195,7 @@ impl<'a> Player<'a> {
     }
 
     /// Plays a playback file of `length` bytes, of which only the index is read now. Pages stay in memory up to `budget`
-    /// bytes; those that one moment needs stay in any case.
+    /// bytes; those that one time needs stay in any case.
     ///
     /// Errors: those of [`Index::parse`] and of the source.
     pub fn open(mut source: Box<dyn ReadAt + Send>, length: u64, budget: usize) -> Result<Self> {

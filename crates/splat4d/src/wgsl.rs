@@ -33,11 +33,11 @@ pub const BYTES: &str = include_str!("gpu/bytes.wgsl");
 pub const BLEND_BACK: &str = include_str!("gpu/blend_back.wgsl");
 /// Sums over subgroups. After [`BLEND_BACK`].
 pub const SUBGROUP_SUMS: &str = include_str!("gpu/subgroup_sums.wgsl");
-/// The blend's way back with subgroups. After [`SUBGROUP_SUMS`].
+/// The blend's backward pass with subgroups. After [`SUBGROUP_SUMS`].
 pub const RASTERIZE_BACK_SUBGROUP: &str = include_str!("gpu/rasterize_back_subgroup.wgsl");
 /// The same with pixels in vectors. After [`SUBGROUP_SUMS`].
 pub const RASTERIZE_BACK_VECTOR: &str = include_str!("gpu/rasterize_back_vector.wgsl");
-/// The blend's way back: a record a (tile, splat) pair. After [`BLEND_BACK`].
+/// The blend's backward pass: a record a (tile, splat) pair. After [`BLEND_BACK`].
 pub const RASTERIZE_BACK: &str = include_str!("gpu/rasterize_back.wgsl");
 /// An image compared with its truth: L1, D-SSIM and their gradient: `moments`, `gradient`.
 pub const LOSS: &str = include_str!("gpu/loss.wgsl");

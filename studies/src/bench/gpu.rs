@@ -1,4 +1,4 @@
-//! Times of a GPU: every stage of an image and of its way back by the GPU's own clock, and whole training steps in
+//! Times of a GPU: every stage of an image and of its backward pass by the GPU's own clock, and whole training steps in
 //! which it
 //! draws.
 
@@ -92,13 +92,14 @@ fn floors(
     out
 }
 
-/// Those of an image that stays there, and of its way back.
+/// Those of an image that stays there, and of its backward pass.
 const LISTS: [&str; 6] = ["project", "compact", "sort splats", "tiles", "sort pairs", "rasterize"];
 const BACKWARD: [&str; 3] = ["rasterize backward", "gather", "splats backward"];
 /// A whole training step; a frame of a film.
 const STEP: &str = "step";
 const FILM: &str = "frame, nothing read back";
-/// Frames of a film, times the rounds, of which there are five unless told; and how often it is drawn at most: the best counts.
+/// Frames of a film, times the rounds, of which there are five by default; and how often it is drawn at most: the best
+/// counts.
 const FRAMES: usize = 200;
 const FILMS: usize = 3;
 /// How far a camera looks to either side, radians: five degrees.

@@ -37,7 +37,7 @@ pub(super) struct Row {
     /// Value of the quantity that was varied: Gaussians, pixels or frames.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub x: Option<f64>,
-    /// Bytes, for rows that tell where memory is.
+    /// Bytes, for rows about memory.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bytes: Option<u64>,
     /// The GPU and its driver, where one was measured.

@@ -1,4 +1,4 @@
-//! Times of drawing: the motion at a time, the renderer's stages, and their way back.
+//! Times of drawing: the motion at a time, the renderer's stages, and their backward pass.
 
 use super::roofline::{Roofline, bytes};
 use super::rows::Row;

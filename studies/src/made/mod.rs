@@ -106,7 +106,7 @@ fn depth_maps(camera: usize) -> String {
     format!("depth/cam{camera:02}")
 }
 
-/// The share of the take at a moment.
+/// The share of the take at a time.
 fn share(moment: usize, moments: usize) -> f64 {
     moment as f64 / (moments.max(2) - 1) as f64
 }
@@ -148,8 +148,8 @@ fn description(name: &str, scene: &Scene) -> Value {
 /// A coloured point, in the world's units.
 type Point = (V3, [u8; 3]);
 
-/// A sparse cloud as structure from motion would find it: random pixels of the training images of the first moment (of
-/// a moving camera: of all moments), kept where a second training image sees the place from a different direction.
+/// A sparse cloud as structure from motion would find it: random pixels of the training images of the first time (of
+/// a moving camera: of all times), kept where a second training image sees the place from a different direction.
 fn cloud(scene: &Scene) -> Vec<Point> {
     let training = scene.viewers.iter().filter(|v| !v.held);
     let views: Vec<(&Pinhole, usize)> =
@@ -259,7 +259,7 @@ mod tests {
     #[test]
     fn the_same_bytes_come_out_everywhere() {
         let all: Vec<String> = NAMES.iter().map(|(name, _)| format!("{name} {}", print_of(name))).collect();
-        // Whoever changes what is drawn also changes `VERSION`, so that old drawings are not taken for new ones.
+        // A change of what is drawn must also change `VERSION`, so that old drawings are not taken for new ones.
         assert_eq!((VERSION, all.join("\n")), (2, PRINTS.trim().to_owned()));
     }
 

@@ -17,7 +17,7 @@ const TARGET: V3 = [0.0, 0.7, -0.3];
 /// Half the arc of rigs that stand before the scene, and of one that stands all round it, radians.
 const HALF_ARC: f64 = 0.9;
 const HALF_RING: f64 = 3.0;
-/// Moments of captures in which something moves, and of the rig with many cameras.
+/// Times of captures in which something moves, and of the rig with many cameras.
 const MOMENTS: usize = 10;
 const FEW_MOMENTS: usize = 5;
 /// Distance of a far background, in distances of the cameras.
@@ -35,7 +35,7 @@ const LONG_PATH: usize = 60;
 /// A camera of a synthetic capture.
 #[derive(Clone, Debug)]
 pub(crate) struct Viewer {
-    /// Its pose at every moment, or the one that it keeps.
+    /// Its pose at every time, or the one that it keeps.
     pub poses: Vec<Pinhole>,
     pub gain: f64,
     pub held: bool,
@@ -48,7 +48,7 @@ impl Viewer {
         Self { poses: vec![pose], gain: 1.0, held: false, wrong: 0.0 }
     }
 
-    /// The true camera at a moment.
+    /// The true camera at a time.
     pub(crate) fn at(&self, moment: usize) -> &Pinhole {
         &self.poses[moment.min(self.poses.len() - 1)]
     }

@@ -9,7 +9,7 @@ use splat4d_workflow::files;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// The list that is measured unless told.
+/// The list that is measured by default.
 const DEFAULT: &str = include_str!("../../suite.toml");
 /// The folder that `bundled` paths begin in.
 const REPOSITORY: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/..");

@@ -329,7 +329,7 @@ fn trained(
     })
 }
 
-/// PSNR where nothing moves, by the means of whole images and of what moves.
+/// PSNR where nothing moves, by the means of whole images and of dynamic regions.
 fn elsewhere(whole: Option<f64>, moving: Option<f64>, share: Option<f64>) -> Option<f64> {
     let error = |psnr: f64| 10f64.powf(-0.1 * psnr);
     let (whole, moving, share) = (error(whole?), error(moving?), share?);

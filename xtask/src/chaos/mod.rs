@@ -19,9 +19,9 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 use verbs::{Setup, VERBS, Verb};
 
-/// Trials unless told.
+/// Trials by default.
 const TRIALS: usize = 20;
-/// Seed unless told.
+/// Seed by default.
 const SEED: u64 = 44;
 /// Files with times and paths of a run in them, which are not compared but must be there.
 const VOLATILE: [&str; 10] = [

@@ -66,7 +66,7 @@ fn parts_by_number_and_one_command_make_the_same_scene_and_file() {
         }
     }
     assert!(status(&parts)["next"].as_str().unwrap().contains("splat4d join"));
-    // Bytes of somebody who died in the midst of appending.
+    // Bytes of a process that died while appending.
     let mut broken = std::fs::read(&film).unwrap();
     broken.extend([7; 999]);
     std::fs::write(&film, broken).unwrap();

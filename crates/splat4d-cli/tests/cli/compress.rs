@@ -53,7 +53,7 @@ fn a_run_becomes_a_smaller_run_and_is_measured_before_and_after() {
     );
     assert!(!run.join("compress.json").exists() && !run.join("unpruned").exists());
 
-    // A finished compression is told again without a step, and never taken over.
+    // A finished compression is reported again without a step, and never taken over.
     let again = splat4d(&["compress", "--resume", str(&dir), "--size", "32x24"]).run().ok();
     assert!(again.contains("times smaller"), "{again}");
     assert_eq!(std::fs::read(dir.join("scene.s4d")).unwrap(), file);

@@ -66,7 +66,7 @@ fn a_moving_scene_goes_everywhere() {
         splat4d(&["convert", from, to, "--json"]).args(more).run_in(work.path()).ok()
     };
 
-    // Moving targets keep the motion, turned to their axes; single moments say which one was taken.
+    // Moving targets keep the motion, turned to their axes; single times say which one was taken.
     for (name, dialect) in [("birds.splatv", splatv::DIALECT), ("birds.stg.ply", ply::STG)] {
         let said = convert("birds.safetensors", name, &[]);
         assert!(said.contains("view dependence"), "{said}");
@@ -78,7 +78,7 @@ fn a_moving_scene_goes_everywhere() {
         assert!(said.contains("one time") && said.contains("--frames"), "{name}: {said}");
         assert_eq!(open(&at(name)).len(), 40);
     }
-    // z up became y down: what was z is now −y, at the moment that was asked for.
+    // z up became y down: what was z is now −y, at the time that was asked for.
     convert("birds.safetensors", "then.ply", &["--time", "0.75", "--sh", "0"]);
     let then = open(&at("then.ply"));
     let (own, was) = (&then.layers[0].params, moving());
@@ -87,7 +87,7 @@ fn a_moving_scene_goes_everywhere() {
     let z = p[GEOMETRY].get(7, 2) + 0.25 * p[v].get(7, 2);
     assert!((own[GEOMETRY].get(7, 1) + z).abs() < 1e-5, "{} {z}", own[GEOMETRY].get(7, 1));
     assert_eq!(own[SH].width(), 3);
-    // ... unless told to keep its axes.
+    // ... by default to keep its axes.
     convert("birds.safetensors", "kept.ply", &["--time", "0.5", "--up", "keep"]);
     assert_eq!(open(&at("kept.ply")).layers[0].params[GEOMETRY].read::<3>(7, 0), p[GEOMETRY].read::<3>(7, 0));
     convert("birds.safetensors", "z.spz", &["--time", "0.5", "--up=-z", "--spz-version", "4"]);

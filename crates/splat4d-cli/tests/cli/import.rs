@@ -116,7 +116,7 @@ fn videos_with_sound_become_a_capture_whose_clocks_were_heard() {
     let (films, take) = (dir.path().join("films"), dir.path().join("take"));
     std::fs::create_dir_all(&films).unwrap();
     let taken = 20;
-    // Of three cameras geometry does not tell clocks: only what they hear does.
+    // Geometry does not determine the clocks of three cameras: only sound does.
     let cameras = &CAMERAS[..3];
     for (k, (name, begin)) in cameras.iter().enumerate() {
         let wave = dir.path().join(format!("{name}.wav"));
@@ -330,7 +330,7 @@ fn colmap_is_called_where_it_is_asked_for_and_its_model_is_taken() {
     assert_eq!((std::fs::read(take.join("capture.json")).unwrap(), saved(&take)), (before, count));
 }
 
-/// Of three cameras geometry does not tell clocks, and these are silent: what is left is a guess.
+/// Geometry does not determine the clocks of three cameras, and these are silent: the rest is a guess.
 #[test]
 fn unconfirmed_time_offsets_are_refused_and_can_be_given() {
     let dir = tempfile::tempdir().unwrap();
@@ -355,7 +355,7 @@ fn unconfirmed_time_offsets_are_refused_and_can_be_given() {
     import(&["--synchronous"]).ok();
     let report = json_of(&take.join("import/report.json"));
     assert!((0..3).all(|k| report["cameras"][k]["offset"].as_f64() == Some(0.0)), "{report}");
-    // Or offsets that are told.
+    // Or given offsets.
     let path = take.join("import.toml");
     let mut text = std::fs::read_to_string(&path).unwrap();
     for (name, offset) in [("cam07", 0.0), ("cam08", -1.0 / 30.0), ("cam09", 1.0 / 30.0)] {
@@ -415,7 +415,7 @@ fn what_cannot_be_imported_is_explained() {
     }
     let alone = refused(&far, &[]);
     assert!(alone.contains("20 degrees"), "{alone}");
-    // Clocks that are told to be so far apart that nothing is shared.
+    // Given clocks so far apart that no time is shared.
     let path = take.join("import.toml");
     let text = std::fs::read_to_string(&path).unwrap();
     let mut offsets = ["0.0", "100.0"].iter();
@@ -432,7 +432,7 @@ fn what_cannot_be_imported_is_explained() {
     let own = own.replacen("use = true", "use = false", 1);
     std::fs::write(&path, format!("{before}name = \"cam19\"{own}")).unwrap();
     assert!(refused(&far, &["--rig", "fixed"]).contains("one fixed camera"));
-    // A capture that is somebody's own stays.
+    // A capture that another program wrote stays.
     let own = at("own");
     std::fs::create_dir(&own).unwrap();
     std::fs::write(own.join("capture.json"), "{}").unwrap();

@@ -83,7 +83,7 @@ fn what_cannot_be_predicted_is_refused_with_a_remedy() {
     for flags in [["--horizon", "0"], ["--nodes", "999"], ["--seeds", "0"]] {
         predict(&run, &flags).refused();
     }
-    // Not told to keep anything, too little seen, nothing that moves.
+    // No frames to hold back, too few observed frames, no motion.
     let whole = work.path().join("whole");
     splat4d(&["train", str(&capture), "-o", str(&whole), "--no-eval"]).args(&TINY).run().ok();
     assert!(predict(&whole, &[]).refused().contains("--observe"));

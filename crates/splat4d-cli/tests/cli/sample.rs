@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 const CAMERAS: usize = 4;
-/// Frames unless told.
+/// Frames by default.
 const FRAMES: usize = 4;
 const SIZE: [u32; 2] = [32, 24];
 

@@ -82,7 +82,7 @@ impl FromStr for Board {
             Some(other) => return wrong(format!("stands on \"{other:.40}\"")),
         };
         if parts.len() > 3 {
-            return wrong("says too much".into());
+            return wrong("has too many parts".into());
         }
         Ok(Self { family, side, lies })
     }

@@ -3,7 +3,8 @@
 use splat4d::scene::Planes;
 use splat4d_train::vision::raster::sample;
 
-/// Pixels of a tile whose brightest and darkest pixel, with those of its neighbours, tell what is dark: AprilTag's.
+/// Pixels of a tile whose brightest and darkest pixel, with those of its neighbours, give the threshold for dark:
+/// AprilTag's.
 const TILE: usize = 4;
 /// The least difference of them: what is plainer is neither dark nor bright (AprilTag: 5 of 255).
 const PLAIN: f32 = 0.04;

@@ -7,7 +7,7 @@ use splat4d::math::Se3;
 use splat4d::scene::{Intrinsics, Lens};
 use splat4d::{Error, ErrorKind, Result};
 
-pub(super) const DIALECT: Dialect = Dialect { name: "capture.json of another take", reads, read };
+pub(super) const DIALECT: Dialect = Dialect { name: "capture.json of another capture", reads, read };
 
 const POSES: [&str; 2] = ["world_to_camera", "camera_to_world"];
 
@@ -79,7 +79,7 @@ fn camera(tree: &Tree, opengl: bool) -> Result<Part> {
         .ok_or_else(|| Error::input("its pose is missing").remedy("Give world_to_camera or camera_to_world."))?;
     if value.list().and_then(|l| l.first()).and_then(Tree::list).is_some_and(|l| l.iter().any(|v| v.list().is_some())) {
         return Err(Error::input("the camera moves: it has a pose for each frame")
-            .remedy("A calibration is of cameras that stand still."));
+            .remedy("A calibration is for fixed cameras."));
     }
     let m = super::opencv::numbers(key, value)?;
     if m.columns != 4 || m.rows < 3 {

@@ -87,7 +87,7 @@ fn number(name: &str) -> Option<u64> {
 fn by_number(cameras: &[Calibrated], videos: &[Video<'_>]) -> Option<Vec<usize>> {
     let plain = |name: &str| -> Option<u64> {
         let rest = name.trim_end_matches(|c: char| c.is_ascii_digit()).trim_end_matches(['_', '-', ' ']).to_lowercase();
-        // What programs call cameras that nobody named.
+        // What programs call cameras without names.
         ["", "cam", "camera", "port"].contains(&rest.as_str()).then(|| number(name))?
     };
     let own: Vec<u64> = cameras.iter().map(|c| plain(&c.names[0])).collect::<Option<_>>()?;

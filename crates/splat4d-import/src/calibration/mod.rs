@@ -249,7 +249,7 @@ fn add(parts: &mut Vec<(Part, PathBuf)>, part: Part, file: &Path) -> Result<()> 
         let what = if first == file { String::new() } else { format!(" (also in {})", first.display()) };
         return Err(Error::input(format!("camera {name:.80} is there twice{what}"))
             .at(file.display())
-            .remedy("Take one out: names tell which video is which camera's."));
+            .remedy("Take one out: videos and cameras are matched by name."));
     }
     known.size = known.size.or(part.size);
     known.optics = known.optics.or(part.optics);
@@ -257,7 +257,7 @@ fn add(parts: &mut Vec<(Part, PathBuf)>, part: Part, file: &Path) -> Result<()> 
     Ok(())
 }
 
-/// Sides that are taken where the size is not told, to check focal lengths by.
+/// Sides assumed where the size is not given, to check focal lengths.
 const ANY_SIDE: usize = 1;
 
 fn whole(part: Part) -> Result<Calibrated> {
@@ -287,7 +287,7 @@ fn alike(cameras: &[Calibrated]) -> Result<()> {
     if without.is_empty() || without.len() == cameras.len() {
         return Ok(());
     }
-    Err(Error::input(format!("of these cameras the place is not told, of others it is: {}", without.join(", ")))
+    Err(Error::input(format!("these cameras have no position, others have one: {}", without.join(", ")))
         .remedy("Give rotation and translation of all cameras, or of none."))
 }
 
@@ -313,14 +313,14 @@ impl Calibration {
         let Some(middle) = apart.get(apart.len() / 2) else { return String::new() };
         match self.unit {
             Unit::Metre => {
-                format!("Lengths are metres, as the calibration says: neighbouring cameras are {middle:.2} m apart.")
+                format!("Lengths are metres, as the calibration states: neighbouring cameras are {middle:.2} m apart.")
             }
             Unit::Unstated if *middle > MILLIMETRES => format!(
-                "Lengths are the calibration's, whose unit it does not tell: neighbouring cameras are {middle:.0} apart, which \
-                 looks like millimetres (--apart A,B=METRES makes metres of them)."
+                "The calibration does not state its unit of length: neighbouring cameras are {middle:.0} apart, which \
+                 looks like millimetres (--apart A,B=METRES converts to metres)."
             ),
             Unit::Unstated => format!(
-                "Lengths are the calibration's, whose unit it does not tell: neighbouring cameras are {middle:.3} apart."
+                "The calibration does not state its unit of length: neighbouring cameras are {middle:.3} apart."
             ),
         }
     }

@@ -87,7 +87,7 @@ fn read(text: &Text) -> Result<Said> {
         let own =
             ["name", "camera_name"].iter().find_map(|k| tree.get(k)).and_then(Tree::text).filter(|n| !n.is_empty());
         let mut names: Vec<String> = own.into_iter().collect();
-        // A file's own name tells its camera as well as the name in it.
+        // A file's own name identifies its camera as well as the name in it.
         names.push(key.unwrap_or_else(|| text.stem()));
         // Caliscope's number of a camera, after which it calls videos.
         let ports = ["port", "cam_id"].iter().filter_map(|k| tree.get(k)).filter_map(Tree::text);

@@ -64,7 +64,7 @@ fn sizes(size: [usize; 2], video: [usize; 2]) -> String {
 /// are black
 /// bars: at the left, above, at the right, below. And what that means, a sentence, where it is not plain.
 ///
-/// Errors: the video is of another shape than the images it was calibrated with, and neither bars nor padding tell
+/// Errors: the video is of another shape than the images it was calibrated with, and neither bars nor padding explain
 /// why; the
 /// principal point lies outside.
 pub fn fitted(
@@ -99,7 +99,7 @@ pub fn fitted(
                 sizes(size, video)
             ));
         } else {
-            return Err(Error::input(format!("{}, and no black bars tell why", sizes(size, video))).remedy(ADVICE));
+            return Err(Error::input(format!("{}, and no black bars explain it", sizes(size, video))).remedy(ADVICE));
         }
     }
     let k = &camera.intrinsics;

@@ -308,7 +308,7 @@ fn opencv_and_openpose_files_of_each_camera_are_read() {
         yaml.iter().map(|(f, t)| (*f, t.split("rotation:").next().unwrap().to_owned())).collect();
     let bare: Vec<Calibrated> = truth.iter().map(|c| Calibrated { pose: None, ..c.clone() }).collect();
     same(&folder(&alone).unwrap(), &bare);
-    refused(&[yaml[0].clone(), alone[1].clone()], "place is not told");
+    refused(&[yaml[0].clone(), alone[1].clone()], "have no position");
 }
 
 #[test]

@@ -6,7 +6,7 @@ use super::{Grade, Report};
 use crate::sync::median;
 use splat4d_train::capture::Capture;
 
-/// What stands still went so far, pixels of 1920, and at least so many own ones.
+/// The static background went so far, pixels of 1920, and at least so many own ones.
 pub(super) const MOVED: [f64; 2] = [0.5, 2.0];
 pub(super) const MOVED_PIXELS: [f64; 2] = [0.35, 1.0];
 /// Brightness that jumps from image to image, stops.
@@ -30,9 +30,12 @@ pub(super) fn alone(capture: &Capture, camera: usize, s: &CameraObservations, re
         report.cameras[camera].moved = Some(far);
         let limits = worse(MOVED, MOVED_PIXELS.map(|p| p * unit(&stand.view)));
         if let Some(g) = grade(far, limits) {
-            let what = format!("Camera {name} moved: what stands still went {far:.1} px (of 1920) from first to last.");
-            let words =
-                ("Everything it shows is doubled.", "Fasten it; cut the take where it was pushed, or leave it out.");
+            let what =
+                format!("Camera {name} moved: the background moved by {far:.1} px (of 1920) from first to last.");
+            let words = (
+                "Everything it shows is doubled.",
+                "Fasten it; cut the recording where it was pushed, or leave it out.",
+            );
             FindingList { report }.add((g, "moved"), who, (far, "px"), what, words);
         }
     }
@@ -43,8 +46,8 @@ pub(super) fn alone(capture: &Capture, camera: usize, s: &CameraObservations, re
                 "Camera {name} changes its focus: from first to last its images get {ratio:.2} times as sharp."
             );
             let words = (
-                "Texture that is soft in one part of the take, and a lens that is not one.",
-                "Lock focus; cut the take where it changed, or leave the camera out.",
+                "Blurred texture in one part of the clip, as if the lens had changed.",
+                "Lock focus; cut the recording where it changed, or leave the camera out.",
             );
             FindingList { report }.add((g, "focus"), who, (ratio, "times"), what, words);
         }
@@ -60,7 +63,7 @@ pub(super) fn alone(capture: &Capture, camera: usize, s: &CameraObservations, re
                 who,
                 (missing as f64, "frames"),
                 what,
-                ("Jerks of what moves.", "Record to a faster card, or extract without a rate."),
+                ("Jerks in the motion.", "Record to a faster card, or extract without a rate."),
             );
         }
         let doubled = s.clock.doubled.len();
@@ -71,7 +74,7 @@ pub(super) fn alone(capture: &Capture, camera: usize, s: &CameraObservations, re
                 who,
                 (doubled as f64, "frames"),
                 what,
-                ("What moves stops and jumps.", "Remove them; extract frames without changing the rate."),
+                ("Motion stops and jumps.", "Remove them; extract frames without changing the rate."),
             );
         }
     }

@@ -136,7 +136,7 @@ fn pair(
     })
 }
 
-/// A number for each camera of which pairs tell the differences, about the median of the cameras that are connected; None for
+/// A number for each camera from pairwise differences, about the median of the cameras that are connected; None for
 /// those without a pair. Least squares, in which pairs of many features count more and those that contradict little (Cauchy's
 /// weights at `scale`).
 fn relative(cameras: usize, told: &[([usize; 2], f64, f64)], scale: f64) -> Vec<Option<f64>> {

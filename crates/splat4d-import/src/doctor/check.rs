@@ -113,7 +113,8 @@ fn take(capture: &Capture, seen: &[CameraObservations], report: &mut Report) {
     let views: Vec<&Camera> = fixed.iter().map(|&c| &seen[c].stands[0].view).collect();
     let Some(target) = volume::target(&views) else {
         report.left.push(
-            "Angles between cameras and what three of them see were not judged: they look at no common place.".into(),
+            "Angles between cameras and what three of them see were not judged: the cameras have no common view."
+                .into(),
         );
         return;
     };
@@ -140,13 +141,13 @@ fn take(capture: &Capture, seen: &[CameraObservations], report: &mut Report) {
     volume_of(&own, target, report);
 }
 
-/// What three cameras see of what moves about a place.
+/// What three cameras see of dynamic regions about a place.
 pub(super) fn volume_of(seen: &[&CameraObservations], target: [f64; 3], report: &mut Report) {
     report.seen_by_three = volume::seen_by_three(seen, target);
     let Some(share) = report.seen_by_three else {
-        report
-            .left
-            .push("What three cameras see of what moves was not judged: too little moves in view of two.".into());
+        report.left.push(
+            "Coverage of the dynamic region by three cameras was not judged: two cameras see too little motion.".into(),
+        );
         return;
     };
     if let Some(g) = grade(1.0 / share.max(f64::MIN_POSITIVE), VOLUME.map(|v| 1.0 / v)) {
@@ -160,9 +161,9 @@ pub(super) fn volume_of(seen: &[&CameraObservations], target: [f64; 3], report: 
 /// Whether training with all defaults fits into the memory there is.
 pub(super) fn memory(needed: u64, there: Option<u64>, report: &mut Report) {
     let Some(there) = there else {
-        report.left.push(
-            "Whether training fits into memory was not judged: this system does not tell how much there is.".into(),
-        );
+        report
+            .left
+            .push("Whether training fits into memory was not judged: the system does not report its memory.".into());
         return;
     };
     if let Some(g) = grade(needed as f64 / there.max(1) as f64, MEMORY) {

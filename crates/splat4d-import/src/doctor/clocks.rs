@@ -1,4 +1,4 @@
-//! Clocks of cameras against each other, by what moves.
+//! Clocks of cameras against each other, by motion.
 
 use super::Report;
 use super::finding::{AGREE, FindingList, MATCHES, grade, unit};
@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use splat4d_train::capture::Capture;
 use splat4d_train::event::Progress;
 
-/// Blur of what moves by a wrong clock, pixels of 1920.
+/// Blur of dynamic regions by a wrong clock, pixels of 1920.
 const OFFSET: [f64; 2] = [0.5, 1.5];
 /// Standard deviations from which an offset is one, and the least part of a frame: of a hall whose cameras one clock drives up
 /// to 0.59 frames were found, other cameras with other settings, so that less than this is no evidence.
@@ -95,7 +95,7 @@ pub(super) fn clocks(capture: &Capture, seen: &[CameraObservations], report: &mu
             let name = &capture.cameras[c].name;
             let way = if off > 0.0 { "early" } else { "late" };
             let what = format!(
-                "Camera {name}: its clock is {:.1} ± {:.1} ms {way}: what moves is {blur:.1} px (of 1920) off.",
+                "Camera {name}: its time offset is {:.1} ± {:.1} ms {way}: motion is displaced by {blur:.1} px (of 1920).",
                 1e3 * off.abs(),
                 1e3 * sigma
             );
@@ -121,7 +121,7 @@ pub(super) fn clocks(capture: &Capture, seen: &[CameraObservations], report: &mu
                 1e3 * sigma
             );
             let words = (
-                "What moves fast leans, and differently in each view.",
+                "Fast motion leans, and differently in each view.",
                 "Film at a higher rate: it reads its rows faster.",
             );
             FindingList { report }.add((g, "rolling-shutter"), Some(name), (1e3 * seconds, "ms"), what, words);

@@ -7,9 +7,10 @@ use splat4d::scene::Camera;
 pub(super) const SHARPNESS: [f64; 2] = [0.6, 0.35];
 /// sRGB values are this power of light, about.
 pub(super) const GAMMA: f64 = 2.2;
-/// Matches that tell something of a pair.
+/// Matches that are needed to judge a pair.
 pub(super) const MATCHES: usize = 12;
-/// So many of a camera's pairs must agree on its error at least, of so many that tell it; chance only makes errors larger.
+/// So many of a camera's pairs must agree on its error at least, of so many that measure it; chance only makes errors
+/// larger.
 pub(super) const AGREE: usize = 2;
 
 pub(super) fn grade(value: f64, [warning, bad]: [f64; 2]) -> Option<Grade> {

@@ -10,9 +10,9 @@ use splat4d::math::median_by;
 use splat4d::scene::{Camera, Planes};
 use splat4d_train::capture::{Capture, ImageStore, Rgb8};
 
-/// Images over the take whose median is what stands still.
+/// Images over the take whose median is the static background.
 const SPREAD: usize = 15;
-/// From so many on a median knows what stands still.
+/// From so many on a median knows the static background.
 const MEDIAN_FROM: usize = 3;
 /// Images of a moving camera that are compared with others.
 const STANDS: usize = 16;
@@ -25,7 +25,7 @@ pub(super) const CELL: usize = 8;
 /// A cell moves from this part of its pixels on.
 const MOVING: f64 = 0.25;
 
-/// An image from a place: of what stands still, or one of a moving camera.
+/// An image from a place: of the static background, or one of a moving camera.
 pub(super) struct Stand {
     pub(super) view: Camera,
     pub(super) picture: Rgb8,
@@ -47,7 +47,7 @@ pub(super) struct CameraObservations {
     pub(super) clipped: [f64; 2],
     /// Step across the borders of blocks of 8 pixels over that elsewhere.
     pub(super) blocks: f64,
-    /// Pixels that what stands still went.
+    /// Pixels that the background moved.
     pub(super) moved: Option<f64>,
     /// Detail of the take's last third relative to its first.
     pub(super) focus: Option<f64>,
@@ -128,7 +128,7 @@ fn blocks(g: &Grey) -> f64 {
     255.0 * (mean(1) - mean(0))
 }
 
-/// The cells of an image that differ from what stands still.
+/// The cells of an image that differ from the static background.
 fn cells(picture: &Grey, still: &Grey) -> Vec<bool> {
     let (across, down) = (picture.width.div_ceil(CELL), picture.height.div_ceil(CELL));
     let mut counts = vec![[0usize; 2]; across * down];
@@ -158,9 +158,9 @@ fn focus(pictures: &[Rgb8]) -> Option<f64> {
     (first > 0.0).then(|| last / first)
 }
 
-/// How far what stands still went from the first images to the last, pixels: the median of corners next to which
+/// How far the background moved from the first images to the last, pixels: the median of corners next to which
 /// nothing
-/// moves in either of them. `None` if there are too few to tell.
+/// moves in either of them. `None` if there are too few.
 fn moved(ends: [&[Rgb8]; 2]) -> Option<f64> {
     let still = ends.map(|end| Grey::of(&median_of(end)));
     let across = still[0].width.div_ceil(CELL);
@@ -235,7 +235,7 @@ pub(super) fn camera(
         }
     }
     let first = (frames.len() - frames.len().min(options.window)) / 2;
-    // Of a moving camera only its darkness is asked, which a few images tell.
+    // Of a moving camera only the darkness is needed, for which a few images suffice.
     let row = if fixed { &frames[first..first + frames.len().min(options.window)] } else { &chosen[..] };
     let still = (fixed && same && frames.len() >= MEDIAN_FROM).then(|| Grey::of(&seen.stands[0].picture));
     let mut tracker = Tracker::new(options.tracks, APART);

@@ -26,7 +26,7 @@ use std::sync::Arc;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Grade {
-    /// Worth knowing.
+    /// For information.
     Note,
     /// It will probably be seen.
     Warning,
@@ -72,7 +72,7 @@ pub struct CameraReport {
     pub exposure: Option<[f64; 3]>,
     /// Sharpness relative to other cameras, at places that both see.
     pub sharpness: Option<f64>,
-    /// Pixels (of 1920) that what stands still went between the first and the last images.
+    /// Pixels (of 1920) that the background moved between the first and the last images.
     pub moved: Option<f64>,
     /// Detail of the take's last third relative to its first.
     pub focus: Option<f64>,
@@ -168,8 +168,8 @@ impl Default for Options {
 /// Bytes of decoded images that are kept at once: each is looked at once or twice, so that more gains nothing.
 const STORE: usize = 64 << 20;
 
-/// Bytes of memory that the machine has, or less where it is a container that may take less; none: it does not tell (it is no
-/// Linux).
+/// Bytes of memory that the machine has, or less where it is a container that may take less; none: it does not report
+/// it (it is no Linux).
 fn machine_memory() -> Option<u64> {
     let text = std::fs::read_to_string("/proc/meminfo").ok()?;
     let all = text.lines().find_map(|l| l.strip_prefix("MemTotal:"))?.trim().strip_suffix("kB")?;
@@ -217,7 +217,7 @@ pub fn examine(capture: &Capture, options: &Options, progress: &mut Progress<'_>
             report.training = Some(Training { motion: forecast.motion, memory: forecast.memory });
             check::memory(forecast.memory, options.memory.or_else(machine_memory), &mut report);
         }
-        Err(e) => report.left.push(format!("What training takes cannot be told: {e}")),
+        Err(e) => report.left.push(format!("Memory of training could not be estimated: {e}")),
     }
     if misread {
         // Cameras that are read in another convention are not bad ones.

@@ -200,7 +200,7 @@ fn a_camera_that_was_pushed_is_found() {
     is_found(&clip, "moved");
 }
 
-/// A camera that stands still before one body that fills most of its image and drifts, so that most corners are the
+/// A fixed camera before one body that fills most of its image and drifts, so that most corners are the
 /// body's.
 #[test]
 fn a_large_passing_object_is_not_reported_as_camera_motion() {

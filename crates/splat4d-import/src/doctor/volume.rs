@@ -13,7 +13,7 @@ const HALF: f64 = 0.6;
 const SEES: [usize; 2] = [2, 3];
 /// Of the cameras that see a place so large a part must see something move there: noise and shade hide some of it.
 const MOVES: f64 = 0.75;
-/// Cells in all moments that must move before a share means anything.
+/// Cells in all times that must move before a share means anything.
 const LEAST: usize = 60;
 
 /// Where so many cameras look, by their images' middles.
@@ -24,8 +24,8 @@ pub(super) fn target(views: &[&Camera]) -> Option<[f64; 3]> {
     triangulate::triangulate(&sights)
 }
 
-/// Of the visual hull of what moves (Laurentini 1994; moment by moment, as far as two cameras see it) the part that three see;
-/// None where too little moves to tell.
+/// Of the visual hull of dynamic regions (Laurentini 1994; frame by frame, as far as two cameras see it) the part that
+/// three see; None where too little moves.
 pub(super) fn seen_by_three(seen: &[&CameraObservations], target: [f64; 3]) -> Option<f64> {
     let views: Vec<&Camera> = seen.iter().map(|s| &s.stands[0].view).collect();
     let mut far: Vec<f64> = views.iter().map(|v| norm(sub(v.center(), target))).collect();

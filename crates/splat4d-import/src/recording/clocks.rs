@@ -17,7 +17,7 @@ use splat4d_train::event::Progress;
 pub(super) const WAY: f64 = 5.0;
 /// Least seconds that all cameras must film at once.
 const LEAST_SHARED: f64 = 0.1;
-/// Frames a second of cameras that do not tell.
+/// Frames a second of cameras that do not state them.
 const USUAL_RATE: f64 = 30.0;
 
 /// All pairs of so many.
@@ -67,7 +67,7 @@ fn heard(
     let of = |&[a, b]: &[usize; 2]| {
         let (x, y) = (tracks[a].as_ref()?, tracks[b].as_ref()?);
         let lag = sound::lag(x, y, None).ok()?;
-        // Sound needs time for its way, and nobody knows yet from where: part of what is uncertain.
+        // Sound needs time for its way, and its source is not known yet: part of the uncertainty.
         let sigma = lag.sigma.hypot(0.5 * sound::way(WAY));
         Some(Evidence { cameras: [a, b], lag: lag.at_zero(), sigma, drift: lag.drift, kind: Kind::Sound })
     };
@@ -111,8 +111,9 @@ pub(super) fn by_motion(
     Ok(Guessed { evidence: out, moves })
 }
 
-/// Refuses a take in which something moves and too few clocks are known: it would be seen at other moments by every camera, and
-/// nothing later could tell. How much moves is a guess that other evidence has to confirm, and counts for nothing here.
+/// Refuses a take in which something moves and too few clocks are known: it would be seen at other times by every
+/// camera, and nothing later could show. How much moves is a guess that other evidence has to confirm, and counts for
+/// nothing here.
 pub(super) fn check(names: &[&str], solved: &Solved, told: &[Option<f64>], motion: &[String]) -> Result<()> {
     let known = |c: usize| {
         let measured = |o: &Offset| o.kinds.iter().any(|k| *k != Kind::Motion);
@@ -128,16 +129,16 @@ pub(super) fn check(names: &[&str], solved: &Solved, told: &[Option<f64>], motio
         Some(format!("{} {:+.0} ± {:.0} ms", names[c], 1e3 * o.seconds, 1e3 * o.sigma))
     };
     let guesses: Vec<String> = open.iter().filter_map(guess).collect();
-    // Of three cameras that are not calibrated clocks are not adjusted: they cannot be told from places.
+    // Clocks of three cameras that are not calibrated are not adjusted: they cannot be separated from positions.
     let seen = match placed.len() {
         ..4 => {
             "geometry gives the time offsets of at least four cameras, or of calibrated ones that see the same motion"
         }
-        _ => "too few see the same thing move",
+        _ => "too few cameras see the same motion",
     };
     let mut why = vec!["sound agrees of no two of them".to_owned(), seen.to_owned()];
     if let Some(first) = motion.first() {
-        why.push(format!("how much moves says nothing of {first}"));
+        why.push(format!("the amount of motion gives no time offset of {first}"));
     }
     if !guesses.is_empty() {
         why.push(format!("it lets guess {}, which nothing confirms", guesses.join(", ")));

@@ -1,4 +1,4 @@
-//! Poses of fixed cameras by the COLMAP program, where it is installed: one image a camera, of what stands still.
+//! Poses of fixed cameras by the COLMAP program, where it is installed: one image a camera, of the static background.
 
 use super::stored::Stored;
 use crate::calibration::{self, Calibration};

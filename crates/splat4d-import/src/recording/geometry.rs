@@ -1,4 +1,4 @@
-//! Lags by what moves, of cameras whose places are known: no feature needs to look alike from two sides.
+//! Lags by motion, of cameras whose places are known: no feature needs to look alike from two sides.
 
 use super::cache::Cache;
 use super::stored::Stored;
@@ -22,7 +22,7 @@ const SHORTEST: usize = 30;
 /// Neighbours that each camera is compared with.
 const NEIGHBOURS: usize = 3;
 
-/// A camera that stands still, as a pinhole camera, and corners that move in it, by its own clock.
+/// A fixed camera, as a pinhole camera, and corners that move in it, by its own clock.
 struct StandingCamera {
     camera: Camera,
     tracks: Vec<Track>,

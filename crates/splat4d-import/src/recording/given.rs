@@ -34,10 +34,9 @@ impl Given {
         let place = |e: Error| e.at(path.display());
         let found = calibration::read(path)?;
         if moving && found.posed() {
-            return Err(place(
-                Error::input("it says where cameras stand, but these move")
-                    .remedy("Leave --calibration out, give one of lenses alone, or --rig fixed if they stand still."),
-            ));
+            return Err(place(Error::input("it has fixed camera positions, but these cameras move").remedy(
+                "Leave --calibration out, give one of lenses alone, or --rig fixed if the cameras are fixed.",
+            )));
         }
         let from = path.display().to_string();
         let videos: Vec<Video<'_>> =
@@ -57,7 +56,7 @@ impl Given {
         for (camera, video) in own.iter().zip(videos) {
             calibration::shape(camera, video.size).map_err(|e| e.at(format!("camera {}", video.name)))?;
         }
-        let what = if found.posed() { "Lenses and places of cameras are" } else { "Lenses of cameras are" };
+        let what = if found.posed() { "Lenses and positions of cameras are" } else { "Lenses of cameras are" };
         let mut all = vec![format!("{what} from {from} ({}).", found.dialects.join(", "))];
         all.extend(found.notes.iter().cloned());
         all.append(&mut notes);

@@ -74,7 +74,7 @@ pub fn find(paths: &[PathBuf]) -> Result<Vec<Input>> {
     }
     out.extend(recordings(alone));
     if out.is_empty() {
-        return Err(Error::input("there is nothing to import").remedy("Give the videos of a take."));
+        return Err(Error::input("there is nothing to import").remedy("Give the videos of one recording."));
     }
     Ok(out)
 }

@@ -122,7 +122,7 @@ const FEW_POINTS: usize = 50;
 /// focussed again is off
 /// by more, and rigs that people work with by 1 or 2.
 const CONTRADICTS: f64 = 5.0;
-/// A calibration that is contradicted by more than this part of the cameras that tell is not of this take.
+/// A calibration that more than this part of the judged cameras contradict belongs to another recording.
 const CONTRADICTED: f64 = 0.67;
 /// A camera on its way.
 struct Camera {
@@ -168,7 +168,7 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
         > 1
     {
         return Err(Error::input("the scale is given in two ways")
-            .remedy("Tell the distance of two cameras, tags, or a height: one."));
+            .remedy("Give one of them: the distance of two cameras, tags, or a height."));
     }
     let moving = match request.rig {
         Rig::Auto => cameras.len() == 1,
@@ -210,7 +210,7 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
         .map_err(|e| if stop() && e.kind() != ErrorKind::Interrupted { stopped() } else { e })?;
     for p in &pictures {
         if p.shots.is_empty() {
-            return Err(Error::input("no frame lies in the part that was chosen")
+            return Err(Error::input("the chosen part contains no frame")
                 .at(format!("camera {}", p.name))
                 .remedy("Choose another part, or leave the camera out."));
         }
@@ -267,7 +267,7 @@ struct Solution<'a> {
     stored: &'a stored::Stored<'a>,
     given: Option<given::Given>,
     solved: poses::Solved,
-    /// Lags of pairs, and offsets that were told.
+    /// Lags of pairs, and given offsets.
     evidence: &'a [Evidence],
     told: &'a [Option<f64>],
     /// Whether something moves in cameras whose clocks sound leaves open; none: it leaves none open.
@@ -311,9 +311,9 @@ fn check(solved: &poses::Solved, pictures: &[Pictures], report: &mut Report) -> 
     if solved.points.len() < FEW_POINTS {
         let given = !solved.contradiction.is_empty();
         let what = if given {
-            "were found on the given poses: cameras see little in common, and training looks for more."
+            "were found on the given poses: cameras share few points, and training searches for more."
         } else {
-            "hold the cameras together: look at the result before you trust it."
+            "connect the cameras: check the result."
         };
         report.guesses.push(format!("Only {} points {what}", solved.points.len()));
     }
@@ -393,7 +393,9 @@ fn sound_goes(
         }
     } else if way::hangs_on_sound(solved, told) {
         report.guesses.push(
-            "Clocks by sound alone are late by 2.9 ms a metre of its way, which is not taken out, for the unit is no metre.".into(),
+            "Time offsets from sound alone include the travel time of sound, 2.9 ms a metre. It is not subtracted, because \
+             the unit of length is not the metre."
+                .into(),
         );
     }
 }
@@ -476,7 +478,7 @@ fn finish(
         solved.take_points(&points);
         report.guesses.push("Points are the calibration's: too few were found in these images.".into());
     }
-    // What could not be placed is told before what could not be measured.
+    // What could not be placed is reported before what could not be measured.
     let metres = match world::settle(request, stored, origin, &mut solved, &mut report, progress) {
         Ok(metres) => metres,
         Err(e) => {
@@ -491,8 +493,8 @@ fn finish(
         report.cameras.push(row);
         if solved.stray.get(k) == Some(&true) {
             report.cameras[k].warnings.push(
-                "what moves in it fits the other cameras much less than theirs does: it films another time (tell its offset), \
-                 another take, or from too far aside; its clock is not believed"
+                "its motion fits the other cameras much less than theirs fits each other: it shows another time (give its \
+                 offset), another recording, or a view from too far aside; its time offset is not used"
                     .into(),
             );
         }
@@ -520,7 +522,7 @@ fn finish(
         Some(true) => clocks::check(&names_of(pictures), &solved, told, &report.motion)?,
         Some(false) => {
             report.still = true;
-            report.guesses.push("Nothing moves: clocks are those of the files, and do not matter.".into());
+            report.guesses.push("Nothing moves: time offsets are those of the files and have no effect.".into());
         }
         None => {}
     }

@@ -52,7 +52,7 @@ pub(super) struct Solved {
     pub moving: bool,
     /// See [`sfm::Solution::contradiction`].
     pub contradiction: Vec<Option<f64>>,
-    /// Cameras whose clock adjusting did not find, for what moves in them contradicts the others.
+    /// Cameras whose clock adjusting did not find, for motion in them contradicts the others.
     pub stray: Vec<bool>,
 }
 
@@ -160,7 +160,7 @@ pub(super) fn once(
     Ok(cache.or("solved", &made_of, || Ok(Note::of(&solve()?)))?.solved(stored))
 }
 
-/// Places cameras that stand still, and refines their clocks.
+/// Places fixed cameras, and refines their clocks.
 pub(super) fn standing(
     stored: &Stored<'_>,
     clock: graph::Solution,
@@ -170,7 +170,7 @@ pub(super) fn standing(
 ) -> Result<Solved> {
     let n = stored.pictures.len();
     let mut offsets = clock.offsets;
-    // What nothing tells stays as the files have it.
+    // Without evidence, the values of the files stay.
     let mut current: Vec<Offset> = offsets.iter().map(|o| o.clone().unwrap_or_default()).collect();
     let before: Vec<f64> = current.iter().map(|o| o.seconds).collect();
     let begun = offsets.clone();
@@ -199,7 +199,7 @@ pub(super) fn standing(
     for (taken, contradicts) in solution.taken.iter().zip(&solution.stray) {
         let c = taken.camera;
         if *contradicts && told[c].is_none() {
-            // What adjusting made of its clock is chance.
+            // What adjusting made of its time offset is chance.
             stray[c] = true;
             offsets[c].clone_from(&begun[c]);
         }
@@ -244,7 +244,7 @@ fn refined(
     if (0..n).filter_map(tau).all(|tau| tau == 0.0) {
         return 0.0;
     }
-    // The clock of those that are told, else the first camera's that geometry knows.
+    // The clock of those that are given, else of the first camera that geometry determined.
     let mut fixed: Vec<f64> = (0..n).filter(|&c| told[c].is_some()).filter_map(tau).collect();
     fixed.sort_by(f64::total_cmp);
     let Some(zero) = fixed.get(fixed.len() / 2).copied().or_else(|| (0..n).find_map(tau)) else { return 0.0 };

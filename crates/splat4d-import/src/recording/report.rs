@@ -61,7 +61,7 @@ pub struct CameraReport {
     pub error: Option<f64>,
     /// Focal length, pixels.
     pub focal: Option<f64>,
-    /// How far what it shows lies from where the calibration says, pixels; none: there is none, or too few matches tell.
+    /// Distance of its content from the position by the calibration, pixels; none: no calibration, or too few matches.
     pub calibration: Option<f64>,
     /// What was odd about its file.
     pub warnings: Vec<String>,

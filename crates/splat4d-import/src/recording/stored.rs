@@ -54,7 +54,7 @@ impl<'a> Stored<'a> {
         format!("{prints:?} {masks:?} {:?}", self.known)
     }
 
-    /// What stands still: the median of some frames, each made into what is worked with.
+    /// The static background: the median of some frames, each made into what is worked with.
     pub(super) fn median(&self, camera: usize, made: impl Fn(Rgb8) -> Rgb8 + Sync) -> Result<Rgb8> {
         /// Frames over the take.
         const SPREAD: usize = 15;

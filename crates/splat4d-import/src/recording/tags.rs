@@ -15,9 +15,9 @@ use splat4d_train::event::Progress;
 use splat4d_train::vision::raster::grey;
 use splat4d_train::vision::triangulate::{PixelObservation, angle_at, triangulate};
 
-/// Moments at which fixed cameras look for tags, and frames in which a moving one does.
+/// Times at which fixed cameras look for tags, and frames in which a moving one does.
 const MOMENTS: usize = 12;
-/// A frame farther from a moment than so much of an interval does not show it.
+/// A frame farther from a time than so much of an interval does not show it.
 const NEAR: f64 = 0.5;
 /// Degrees between two cameras that see a corner, at least: the placing of points goes by the same.
 const ANGLE: f64 = 1.5;
@@ -30,7 +30,7 @@ const UNLIKE: f64 = 0.03;
 /// Directions farther than this from the mean are left out (cosine of 10 degrees).
 const ASKEW: f64 = 0.985;
 
-/// What tags tell.
+/// Results from tags.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct TagWorld {
     /// Metres of the unit that lengths had.
@@ -79,7 +79,7 @@ pub(super) fn measured(
     progress: &mut Progress<'_>,
 ) -> Result<TagWorld> {
     let clock = stored.on(&solved.offsets);
-    // What each look is: a camera, a frame, and the moment that it belongs to.
+    // What each look is: a camera, a frame, and the time that it belongs to.
     let looks = if solved.moving { walked(&clock, solved) } else { stood(&clock, solved) };
     let mut seen: Vec<(usize, TagView)> = Vec::new();
     const AT_ONCE: usize = 8;
@@ -111,7 +111,7 @@ struct TagImage {
     moment: usize,
 }
 
-/// Fixed cameras look at moments that they share: the board may be carried about.
+/// Fixed cameras look at times that they share: the board may be carried about.
 fn stood(stored: &Stored<'_>, solved: &Solved) -> Vec<TagImage> {
     let cameras: Vec<usize> = (0..stored.cameras()).filter(|&c| solved.cameras[c].is_ok()).collect();
     let ends = |c: usize| (stored.time(c, 0), stored.time(c, stored.frames(c) - 1));
@@ -124,7 +124,7 @@ fn stood(stored: &Stored<'_>, solved: &Solved) -> Vec<TagImage> {
             let off = |k: &usize| (stored.time(camera, *k) - at).abs();
             let nearest = (0..stored.frames(camera)).min_by(|a, b| off(a).total_cmp(&off(b)));
             let interval = stored.pictures[camera].clock.interval;
-            // One image is of every moment.
+            // One image is of every time.
             let near = |k: &usize| stored.frames(camera) == 1 || off(k) <= NEAR * interval;
             out.extend(nearest.filter(near).map(|frame| TagImage { camera, frame, moment }));
         }
@@ -169,7 +169,7 @@ impl TagImage {
     }
 }
 
-/// Tags where two cameras and more see them at one moment, each moment for itself.
+/// Tags where two cameras and more see them at one time, each time for itself.
 fn placed(seen: &[(usize, TagView)]) -> Vec<Placed> {
     let mut keys: Vec<(usize, usize)> = seen.iter().map(|(m, s)| (*m, s.tag.id)).collect();
     keys.sort_unstable();
@@ -226,7 +226,7 @@ impl Placed {
     }
 }
 
-/// What placed tags tell.
+/// Results from placed tags.
 fn of(board: &Board, placed: &[Placed], held: [f64; 3]) -> Result<TagWorld> {
     let contradicts = |what: String| {
         Error::input(what).remedy(

@@ -27,8 +27,8 @@ pub(super) struct Corrected {
 
 /// Takes the way of sound out of clocks that sound alone determines. The solution's unit is the metre.
 ///
-/// Where sounds come from, cameras say whose clocks geometry found or people told: what these heard is late by nothing but its
-/// way. Of fewer cameras, or none, it is the middle of what all look at.
+/// The positions of sounds come from cameras whose clocks geometry found or users gave: what these heard is late by
+/// nothing but its way. Of fewer cameras, or none, it is the middle of what all look at.
 pub(super) fn corrected(
     solved: &mut Solved,
     evidence: &[Evidence],

@@ -26,7 +26,7 @@ pub(super) enum Origin {
 
 /// Gives a solution its unit and its axes, and says so in the report; whether the unit is the metre.
 ///
-/// Errors: what should tell lengths is not seen, or contradicts itself.
+/// Errors: what should give the scale is not visible, or contradicts itself.
 pub(super) fn settle(
     request: &Request,
     stored: &Stored<'_>,
@@ -68,7 +68,7 @@ pub(super) fn settle(
                 "Upwards (+z) and the other axes are those of floor and walls; cameras were held {off:.0} degrees off."
             ),
             (true, _) => "Upwards (+z) and the other axes are those of floor and walls.".into(),
-            (false, true) => "Upwards (+z) is what most cameras hold upwards; x and y lie along walls.".into(),
+            (false, true) => "Up (+z) is the up direction of most cameras; x and y follow the walls.".into(),
             (false, false) => "Upwards (+z) is what most cameras hold upwards.".into(),
         });
     }
@@ -76,15 +76,15 @@ pub(super) fn settle(
         let by = metres / height(solved, stored, name)?;
         solved.place(&Sim3 { scale: by, ..Sim3::default() });
         report.guesses.push(format!(
-            "The unit of length is the metre: {name} stands {metres} m above the floor that points show. Tags or the distance of two \
-             cameras tell it more exactly."
+            "The unit of length is the metre: {name} stands {metres} m above the floor among the points. Tags or the \
+             distance of two cameras are more accurate."
         ));
     }
     let told = found.is_some() || request.apart.is_some() || request.camera_height.is_some();
     if !told && (origin == Origin::Free || request.colmap) {
         report.guesses.push(format!(
-            "The unit of length is {}: tell two cameras' distance (--apart A,B=METRES), or film tags (--board), for metres.",
-            if request.colmap { "COLMAP's" } else { "the median distance of the cameras from what they see" }
+            "The unit of length is {}. For metres, give the distance of two cameras (--apart A,B=METRES) or film tags (--board).",
+            if request.colmap { "COLMAP's" } else { "the median distance of the cameras from the points" }
         ));
     }
     Ok(told || origin == Origin::Calibrated { metres: true })
@@ -119,13 +119,13 @@ fn place(solved: &Solved, stored: &Stored<'_>, name: &str) -> Option<[f64; 3]> {
 
 /// What makes the distance of two cameras so many metres.
 fn apart(solved: &Solved, stored: &Stored<'_>, pair: &[String; 2], metres: f64) -> Result<f64> {
-    let other = |what: String| Error::input(what).remedy("Tell the distance of two other cameras.");
+    let other = |what: String| Error::input(what).remedy("Give the distance of two other cameras.");
     let (Some(a), Some(b)) = (place(solved, stored, &pair[0]), place(solved, stored, &pair[1])) else {
         return Err(other(format!("{} or {} could not be placed", pair[0], pair[1])));
     };
     let now = norm(sub(a, b));
     if now <= 0.0 {
-        return Err(other(format!("{} and {} stand in one place", pair[0], pair[1])));
+        return Err(other(format!("{} and {} have the same position", pair[0], pair[1])));
     }
     Ok(metres / now)
 }
@@ -133,7 +133,8 @@ fn apart(solved: &Solved, stored: &Stored<'_>, pair: &[String; 2], metres: f64) 
 /// How high a camera stands above the floor, in the unit that is.
 fn height(solved: &Solved, stored: &Stored<'_>, name: &str) -> Result<f64> {
     let other = |what: String| {
-        Error::input(what).remedy("Tell two cameras' distance instead (--apart A,B=METRES), or film tags (--board).")
+        Error::input(what)
+            .remedy("Give the distance of two cameras instead (--apart A,B=METRES), or film tags (--board).")
     };
     let Some(camera) = place(solved, stored, name) else {
         return Err(other(format!("{name}, whose height is given, could not be placed")));
@@ -144,7 +145,7 @@ fn height(solved: &Solved, stored: &Stored<'_>, name: &str) -> Result<f64> {
     };
     let high = dot(camera, solved.up) - floor;
     if high <= 0.0 {
-        return Err(other(format!("{name} seems to stand below the floor")));
+        return Err(other(format!("{name} is below the floor")));
     }
     Ok(high)
 }

@@ -330,7 +330,7 @@ impl Normal {
             (0..3).for_each(|k| v[k][k] += damping * v[k][k]);
             v
         };
-        // V⁻¹ of every point; points that nobody sees stay.
+        // V⁻¹ of every point; points that no camera sees stay.
         let inverse: Vec<Option<[[f64; 3]; 3]>> =
             (0..self.points.len()).into_par_iter().map(|p| invert(&damped(p))).collect();
         let count = self.points.len();
@@ -384,7 +384,7 @@ impl Normal {
             right.iter_mut().zip(b).for_each(|(x, y)| *x -= y);
         }
         for k in 0..n {
-            // What is held, and what nobody sees.
+            // What is held, and what no camera sees.
             if held[k] || self.cameras[k * n + k] == 0.0 {
                 (0..k).for_each(|j| a[k * n + j] = 0.0);
                 (k + 1..n).for_each(|i| a[i * n + k] = 0.0);

@@ -23,9 +23,9 @@ pub fn median_distance(distances: &mut [Vec<f64>]) -> Option<f64> {
 pub struct Axes {
     /// Rows: x, y and, upwards, z of the frame in the world.
     pub rotation: Mat3,
-    /// Whether floor and walls tell what is up; else z is what cameras hold upwards.
+    /// Whether floor and walls determine the up direction; else z is what cameras hold upwards.
     pub upright: bool,
-    /// Whether walls tell the heading; else any is as good.
+    /// Whether walls determine the heading; else any is as good.
     pub along: bool,
 }
 
@@ -33,7 +33,7 @@ pub struct Axes {
 const TILT: f64 = 16.0;
 /// Steps of the first search, degrees: tilt, heading.
 const COARSE: [f64; 2] = [4.0, 3.0];
-/// Steps of the last one, degrees; walls of matched points tell no more.
+/// Steps of the last one, degrees; walls of matched points allow no finer ones.
 const FINE: f64 = 0.05;
 /// Width of a bin, of the points' median distance from their middle: of the bundled capture's 650 points widths from 0.01 to 0.04
 /// find the axes to 0.4 degrees.

@@ -66,11 +66,12 @@ impl Straight {
     }
 }
 
-/// Points and clocks of cameras whose poses and lenses are given. `links` were found without them, and tell how right they are.
+/// Points and clocks of cameras whose poses and lenses are given. `links` were found without them, and measure their
+/// errors.
 ///
 /// What moves lies next to its epipolar lines as long as clocks are off: first clocks are found of what looks alike,
 /// within wide
-/// bounds; then points of what lies on the lines, which it does at any clock, so that they tell none.
+/// bounds; then points of what lies on the lines, which it does at any clock, so that they determine none.
 pub(crate) fn about(sights: &[CameraView], links: &[Link], how: &Mapping, progress: &mut Progress<'_>) -> Mapped {
     /// Of the tolerance: two frames of what is followed at all, in images 1920 across.
     const WIDE: f64 = 8.0;
@@ -106,13 +107,14 @@ pub(crate) fn about(sights: &[CameraView], links: &[Link], how: &Mapping, progre
     Mapped { contradiction: errors(sights, links), moving: clocks.moving, ..map.result() }
 }
 
-/// Matches of what stands still that a pair of cameras must have before it shows whether poses are right.
+/// Matches of the static background that a pair of cameras must have before it shows whether poses are right.
 const SURE: usize = 12;
 /// Cameras whose axes are farther apart see other sides of things: what seems alike there is chance, degrees.
 const APART: f64 = 70.0;
 /// Median over lower quartile of the size of a normal error: 0.6745 / 0.3186.
 const QUARTILE_TO_MEDIAN: f64 = 2.117;
-/// So many of a camera's pairs must agree on its error, where so many tell it: a neighbour may be the one that is wrong.
+/// So many of a camera's pairs must agree on its error, where so many measure it: a neighbour may be the one that is
+/// wrong.
 const AGREE: usize = 2;
 const TELL: usize = 3;
 

@@ -60,7 +60,8 @@ const FITS: usize = 12;
 const FITS_SHARE: f64 = 0.2;
 /// A camera is placed within so many tolerances: points and lenses are not final.
 const PLACED_WITHIN: f64 = 2.0;
-/// Views from which on focal lengths are adjusted, and from which on all else is: few views do not tell them from poses.
+/// Views from which on focal lengths are adjusted, and from which on all else is: few views do not separate them from
+/// poses.
 const FOCAL_FROM: usize = 3;
 const ALL_FROM: usize = 7;
 /// Small rigs have no more: then from all of them, and at least so many.
@@ -359,7 +360,7 @@ impl Map<'_> {
     fn free(&self) -> Free {
         let n = self.order.len();
         if self.placed_before() {
-            // Poses that are given tell clocks from places, of two cameras on.
+            // Given poses separate clocks from positions, from two cameras on.
             let moves = self.how.clocks && self.sights.iter().all(|s| s.frame > 0.0);
             return Free { pose: false, focal: false, k1: false, center: false, tau: moves };
         }
@@ -517,7 +518,7 @@ impl Map<'_> {
         let fits = found.inliers.len();
         if fits < FITS || (fits as f64) < FITS_SHARE * known.len() as f64 {
             self.reasons[sight] =
-                format!("of {} places that it shares with the others only {fits} fit any position", known.len());
+                format!("of {} points that it shares with the others only {fits} fit any position", known.len());
             return false;
         }
         let among: Vec<Known> = found.inliers.iter().map(|&k| known[k]).collect();
@@ -546,7 +547,7 @@ impl Map<'_> {
             left.sort_by_key(|&(count, s)| (std::cmp::Reverse(count), s));
             let next = left.iter().find(|&&(_, s)| self.place(s)).copied();
             if next.is_none() {
-                // Once more with points and lenses at their best.
+                // Again with points and lenses at their best.
                 if left.is_empty() || fresh {
                     break;
                 }
@@ -585,7 +586,7 @@ impl Map<'_> {
             let weak: Vec<usize> = self.order.iter().copied().filter(|&s| self.fits(s) < FITS).collect();
             if !weak.is_empty() && self.order.len() - weak.len() >= 2 {
                 for s in weak {
-                    self.reasons[s] = format!("only {} places fit it in the end", self.fits(s));
+                    self.reasons[s] = format!("only {} points fit it in the end", self.fits(s));
                     self.poses[s] = None;
                     self.order.retain(|&o| o != s);
                 }
@@ -733,7 +734,7 @@ pub struct Mapped {
     pub contradiction: Vec<Option<f64>>,
     /// Of each camera, the points that move by which its clock was found.
     pub moving: Vec<usize>,
-    /// Of each camera, whether what moves in it contradicts the others: it shows another time.
+    /// Of each camera, whether motion in it contradicts the others: it shows another time.
     pub stray: Vec<bool>,
 }
 

@@ -77,7 +77,7 @@ pub struct Point {
     pub place: [f64; 3],
     /// sRGB.
     pub color: [u8; 3],
-    /// 0: it stands still; otherwise the moment it was seen at.
+    /// 0: it stands still; otherwise the time it was seen at.
     pub moment: usize,
     /// Images that see it, by their place in [`Solution::taken`].
     pub seen: Vec<usize>,
@@ -101,15 +101,15 @@ pub struct Solution {
     pub contradiction: Vec<Option<f64>>,
     /// Of each of [`Solution::taken`], the points that move by which its clock was found.
     pub moving: Vec<usize>,
-    /// Of each of them, whether what moves in it contradicts the others: it shows another time, or another take.
+    /// Of each of them, whether motion in it contradicts the others: it shows another time, or another take.
     pub stray: Vec<bool>,
 }
 
 /// Finds where images were taken from.
 ///
-/// The world's unit is the median distance of the cameras from what they see; its axes are those of the camera that was placed
-/// first. Lengths and the vertical must come from elsewhere. Where all places are known, so are unit and axes: then only points
-/// and clocks are found.
+/// The world's unit is the median distance of the cameras from the points; its axes are those of the camera that was
+/// placed first. Lengths and the vertical must come from elsewhere. Where all places are known, so are unit and axes:
+/// then only points and clocks are found.
 ///
 /// Errors: images that cannot be read; no two that show one scene.
 pub fn solve(pictures: &dyn Pictures, options: &Options, progress: &mut Progress<'_>) -> Result<Solution> {

@@ -125,7 +125,7 @@ pub(super) struct ImagePoint<'a> {
     pub eye: Eye<'a>,
 }
 
-/// How fast a point moves that these see moving so fast (pixels a second); `None`: they do not tell.
+/// How fast a point moves that these see moving so fast (pixels a second); `None`: undetermined.
 pub(super) fn speed(x: [f64; 3], seen: &[ImagePoint<'_>], velocities: &[[f64; 2]]) -> Option<[f64; 3]> {
     if velocities.iter().all(|v| *v == [0.0; 2]) {
         return Some([0.0; 3]);

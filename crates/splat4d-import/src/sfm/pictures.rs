@@ -1,4 +1,4 @@
-//! What cameras see, as features: of what stands still on the median image, of what moves at moments that all share.
+//! What cameras see, as features: of the static background on the median image, of what moves at times that all share.
 
 use super::lens::Known;
 use super::overlay::Shown;
@@ -47,10 +47,10 @@ pub trait Pictures: Sync {
 pub struct Feature {
     /// Pixels.
     pub pixel: [f64; 2],
-    /// Pixels a second; zero for what stands still.
+    /// Pixels a second; zero for the static background.
     pub velocity: [f64; 2],
-    /// 0: it stands still; otherwise which of the shared moments it was seen at, from 1. Those of different moments are never
-    /// the same.
+    /// 0: it stands still; otherwise which of the shared times it was seen at, from 1. Those of different times are
+    /// never the same.
     pub moment: usize,
     /// What it looks like.
     pub descriptor: [u8; NUMBERS],
@@ -78,22 +78,23 @@ pub struct CameraView {
     pub lens: usize,
     /// How long a frame lasts, seconds.
     pub frame: f64,
-    /// In the order of moments.
+    /// In the order of times.
     pub features: Vec<Feature>,
-    /// What each moment's features are from, by the moment's number; none of a lens that is known, whose features were straightened.
+    /// What each time's features are from, by the time's number; none of a lens that is known, whose features were
+    /// straightened.
     pub shown: Vec<Option<Shown>>,
 }
 
 /// What features are taken from.
 #[derive(Clone, Copy, Debug, PartialEq)]
+    /// Times at which features are taken from dynamic regions.
 pub struct FeatureOptions {
-    /// Moments at which features are taken from what moves.
     pub moments: usize,
     /// Least contrast of a feature.
     pub contrast: f64,
-    /// Features of what stands still, at most, for each camera.
+    /// Features of the static background, at most, for each camera.
     pub still: usize,
-    /// Features of a moment, at most, for each camera.
+    /// Features of a time, at most, for each camera.
     pub moving: usize,
     /// Images are halved until they have no more pixels.
     pub pixels: usize,
@@ -102,21 +103,21 @@ pub struct FeatureOptions {
 impl Default for FeatureOptions {
     fn default() -> Self {
         // Measured on a hall with 31 cameras of 640x360: contrasts of OpenCV's 0.004 to 0.01 (divided by its three layers) and ten
-        // moments map it. Poses of the bundled capture are 1.3 times as exact with 25 moments as with ten.
+        // times map it. Poses of the bundled capture are 1.3 times as exact with 25 times as with ten.
         Self { moments: 16, contrast: 0.003, still: 4000, moving: 800, pixels: 1_200_000 }
     }
 }
 
-/// Frames whose median is what stands still.
+/// Frames whose median is the static background.
 const MEDIAN_OF: usize = 15;
-/// From so many frames on a median knows what stands still.
+/// From so many frames on a median knows the static background.
 const MEDIAN_FROM: usize = 3;
-/// A pixel that differs by more than this from what stands still (mean of the channels, in [0, 1]) belongs to something that
-/// moves: above the noise of ordinary cameras.
+/// A pixel that differs by more than this from the static background (mean of the channels, in [0, 1]) belongs to
+/// something that moves: above the noise of ordinary cameras.
 const MOVED: f32 = 0.06;
 /// Differences are blurred by so many pixels: single ones are noise.
 const MOVED_BLUR: f64 = 1.0;
-/// A frame farther from a moment than this many frames does not show it.
+/// A frame farther from a time than this many frames does not show it.
 const TOO_FAR: f64 = 1.0;
 /// Features that move more slowly than this stand still as far as clocks are concerned, pixels a frame.
 const FASTEST: f64 = 40.0;
@@ -165,7 +166,7 @@ fn mask(pictures: &dyn Pictures, camera: usize, frame: usize, picture: &Planes<f
     Ok(pictures.mask(camera, frame)?.map(|mask| Mask { mask, size }))
 }
 
-/// What stands still: the median over some frames, channel by channel.
+/// The static background: the median over some frames, channel by channel.
 fn median(pictures: &dyn Pictures, camera: usize, most: usize) -> Result<(Planes<f32>, f64)> {
     let frames = spread(pictures.frames(camera), MEDIAN_OF);
     let (mut out, factor) = load(pictures, camera, frames[0], most)?;
@@ -260,7 +261,7 @@ pub fn fixed(pictures: &dyn Pictures, look: &FeatureOptions, progress: &mut Prog
 fn sight(pictures: &dyn Pictures, camera: usize, look: &FeatureOptions, moments: &[f64]) -> Result<CameraView> {
     let (background, factor) = median(pictures, camera, look.pixels)?;
     let limits = |most: usize| Limits { contrast: look.contrast, most };
-    // What stands still counts where the middle frame does.
+    // The static background counts where the middle frame does.
     let counts = mask(pictures, camera, pictures.frames(camera) / 2, &background)?;
     let mut features =
         found(&background, limits(look.still), &|x, y| counts.as_ref().is_none_or(|m| m.counts(x, y)), 0);
@@ -348,7 +349,7 @@ impl Window {
     }
 }
 
-/// Features of what moves in a frame, each with its velocity; brought to the time of the moment, which may lie next
+/// Features of what moves in a frame, each with its velocity; brought to the time of the time, which may lie next
 /// to the
 /// frame's. And what they are from.
 fn moving(
@@ -409,8 +410,8 @@ fn moving(
     Ok((features.into_iter().enumerate().filter_map(with_velocity).collect(), Some(shown)))
 }
 
-/// Frames of moving cameras, one sight each: at most `most`, evenly chosen. What moves in them contradicts what stands still and
-/// is left out where images are compared.
+/// Frames of moving cameras, one sight each: at most `most`, evenly chosen. Motion in them contradicts the static
+/// background and is left out where images are compared.
 ///
 /// Errors: as [`fixed`].
 pub fn walking(

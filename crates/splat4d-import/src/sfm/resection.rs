@@ -112,7 +112,7 @@ impl Data for Resection<'_> {
 
     fn polish(&self, m: &Placed, inliers: &[usize]) -> Option<Placed> {
         let known: Vec<Known> = inliers.iter().map(|&k| self.known[k]).collect();
-        // A handful of points does not tell a focal length from a distance.
+        // A handful of points does not separate a focal length from a distance.
         const FOCAL_FROM: usize = 12;
         Some(polish(m, &known, self.free && known.len() >= FOCAL_FROM, f64::INFINITY))
     }

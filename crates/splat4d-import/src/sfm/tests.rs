@@ -180,7 +180,7 @@ fn equal_lenses_are_taken_for_equal_and_others_are_not() {
         let zooms: Vec<f64> = (found.taken.iter().zip(&rig.lenses))
             .map(|(t, lens)| (t.placed.as_ref().unwrap().lens.focal / lens.focal).ln())
             .collect();
-        // What all have in common is told by the scene's depth alone.
+        // What all have in common is determined by the scene's depth alone.
         let mean = zooms.iter().sum::<f64>() / zooms.len() as f64;
         assert!(zooms.iter().all(|z| (z - mean).abs() < within), "differing by {spread}: {zooms:?}");
     }
@@ -217,7 +217,7 @@ fn a_camera_that_films_another_time_is_known_by_what_moves() {
         solve_sights(&who, &rig.sights, Pairing::All, &Options::default(), progress).unwrap().stray
     };
     assert_eq!(strays(&rig), [false; 5]);
-    // Where everybody was half a second before, each of them elsewhere; walls stay.
+    // Positions of all people half a second before; walls stay.
     let rng = Rng::new(6, "before", 0);
     for (k, f) in rig.sights[2].features.iter_mut().enumerate().filter(|(_, f)| f.moment > 0) {
         f.pixel = std::array::from_fn(|a| f.pixel[a] + 40.0 * rng.normal((2 * k + a) as u64));

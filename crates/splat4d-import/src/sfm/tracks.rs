@@ -66,7 +66,7 @@ impl Pairing {
     }
 }
 
-/// The features of one moment of a sight as rows of a matrix.
+/// The features of one time of a sight as rows of a matrix.
 struct Rows {
     /// Numbers of the features.
     features: std::ops::Range<usize>,

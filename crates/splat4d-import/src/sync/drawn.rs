@@ -61,7 +61,7 @@ impl Rig {
             Dance::Still => 0.0,
             Dance::Loop => 0.25 * (turn * (t / 0.4 + rng.uniform(i))).sin(),
             Dance::Free => {
-                // Everybody moves by the same music, faster and slower, each in a way of their own.
+                // All people move to the same music, faster and slower, each in their own way.
                 let music = |j: u64| Rng::new(self.seed, "music", 0).uniform(j);
                 let beat = |s: f64, j: u64| (s * t + turn * music(j)).sin();
                 let time = t + 0.28 * beat(1.9, 0) + 0.13 * beat(4.3, 1) + 0.05 * beat(9.7, 2) + 0.02 * beat(17.0, 3);

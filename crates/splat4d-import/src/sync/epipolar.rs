@@ -267,7 +267,7 @@ impl Problem<'_> {
         if count < COMMON { MOST } else { sum / f64::from(count as u32) }
     }
 
-    /// The pairs that fit at a lag; of pairs that were not told, those that fit each other best.
+    /// The pairs that fit at a lag; of pairs without given lags, those that fit each other best.
     fn choose(
         &self,
         pairs: impl Iterator<Item = [usize; 2]>,

@@ -18,7 +18,7 @@ const RIDGE: f64 = 1e-9;
 /// What a lag is from, the most trusted first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub enum Kind {
-    /// Told by the user.
+    /// Given by the user.
     Given,
     /// Epipolar geometry.
     Geometry,
@@ -60,7 +60,7 @@ pub struct Evidence {
 pub struct Offset {
     /// Seconds.
     pub seconds: f64,
-    /// Its standard deviation, seconds; 0 for the camera that is the clock and for what the user told.
+    /// Its standard deviation, seconds; 0 for the camera that is the clock and for given offsets.
     pub sigma: f64,
     /// Drift of the clock, seconds a second.
     pub rate: f64,

@@ -42,7 +42,7 @@ impl fmt::Display for Refusal {
             Self::Short(what) => write!(f, "there is too little of {what}"),
             Self::Silent => write!(f, "nothing is heard"),
             Self::Still => write!(f, "nothing moves"),
-            Self::Unrelated => write!(f, "nothing agrees: these may be different takes"),
+            Self::Unrelated => write!(f, "nothing agrees: these may be different recordings"),
             Self::Repeating([a, b]) => write!(f, "it repeats itself: {a:.3} s and {b:.3} s fit alike"),
             Self::Vague(s) => write!(f, "what moves leaves it open by {s:.3} s"),
             Self::Drifting(r) => {

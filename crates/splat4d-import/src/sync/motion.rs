@@ -90,7 +90,7 @@ impl Motion {
     }
 }
 
-/// How much later b notes what a notes, at most `most` seconds either way, if told.
+/// How much later b notes what a notes, at most `most` seconds either way, if given.
 pub fn lag(a: &Motion, b: &Motion, most: Option<f64>) -> Result<MotionLag, Refusal> {
     if a.times.len() < MIN_INTERVALS || b.times.len() < MIN_INTERVALS {
         return Err(Refusal::Short("the take"));

@@ -38,7 +38,7 @@ const AGREEING: usize = 3;
 const AGREEING_PART: f64 = 0.6;
 /// Largest median absolute deviation of those that agree, seconds.
 const MAX_MAD: f64 = 3e-3;
-/// Windows over at least so many seconds tell a drift of the clocks.
+/// Windows over at least so many seconds are needed to measure a drift of the clocks.
 const DRIFT_SPAN: f64 = 60.0;
 /// Largest drift of clocks, seconds a second: crystals of phones are within 100 ppm of each other.
 const MAX_DRIFT: f64 = 500e-6;
@@ -56,7 +56,7 @@ pub struct SoundLag {
     pub sigma: f64,
     /// A second of the first track's clock in the middle of what was compared.
     pub at: f64,
-    /// Seconds by which the lag grows each second; where the tracks are long enough to tell.
+    /// Seconds by which the lag grows each second; where the tracks are long enough.
     pub drift: Option<f64>,
     /// Median ratio of the highest peak to the next one in the windows that agree.
     pub ratio: f64,
@@ -140,7 +140,7 @@ fn onsets(samples: &[f32]) -> Vec<f64> {
     out
 }
 
-/// How much later b notes what a notes, by their sound; at most `most` seconds either way, if told.
+/// How much later b notes what a notes, by their sound; at most `most` seconds either way, if given.
 pub fn lag(a: &SoundTrack, b: &SoundTrack, most: Option<f64>) -> Result<SoundLag, Refusal> {
     if a.length() < MIN_OVERLAP || b.length() < MIN_OVERLAP {
         return Err(Refusal::Short("sound"));

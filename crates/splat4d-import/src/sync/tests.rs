@@ -14,8 +14,8 @@ const FRAME: f64 = 1.0 / FPS;
 
 // Sound.
 
-/// Somebody talks and claps: bursts of noise of all lengths, as heard `late` seconds later by a clock that is `drift` fast,
-/// with an echo, and noise of the room as loud as the rest times `noise`.
+/// A person talks and claps: bursts of noise of all lengths, as heard `late` seconds later by a clock that is `drift`
+/// fast, with an echo, and noise of the room as loud as the rest times `noise`.
 fn heard(seed: u64, seconds: f64, late: f64, drift: f64, noise: f64, ear: u64) -> SoundTrack {
     let source = Rng::new(seed, "a sound", 0);
     let count = ((seconds + 4.0) * SOUND_RATE) as usize;

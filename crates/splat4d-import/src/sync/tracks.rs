@@ -362,7 +362,7 @@ mod tests {
                 |p: &[f64; 2]| (16.0..80.0).contains(&(p[0] + shift[0])) && (16.0..64.0).contains(&(p[1] + shift[1]));
             let both: Vec<_> = found.iter().zip(&moved).filter(|(p, _)| inside(p)).collect();
             let kept: Vec<_> = both.iter().filter_map(|(p, m)| m.map(|m| (p, m))).collect();
-            // Some cannot be told from their neighbours in small images when they move far.
+            // Some cannot be distinguished from their neighbours in small images when they move far.
             assert!(kept.len() * 2 >= both.len(), "{shift:?}: {} of {}", kept.len(), both.len());
             for (p, m) in kept {
                 let off = (m[0] - p[0] - shift[0]).hypot(m[1] - p[1] - shift[1]);

@@ -209,7 +209,7 @@ impl Reader for Pictures<'_> {
             return Ok(true);
         }
         if self.counted == 0 {
-            let what = "no frame lies in the part that was chosen";
+            let what = "the chosen part contains no frame";
             return Err(Error::input(what).at(self.avi.path.display()).remedy("Choose another part."));
         }
         Ok(false)

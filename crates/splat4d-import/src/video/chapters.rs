@@ -93,7 +93,7 @@ impl Joined {
             }
             starts.push(end);
             end += own.duration.ok_or_else(|| {
-                Error::input("a chapter does not say how long it is").remedy("Join the chapters with ffmpeg first.")
+                Error::input("a chapter does not state its duration").remedy("Join the chapters with ffmpeg first.")
             })?;
             info.frames = info.frames.zip(own.frames).map(|(a, b)| a + b);
             info.sound |= own.sound;

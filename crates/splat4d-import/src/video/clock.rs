@@ -1,4 +1,4 @@
-//! What the times of a video's frames tell: its rate, whether it varies, frames that are missing or there twice.
+//! What the times of a video's frames show: its rate, whether it varies, frames that are missing or there twice.
 
 use super::Rgb8;
 
@@ -33,7 +33,7 @@ pub struct Gap {
     pub missing: usize,
 }
 
-/// The clock of a source, as its frames tell it.
+/// The clock of a source, by its frames.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Clock {
     /// The median interval, seconds; 0 where there are fewer than two frames.

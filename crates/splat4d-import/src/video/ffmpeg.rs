@@ -15,7 +15,7 @@ const STAMP_ERROR: f64 = 0.6e-3;
 const END_FRAMES: f64 = 3.0;
 /// The same in seconds, where the duration may be that of the sound.
 const END_SECONDS: f64 = 1.0;
-/// Frames per second where neither file nor frames tell.
+/// Frames per second where neither file nor frames give them.
 const GUESSED_RATE: f64 = 30.0;
 /// Most seconds of sound that are read: two hours are 460 MB.
 const MAX_SOUND: f64 = 7200.0;
@@ -144,7 +144,7 @@ struct Pictures<'a> {
     /// The second where reading began.
     seek: f64,
     times: Vec<f64>,
-    /// How many frames ffmpeg kept, of which it told the time.
+    /// How many frames ffmpeg kept and printed the time of.
     told: usize,
     /// How many were given away.
     given: usize,

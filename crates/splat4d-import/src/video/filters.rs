@@ -7,7 +7,7 @@ const SCALING: &str = "bicubic+accurate_rnd+full_chroma_int+full_chroma_inp";
 /// Light of white, cd/m², that ordinary screens are graded for (BT.1886): what tone mapping refers to.
 const WHITE: u32 = 100;
 
-/// A chain and what is to be told of it.
+/// A chain and the message about it.
 #[derive(Debug, PartialEq)]
 pub(super) struct Chain {
     /// As `-vf` takes it.
@@ -52,11 +52,11 @@ pub(super) fn chain(info: &Info, selection: &Selection, tone_mapping: bool) -> C
     if !color.tagged
         && let Some(matrix) = color.matrix
     {
-        warnings.push(format!("Its file does not say what its colours mean; taken for {} by its size.", said(matrix)));
+        warnings.push(format!("Its file does not state its colour matrix; assumed: {} by its size.", said(matrix)));
     }
     if let Some(crop) = selection.crop {
         if info.upright_stored() != info.size {
-            // Crops are told in square pixels.
+            // Crops are given in square pixels.
             parts.push(format!("scale={}:{}:flags={SCALING}", info.size[0], info.size[1]));
         }
         parts.push(format!("crop={}:{}:{}:{}:exact=1", crop.width, crop.height, crop.x, crop.y));

@@ -170,7 +170,7 @@ pub fn open_with(path: &Path, fps: f64, tools: Result<Tools>) -> Result<Box<dyn 
     }
     match tools {
         Ok(tools) => Ok(Box::new(ffmpeg::Video::open(path, tools)?)),
-        // Without the program, what is simple enough; its absence is told where the file is not.
+        // Without the program, what is simple enough; its absence is reported where the file is not.
         Err(missing) => match avi::Avi::open(path) {
             Ok(avi) => Ok(Box::new(avi)),
             Err(e) if e.kind() == ErrorKind::Unsupported => Err(missing.at(path.display())),

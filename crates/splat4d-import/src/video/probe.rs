@@ -265,7 +265,7 @@ mod tests {
         let expected =
             Color { matrix: Some("bt709"), tagged: true, range: Range::Limited, transfer: Transfer::Standard };
         assert_eq!(info.color, expected);
-        // Older versions of ffmpeg tell the rotation in a tag, clockwise.
+        // Older versions of ffmpeg state the rotation in a tag, clockwise.
         let old = phone(|f| {
             f.as_object_mut().unwrap().remove("side_data_list");
             f["tags"] = json!({"rotate": "270"});

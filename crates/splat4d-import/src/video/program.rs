@@ -126,7 +126,7 @@ impl Tools {
         let stderr = child.stderr.take().expect("standard error is a pipe");
         let (send, stamps) = channel();
         let name = path.to_owned();
-        // It is read all the time, so that ffmpeg never waits for somebody to listen.
+        // It is read all the time, so that ffmpeg never waits for a reader.
         let listener = std::thread::spawn(move || {
             let mut said = Said::default();
             let mut units = [None; 2];
@@ -135,7 +135,7 @@ impl Tools {
             while matches!(lines.read_until(b'\n', &mut line), Ok(1..)) {
                 let text = String::from_utf8_lossy(&line);
                 if let Some((which, time)) = stamp(&text, &mut units) {
-                    // Whoever asked may have gone.
+                    // The receiver may be gone.
                     let _ = send.send((which, time));
                 } else if text.contains(MUXER) {
                     // It frets over the times of raw images, which go nowhere.
@@ -246,7 +246,7 @@ fn version(text: &str) -> Option<(u32, u32)> {
 }
 
 /// The time in a line of one of our two `showinfo` filters:
-/// `[showinfo@all @ 0x5] [info] n: 3 pts: 1536 pts_time:0.1 ...`. `units` are what a time stamp counts, told before:
+/// `[showinfo@all @ 0x5] [info] n: 3 pts: 1536 pts_time:0.1 ...`. `units` are the unit of time stamps, printed before:
 /// `[showinfo@all @ 0x5] [info] config in time_base: 1/15360, ...`. (`pts_time` has six digits, too few for long takes.)
 fn stamp(line: &str, units: &mut [Option<f64>; 2]) -> Option<(Stamp, Option<f64>)> {
     let rest = line.strip_prefix("[showinfo@")?;

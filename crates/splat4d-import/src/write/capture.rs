@@ -9,7 +9,7 @@ use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::run::checkpoint::write_atomically;
 use std::path::{Path, PathBuf};
 
-/// Times are written to so many parts of a second: cameras' clocks tell no more, and people can read them.
+/// Times are written to so many parts of a second: cameras' clocks are no finer, and people can read them.
 const TICKS: f64 = 1e6;
 
 /// Where a camera was.
@@ -58,7 +58,7 @@ pub struct Recording {
 /// Errors: no cameras, no images of one, poses that are not as many as shots, no space.
 pub fn capture(folder: &Path, take: &Recording, cameras: &[Placed]) -> Result<PathBuf> {
     if cameras.is_empty() {
-        return Err(Error::input("there is no camera whose place is known").remedy("See the report for why."));
+        return Err(Error::input("no camera has a known position").remedy("See the report for why."));
     }
     // The median rate of all; each camera's own times say more.
     let mut intervals: Vec<f64> = cameras.iter().map(|c| c.pictures.clock.interval).filter(|i| *i > 0.0).collect();

@@ -32,7 +32,7 @@ pub struct Begin {
 
 /// Stores the masks of all cameras below `folder`, as `masks/NAME/000000.png` and so on. `from` holds for each
 /// camera an image
-/// `NAME.png` for the whole take, or a folder `NAME` with one for each frame of its video, in the order of names.
+/// `NAME.png` for the whole recording, or a folder `NAME` with one for each frame of its video, in the order of names.
 ///
 /// Errors: a camera without masks, fewer masks than frames, masks of another shape, no space; of kind `Interrupted` where `stop`
 /// said so.
@@ -67,7 +67,7 @@ fn camera(folder: &Path, from: &Path, pictures: &Pictures, begin: Begin) -> Resu
     let own = from.join(&pictures.name);
     if !own.is_dir() {
         return Err(Error::input("it has no masks").at(from.display()).remedy(format!(
-            "Add {}.png for the whole take, or a folder {} with one for each frame: white where the image counts.",
+            "Add {}.png for the whole recording, or a folder {} with one for each frame: white where the image counts.",
             pictures.name, pictures.name
         )));
     }
@@ -102,7 +102,7 @@ fn numbers(pictures: &Pictures, begin: Begin) -> Result<Vec<usize>> {
         return Err(Error::input(format!(
             "its frame rate varies, and it is read from {from:.2} s on: which mask is which frame's is not known"
         ))
-        .remedy("Give one mask for the whole take, or cut the video and its masks beforehand."));
+        .remedy("Give one mask for the whole recording, or cut the video and its masks beforehand."));
     }
     Ok(pictures.shots.iter().map(|s| (s.time / pictures.clock.interval).round() as usize).collect())
 }

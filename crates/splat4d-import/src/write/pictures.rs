@@ -148,7 +148,7 @@ pub fn camera_names(wanted: &[&str]) -> Vec<String> {
         // A dash at the beginning is an option to other programs.
         let plain = plain.trim_start_matches('-');
         let plain = if plain.is_empty() { "camera" } else { plain };
-        // Some systems do not tell large letters from small ones.
+        // Some systems do not distinguish large letters from small ones.
         let numbered = (2..).map(|k| format!("{plain}_{k}"));
         std::iter::once(plain.to_owned()).chain(numbered).find(|n| taken.insert(n.to_lowercase())).expect("one is free")
     };

@@ -77,7 +77,7 @@ fn what_was_interrupted_ends_in_the_same_bytes() {
     let made = contents(parts.path());
     assert_eq!(made, contents(whole.path()));
     assert_eq!(made.len(), 20 + 11 + 2, "pictures, a note per camera, and nothing else: {:?}", made.keys());
-    // Once more: nothing is read any more.
+    // Again: nothing is read any more.
     assert_eq!(store(parts.path(), &clips, 0).unwrap(), expected);
     assert_eq!((expected[0].name.as_str(), expected[0].shots.len(), expected[0].size), ("cam_0", 20, [32, 24]));
     assert_eq!(expected[1].file(3), Path::new("images/cam_1/000003.jpg"));
@@ -163,7 +163,7 @@ fn masks_are_stored_next_to_their_images() {
     assert_eq!(value(&found[0].files[7]), 255, "ones are white");
     let values: Vec<u8> = found[1].files.iter().map(|f| value(f)).collect();
     assert_eq!(values, [0, 40, 80, 120, 160, 200]);
-    // From some second on, frames were not counted: times tell them.
+    // From some second on, frames were not counted: they follow from times.
     let late: Vec<Pictures> = stored
         .iter()
         .cloned()

@@ -1,4 +1,4 @@
-"""A progress bar where somebody looks: on a terminal, and in notebooks."""
+"""A progress bar on a terminal and in notebooks."""
 
 import sys
 from typing import Any
@@ -9,7 +9,7 @@ NOTEBOOK_SECONDS = 0.5
 
 
 def shown() -> "Bar | None":
-    """The bar for this process; None where nobody looks."""
+    """The bar for this process; None without a terminal or notebook."""
     if "ipykernel" in sys.modules:
         return Notebook()
     return Bar() if sys.stderr is not None and sys.stderr.isatty() else None

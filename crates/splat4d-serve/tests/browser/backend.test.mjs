@@ -190,7 +190,7 @@ for (const backend of ['webgl2', 'webgpu']) {
 
   test(`${backend} survives pages that come and go, sizes that change and its own end`, { skip }, () => {
     const made = sample({ seed: 9, masks: 0.3 });
-    // What the fullest moment needs, and no page more: every seek drops pages and lends their rows again.
+    // What the fullest time needs, and no page more: every seek drops pages and lends their rows again.
     const most = 700 + 1025 + 511;
     return shown(backend, made, async (page) => {
       await page.evaluate((most) => {

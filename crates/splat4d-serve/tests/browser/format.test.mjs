@@ -72,7 +72,7 @@ test('key masks say who is drawn when', async () => {
   for (const entry of file.pages) {
     const mask = entry.mask < 0 ? null : new KeyMask(await file.mask(entry.mask));
     if (mask) masked++;
-    // On key times, between them and outside of all, in an order that goes back and forth.
+    // On key times, between them and outside of all, in mixed order.
     for (const t of [entry.from - 1, entry.from + 0.5, entry.from + 0.25, entry.to - 1e-9, entry.to + 1, entry.from]) {
       const want = truth.slice(first, first + entry.count).map((g) => g.admitted(t));
       const changed = mask?.at(t);
@@ -198,7 +198,7 @@ test('a file that grows has its index behind its sections, and reads like a fini
   assert.deepEqual([a.growing, b.growing, b.truncated], [false, true, false]);
   assert.deepEqual(a.meta, b.meta);
   for (const { id } of a.pages) assert.deepEqual(await a.page(id), await b.page(id));
-  // What was added since the header was written is not looked at, and what is not there yet is told.
+  // What was added since the header was written is not looked at, and what is not there yet is reported.
   const more = await SceneFile.open(Buffer.concat([growing, Buffer.alloc(99, 7)]));
   assert.equal(more.pages.length, a.pages.length);
   const gaps = await SceneFile.open(grown(sample({ json: { missing: [[2, 3], [5, 4]] } }).bytes));
@@ -385,7 +385,7 @@ test('sorting finds everybody who is seen, the farthest first', async () => {
     }
     assert.ok(count > 100 && count < known.size);
   }
-  // Whom masks hide is gone, and nobody else.
+  // Gaussians that masks hide are gone, and no others.
   const all = (time) => out.slice(0, sorter.sort({ time, depth, near: 0.01 }, out).count).sort();
   const before = all(3.7),
     { id } = file.activePages(3.7)[0],

@@ -103,7 +103,7 @@ test('a run is paused, continued and stopped from its page, with the token and w
   assert.deepEqual(site.controlled, ['pause', 'continue', 'stop'].map(what => ({ do: what, token: TOKEN })));
   assert.deepEqual(errors, []);
   await page.close();
-  // Somebody who was given the address without its token may look.
+  // A user who was given the address without its token may look.
   site.history = [];
   step(3);
   site.say({ kind: 'snapshot', version: 1 });

@@ -151,7 +151,7 @@ test('an image is whole when the coarsest tier of every span is there, or will n
     stream = new Stream(r.file, r.backend);
   stream.update(5.5);
   assert.equal(stream.playable(5.5), false);
-  // The root alone, half of all Gaussians and more, lacks whoever moves.
+  // The root alone, half of all Gaussians and more, lacks what moves.
   for (const id of [0, 1]) r.open.get(id)();
   await r.tick();
   assert.deepEqual([stream.playable(5.5), stream.ready(5.5)], [false, 2 / 3]);
@@ -270,7 +270,7 @@ test('a first moment and a seek fetch their own bytes and no others', async () =
     const file = await SceneFile.open(server.url + 'a');
     const head = server.sent;
     const backend = { addPalette: () => {}, addPage: () => {}, dropPage: () => {} };
-    // No room for more than the fullest moment: nothing is fetched ahead, so that every byte can be accounted for.
+    // No room for more than the fullest time: nothing is fetched ahead, so that every byte can be accounted for.
     const stream = new Stream(file, backend, { budget: 32 * 8 * (700 + 1025 + 511) });
     const outside = (ids) =>
       ids.reduce(

@@ -57,7 +57,7 @@ test.after(async () => {
   await server?.close();
 });
 
-/// What the reference is told of a `scene`: Gaussians with their span and their harmonics.
+/// What the reference gets of a `scene`: Gaussians with their span and their harmonics.
 function truth({ pages, palettes = [] }) {
   const known = new Map(palettes.map((p) => [p[0], toy.palette(...p)]));
   return pages.flatMap((p) => {

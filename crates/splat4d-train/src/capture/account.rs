@@ -3,7 +3,7 @@
 /// How bad a [`Finding`](super::Finding) is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Severity {
-    /// Worth knowing.
+    /// For information.
     Note,
     /// The result will probably suffer.
     Warning,

@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 
 /// Every how many images one is held out where no rig and no convention says otherwise (LLFF's habit).
 const HOLD_EVERY: usize = 8;
-/// White: what transparent pixels are composited on unless told (the papers' choice for D-NeRF).
+/// White: what transparent pixels are composited on by default (the papers' choice for D-NeRF).
 const WHITE: [f32; 3] = [1.0; 3];
 
 /// Checks a take and turns it into a capture.
@@ -28,7 +28,7 @@ pub(super) fn assemble(mut take: RawCapture, options: &CaptureOptions) -> Result
     if take.frames.is_empty() {
         return Err(located(
             Error::input("the capture has no frames")
-                .remedy("Check that the file lists images and that the images lie where it says."),
+                .remedy("Check that the file lists images and that the images exist at the listed paths."),
         ));
     }
     options::check_rate("frame rate", take.fps).map_err(located)?;
@@ -109,7 +109,7 @@ pub(super) fn assemble(mut take: RawCapture, options: &CaptureOptions) -> Result
     }
     let near = near(&capture, options.near);
     capture.frames.iter_mut().for_each(|f| f.view.near = near);
-    // Last: all else is told by the whole take.
+    // Last: all else follows from the whole capture.
     let frames = &capture.frames;
     for all in [&mut capture.train, &mut capture.held, &mut capture.validation] {
         all.retain(|&i| options.lists(frames[i].index));
@@ -285,8 +285,7 @@ fn check_poses(take: &mut RawCapture, cameras: &[Rig]) -> Result<()> {
 fn warn_of_shared(shared: usize, warnings: &mut Vec<String>) {
     if shared > 0 {
         warnings.push(format!(
-            "{shared} frames of the training, validation and test sets agree in camera and time: figures measured on \
-             them do not tell how new views look."
+            "{shared} frames of the training, validation and test sets agree in camera and time: scores on them do not measure new views."
         ));
     }
 }
@@ -347,8 +346,7 @@ fn skip_missing(take: &mut RawCapture, options: &CaptureOptions) -> Result<()> {
         )));
     }
     if missing.len() == all {
-        return Err(Error::input(what)
-            .remedy("Put them there, or say with --images NAME which folder of the capture holds them."));
+        return Err(Error::input(what).remedy("Put them there, or name the folder of the images with --images NAME."));
     }
     if share > options.max_missing {
         let allowed = (100.0 * share).ceil() / 100.0;
@@ -510,7 +508,7 @@ fn report_orientation(take: &mut RawCapture, as_stored: usize, by_size: [usize; 
     };
     say(
         as_stored,
-        "It is not applied: COLMAP's poses describe the pixels as stored. Otherwise say --set capture.exif=upright.",
+        "It is not applied: COLMAP's poses describe the pixels as stored. Otherwise use --set capture.exif=upright.",
     );
     say(by_size[0], "It is not applied: only the pixels as stored have the size of their intrinsics.");
     say(by_size[1], "It is applied: only the upright images have the size of their intrinsics.");
@@ -527,8 +525,7 @@ fn settle_orientation(capture: &mut Capture, unsure: &[usize]) {
         Some(false) => (Severity::Note, "It is not applied: points and features agree with the pixels as stored."),
         None => (
             Severity::Warning,
-            "It is applied; neither sizes nor points nor features say whether poses describe the upright images or the pixels \
-             as stored. If results are bad, say --set capture.exif=stored.",
+            "It is applied; neither sizes nor points nor features show whether poses describe the upright images or the pixels as stored. If results are bad, use --set capture.exif=stored.",
         ),
     };
     let what = format!("{} of {} images have an EXIF orientation. {what}", unsure.len(), capture.frames.len());
@@ -594,7 +591,7 @@ fn split(take: &mut RawCapture, cameras: &[Rig], options: &CaptureOptions) -> Re
             let train = of(Split::Train);
             return non_empty(train, by_convention, validation);
         }
-        // Photos of one moment are no rig: one of them is too few to measure on.
+        // Photos of one time are no rig: one of them is too few to measure on.
         None if take.timing == Timing::Moment && !take.named => HoldOut::Every(HOLD_EVERY),
         None if cameras.len() >= 2 && cameras.iter().all(|c| c.fixed) => {
             HoldOut::Cameras(vec![cameras[0].name.clone()])

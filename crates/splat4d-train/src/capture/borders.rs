@@ -113,8 +113,8 @@ fn views(capture: &Capture, frames: &[usize], firsts: &BTreeMap<usize, PathBuf>)
     views.into_iter().map(first).collect()
 }
 
-/// [height · width] what the lens of these frames recorded, 1 or 0; `None`: everything, or it cannot be told. Decodes no more
-/// images than it takes.
+/// [height · width] what the lens of these frames recorded, 1 or 0; `None`: everything, or undetermined. Decodes no
+/// more images than it takes.
 fn recorded(views: &[Frame]) -> Option<Vec<u8>> {
     if views.len() < FEWEST {
         return None;
@@ -222,7 +222,7 @@ mod tests {
     const WIDTH: usize = 40;
     const HEIGHT: usize = 30;
 
-    /// Images that are bright where told: of image, column and row.
+    /// Images that are bright where the function says: of image, column and row.
     fn images(count: usize, bright: impl Fn(usize, usize, usize) -> bool) -> Vec<Vec<bool>> {
         (0..count).map(|i| (0..WIDTH * HEIGHT).map(|p| bright(i, p % WIDTH, p / WIDTH)).collect()).collect()
     }

@@ -2,7 +2,7 @@
 //!
 //! COLMAP knows no time. Image names `cam/frame` or `cam_frameN` give camera and frame number; where each camera has
 //! only one registered image, the other images of that camera on disk share its pose: the usual way to calibrate a
-//! fixed rig is to reconstruct one instant.
+//! fixed rig is to reconstruct one time.
 
 mod multiview;
 mod unregistered;
@@ -60,7 +60,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     let names: Vec<&str> = shots.iter().map(|(name, _)| name.as_str()).collect();
     let base = if of_rig { root.clone() } else { lookup.folder_of(&names) };
     let mut files = files(&lookup, &base, &names)?;
-    // Names tell cameras apart by forward slashes.
+    // Names separate cameras by forward slashes.
     shots.iter_mut().for_each(|(name, _)| *name = name.replace('\\', "/"));
     if !of_rig {
         unregistered::settle(&base, &mut shots, &mut files, options, &mut account);

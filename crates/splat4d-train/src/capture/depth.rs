@@ -1,5 +1,5 @@
 //! Depth maps on disk: 16-bit grey PNG, `.npy` or OpenEXR; z along the camera's axis in scene units, or known up to a scale
-//! and a shift only, as networks that look at a single image tell it.
+//! and a shift only, as networks predict it from a single image.
 //!
 //! In memory a map is that of the pinhole view, [height, width], and 0 where nothing is known.
 
@@ -151,7 +151,7 @@ impl Map {
         }
         let values = match raster.samples {
             Samples::Sixteen(v) => v.into_iter().map(f32::from).collect(),
-            // What networks tell is often kept so; lengths are not to be told in 255 steps.
+            // Networks' depth is often stored so; 255 steps are too few for lengths.
             Samples::Eight(v) if file.kind != DepthKind::Metric => v.into_iter().map(f32::from).collect(),
             Samples::Eight(_) => return bad("the depth map has 8 bits, not 16".into()),
         };
@@ -174,7 +174,7 @@ fn check(map: &Map, file: &DepthFile) -> Result<()> {
         return Err(Error::input(what).at(file.path.display()).remedy("Write 0 where depth is not known"));
     }
     if map.values.iter().all(|v| *v == 0.0) {
-        return Err(Error::input("the depth map knows no pixel: all of it is 0")
+        return Err(Error::input("the depth map is empty: all of its pixels are 0")
             .at(file.path.display())
             .remedy("Leave the map out of the capture, or write it again"));
     }

@@ -79,8 +79,8 @@ fn spread(pairs: &[(Se3, Se3)]) -> f64 {
     (sum / pairs.len() as f64).sqrt()
 }
 
-/// The rotation that all cameras' axes agree on, then scale and translation of their places: axes tell more than places
-/// where cameras stand in a row.
+/// The rotation that all cameras' axes agree on, then scale and translation of their places: axes are more reliable
+/// than positions where cameras stand in a row.
 fn fit(pairs: &[(Se3, Se3)]) -> Sim3 {
     let mut cov = [[0.0; 3]; 3];
     for (a, b) in pairs {

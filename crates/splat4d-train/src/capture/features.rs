@@ -52,7 +52,7 @@ pub(crate) fn read(frame: &Frame, capture: &Capture) -> Result<Option<Features>>
         let what = format!("channel {channel} at pixel ({}, {}) is {}", pixel % width, pixel / width, values[i]);
         return Err(place(Error::input(what).remedy("Write 0 in all channels where nothing is known")));
     }
-    // Each pixel of the view takes the nearest one of the array: means across an edge are nobody's.
+    // Each pixel of the view takes the nearest one of the array: means across an edge belong to no surface.
     let (lens, k, down) = (Distortion::new(source.lens), &source.intrinsics, capture.downscale);
     let (to_width, to_height) = (source.width / down, source.height / down);
     let scale = [width as f64 / source.width as f64, height as f64 / source.height as f64];

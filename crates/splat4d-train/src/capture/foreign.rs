@@ -23,7 +23,7 @@ use std::path::{Path, PathBuf};
 struct Export {
     /// Its file (or folder) in a capture's folder; `None`: it is not there.
     find: fn(&Path) -> Option<PathBuf>,
-    /// Whether a path that somebody gives is such a file.
+    /// Whether a given path is such a file.
     is: fn(&Path) -> bool,
     /// Reads the capture in a folder from that file.
     read: fn(&Path, &Path, &CaptureOptions) -> Result<RawCapture>,

@@ -137,7 +137,7 @@ pub trait Frames: Send + Sync {
     fn has_depth(&self) -> bool {
         false
     }
-    /// How far matches of frames of moving cameras agree with a static scene; `None`: that cannot be told.
+    /// How far matches of frames of moving cameras agree with a static scene; `None`: undetermined.
     fn agreement(&self) -> Option<Agreement> {
         None
     }
@@ -161,7 +161,7 @@ pub(crate) fn half_frame(frames: impl Iterator<Item = (usize, f64)>) -> f64 {
     0.5 * gaps.get(gaps.len() / 2).copied().unwrap_or(0.0)
 }
 
-/// Moments of a rig whose shutters do not open at once: times less than half a frame apart are one.
+/// Times of a rig whose shutters do not open at once: times less than half a frame apart are one.
 pub(crate) fn moments(frames: impl Iterator<Item = (usize, f64)> + Clone) -> usize {
     let half = half_frame(frames.clone());
     let mut times: Vec<f64> = frames.map(|(_, t)| t).collect();

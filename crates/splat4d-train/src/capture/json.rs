@@ -28,7 +28,7 @@ pub(super) fn read(path: &Path) -> Result<Value> {
     let text = text::decode(&bytes).map_err(|e| e.at(path.display()))?;
     serde_json::from_str(&text).map_err(|e| {
         let remedy = if ["NaN", "Infinity"].iter().any(|word| text.contains(word)) {
-            "It holds NaN or Infinity, which JSON does not know: calibrate that camera again or leave it out."
+            "It holds NaN or Infinity, which JSON does not allow: calibrate that camera again or leave it out."
         } else if e.is_eof() {
             "The file looks truncated: copy or export it again."
         } else {
@@ -170,7 +170,7 @@ impl<'a> Node<'a> {
                 let error = self.error("the last row of the pose is not 0 0 0 1");
                 return Err(error.remedy(match by_columns {
                     true => {
-                        "It is written column by column, with its translation in the last row: say --poses transposed."
+                        "It is written column by column, with its translation in the last row: use --poses transposed."
                     }
                     false => "Write poses row by row: a transposed matrix has its translation there.",
                 }));

@@ -159,7 +159,7 @@ fn is_capture(folder: &Path) -> bool {
 
 /// Says which of several layouts was read, why, and how to choose another.
 fn remark(take: &mut RawCapture, path: &Path, marker: &str, others: &[&str]) {
-    // Files of one family tell of the same images, and a model next to poses was asked for its points.
+    // Files of one family describe the same images, and a model next to poses was asked for its points.
     let family = [transforms::TRAIN, transforms::ALL];
     let (same, foreign): (Vec<&str>, Vec<&str>) = others
         .iter()
@@ -168,7 +168,7 @@ fn remark(take: &mut RawCapture, path: &Path, marker: &str, others: &[&str]) {
     let list = |names: &[&str]| names.join(", ");
     let choose = |other: &str| format!("To read another, give its path: {}.", path.join(other).display());
     if let Some(other) = same.first() {
-        let what = format!("{marker} is read and {other} is not: the former says which images are held out.");
+        let what = format!("{marker} is read and {other} is not: the former lists the held-out images.");
         take.notes.push(format!("{what} {}", choose(other)));
     }
     if let Some(other) = foreign.first() {

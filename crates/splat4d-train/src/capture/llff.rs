@@ -9,7 +9,7 @@ use splat4d::scene::time::DEFAULT_FPS;
 use splat4d::{Error, Result};
 use std::path::{Path, PathBuf};
 
-/// Reads poses and images; names say whether they show one moment.
+/// Reads poses and images; names say whether they show one time.
 pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<RawCapture> {
     let fps = options.fps.unwrap_or(DEFAULT_FPS);
     let rows = n3dv::rows(marker)?;

@@ -21,7 +21,7 @@ const MASK_WORDS: [&str; 3] = ["mask", "matte", "segment"];
 const IMAGE_FOLDERS: [&str; 3] = ["images", "input", "image"];
 /// How names of folders begin that hold other things than images, though their files may be called like these.
 const NO_IMAGES: [&str; 5] = ["depth", "normal", "seg", "flow", "."];
-/// Names of images compared when a folder is looked for: enough to tell folders apart.
+/// Names of images compared when a folder is looked for: enough to distinguish folders.
 const SAMPLE: usize = 32;
 /// Endings of images, readable ones first; a name with one of the others may be an image converted since.
 const KNOWN_ENDINGS: &[&str] = &[

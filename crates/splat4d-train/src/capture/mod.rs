@@ -120,7 +120,7 @@ pub struct Frame {
     pub source: Camera,
     /// Seconds on the scene clock.
     pub time: Time,
-    /// Frame number in the take, from 0; frames of several cameras with one number belong to one instant unless the
+    /// Frame number in the take, from 0; frames of several cameras with one number belong to one time unless the
     /// cameras have time offsets.
     pub index: usize,
     /// The image file.
@@ -203,9 +203,9 @@ pub struct Capture {
     pub kind: CaptureKind,
     /// The cameras; a moving camera is one entry that is not `fixed`.
     pub cameras: Vec<Rig>,
-    /// Whether the data set, or the names of its images (`cam07`), tell cameras apart; else an entry is one camera's
+    /// Whether the data set, or the names of its images (`cam07`), separate cameras; else an entry is one camera's
     /// photo of a
-    /// moment, or stands for many.
+    /// time, or stands for many.
     pub named: bool,
     /// All images, or those that were asked for ([`CaptureOptions::frames`]).
     pub frames: Vec<Frame>,
@@ -264,7 +264,7 @@ struct RawCapture {
     take: Extent,
     /// The first image of each camera, where the reader listed a part of the take.
     firsts: BTreeMap<usize, PathBuf>,
-    /// The data set's convention, where it is not told by the frames' splits.
+    /// The data set's convention, where the frames' splits do not give it.
     hold_out: Option<HoldOut>,
     fps: f64,
     points: Option<PointCloud>,

@@ -144,7 +144,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
             let own = about.get(id).and_then(|n| n.opt(key)?.map(|n| n.count()).transpose());
             own.map_err(|e| e.at(path.display()))
         };
-        // Warp codes count moments; later takes say it in so many words.
+        // Warp codes count times; later takes say it in so many words.
         let index = match (of("time_id")?, of("warp_id")?, of("appearance_id")?) {
             (Some(n), ..) | (_, Some(n), _) | (.., Some(n)) => n,
             _ => {
@@ -172,7 +172,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     let rate = match (options.fps, stated) {
         (None, None) => format!("The layout states no frame rate: frames {first} to {last} at {fps} a second"),
         (None, Some(_)) => format!("Frames {first} to {last} at the {fps} a second of extra.json"),
-        (Some(_), _) => format!("Frames {first} to {last} at {fps} a second, as told"),
+        (Some(_), _) => format!("Frames {first} to {last} at {fps} a second, as given"),
     };
     account.add(Aspect::Assumed, Severity::Note, format!("{rate}: {length:.3} s."));
     if left_out > 0 {

@@ -12,14 +12,14 @@ impl Capture {
     ///
     /// A frame is observed where its time is at most first + share · (last − first) of the training and held-out frames.
     /// With later images go what belongs to them: initial points with later times, and optical flow into the future. A
-    /// capture's own points without times are taken at their word. Errors: one moment, a share that leaves nothing.
+    /// capture's own points without times are taken at their word. Errors: one time, a share that leaves nothing.
     pub fn observe(&mut self, share: f64, near: f64) -> Result<()> {
         let place = |e: Error| e.at(format!("{} (capture.observe = {share})", self.root.display()));
         let times = || self.train.iter().chain(&self.held).map(|&i| self.frames[i].time.0);
         let (first, last) = times().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), t| (a.min(t), b.max(t)));
         if last <= first {
             return Err(place(Error::input("all images of the capture have the same time, so there is no future"))
-                .remedy("Leave --observe away, or give a moving take"));
+                .remedy("Leave --observe away, or give a capture with motion"));
         }
         if !(share > 0.0 && share < 1.0) {
             return Err(place(Error::input("the observed share leaves nothing to train on, or no future"))

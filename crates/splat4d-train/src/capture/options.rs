@@ -84,9 +84,9 @@ const NEAR: f64 = 0.2;
 choices! {
     /// What images are that state no times.
     pub enum Sequence {
-        /// As their names tell: a film where they are numbered like its frames, else photos.
+        /// By their names: a film where they are numbered like its frames, else photos.
         Auto = "auto",
-        /// Photos of one moment.
+        /// Photos of one time.
         Photos = "photos",
         /// The frames of a film, or of one for each camera of a rig.
         Video = "video",

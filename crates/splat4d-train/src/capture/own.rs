@@ -139,7 +139,7 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<R
 }
 
 /// Whether the part that is wanted can be read by itself: of fixed cameras, which are held out as a whole or not at all.
-/// What else there is can only be told from the whole.
+/// The rest can only be determined from the whole.
 fn in_part(top: &Node<'_>, nodes: &[Node<'_>], told: Option<&HoldOut>, options: &CaptureOptions) -> Result<bool> {
     let by_camera = match told {
         None => nodes.len() > 1,
@@ -348,7 +348,7 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
             ..RawFrame::new((context.camera, index, time + offset), source, image)
         });
     }
-    // Nobody knows where the pixels of the last frame go.
+    // Where the pixels of the last frame go is unknown.
     if let Some(last) = frames[first..].last_mut() {
         last.flow = None;
     }

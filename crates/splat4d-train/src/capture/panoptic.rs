@@ -72,7 +72,7 @@ fn read_meta(
     for t in 0..k.len() {
         let (k, w2c, names, ids) = (k[t].list()?, w2c[t].list()?, names[t].list()?, ids[t].list()?);
         if [w2c.len(), names.len(), ids.len()].iter().any(|&n| n != k.len()) {
-            let what = format!("at instant {t} the lists k, w2c, fn and cam_id are not equally long");
+            let what = format!("at time {t} the lists k, w2c, fn and cam_id are not equally long");
             return Err(top.error(what).remedy("Export the file again."));
         }
         for c in 0..k.len() {

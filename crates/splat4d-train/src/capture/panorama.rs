@@ -42,7 +42,7 @@ pub(super) fn split(take: &mut RawCapture, hold_out: Option<&HoldOut>) -> Result
     }
     let frames = std::mem::take(&mut take.frames);
     let names = std::mem::take(&mut take.cameras);
-    // Places of one moment without a rig: whole panoramas are held out, unless something else is asked for.
+    // Places of one time without a rig: whole panoramas are held out, unless something else is asked for.
     let by_place = take.timing == Timing::Moment
         && !take.named
         && hold_out.or(take.hold_out.as_ref()).is_none()

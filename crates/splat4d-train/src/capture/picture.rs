@@ -76,7 +76,7 @@ fn is_jpeg(bytes: &[u8]) -> bool {
     bytes.starts_with(&[0xFF, 0xD8])
 }
 
-/// Bytes at the start of a file that tell its format.
+/// Bytes at the start of a file that identify its format.
 const HEAD: usize = 64;
 
 /// What to do with images of other formats.
@@ -231,7 +231,7 @@ pub(super) fn check_size(path: &Path, size: (usize, usize), camera: &Camera) -> 
     );
     Err(Error::input(what).at(path.display()).remedy(
         "Give the intrinsics of these images, or resize them. Where they have an EXIF orientation, --set \
-         capture.exif=stored or upright says which pixels the intrinsics describe.",
+         capture.exif=stored or upright selects the pixels that the intrinsics describe.",
     ))
 }
 
@@ -317,7 +317,7 @@ fn decode_jpeg(
     admit(path, (width, height), swaps_sides(orientation), expected)?;
     let pixels = decoder.decode().map_err(|e| broken(path, e))?;
     let buffer = image::RgbImage::from_raw(width as u32, height as u32, pixels);
-    let picture = buffer.ok_or_else(|| broken(path, "fewer pixels than its header says"))?;
+    let picture = buffer.ok_or_else(|| broken(path, "fewer pixels than its header states"))?;
     Ok(upright(DynamicImage::ImageRgb8(picture), orientation))
 }
 

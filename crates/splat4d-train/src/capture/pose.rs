@@ -21,7 +21,7 @@ pub(super) const FARTHEST: f64 = 1e12;
 /// Shortest and longest focal length that is accepted, and farthest principal point, pixels: their products with
 /// [`FARTHEST`] and their reciprocals stay finite in 32-bit floats.
 const FOCAL: std::ops::RangeInclusive<f64> = 1e-3..=1e9;
-/// Latest time of an image that is accepted, seconds (thirty thousand years): frames of it are still told apart.
+/// Latest time of an image that is accepted, seconds (thirty thousand years): frames of it remain distinct.
 pub(super) const LATEST: f64 = 1e12;
 /// Most pixels of an image (134 million): decoding one takes below 1 GiB.
 pub(super) const MAX_PIXELS: usize = 1 << 27;

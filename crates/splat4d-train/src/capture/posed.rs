@@ -22,7 +22,7 @@ const SAME: f64 = 1e-6;
 
 /// The cameras of a COLMAP reconstruction (the folder of its files, or one above), and its points.
 ///
-/// Errors: no reconstruction, damage, a camera in several places.
+/// Errors: no reconstruction, damage, a camera with several positions.
 pub fn colmap_cameras(folder: &Path) -> Result<(Vec<PosedCamera>, Option<PointCloud>)> {
     let (shots, points) = colmap::shots(folder)?;
     Ok((of_pictures(&shots).map_err(|e| e.at(folder.display()))?, points))
@@ -35,7 +35,7 @@ pub fn is_colmap(folder: &Path) -> bool {
 
 /// The cameras of a `transforms.json` (Nerfstudio, instant-ngp, Blender), whose images need not be there.
 ///
-/// Errors: no such file, keys that are missing or wrong, a camera in several places.
+/// Errors: no such file, keys that are missing or wrong, a camera with several positions.
 pub fn transforms_cameras(path: &Path) -> Result<Vec<PosedCamera>> {
     let value = json::read(path)?;
     let root = path.parent().unwrap_or(Path::new("."));
@@ -63,7 +63,7 @@ fn of_pictures(shots: &[(String, Camera)]) -> Result<Vec<PosedCamera>> {
             None => out.push(PosedCamera { name, camera: camera.clone() }),
             Some(known) if alike(&known.camera, camera) => {}
             Some(_) => {
-                return Err(Error::input(format!("camera {name:.80} is in several places, as {path:.200} shows"))
+                return Err(Error::input(format!("camera {name:.80} has several positions, as {path:.200} shows"))
                     .remedy("A calibration describes fixed cameras: give a reconstruction of one time."));
             }
         }

@@ -18,13 +18,13 @@ pub struct Finding {
     pub remedy: String,
 }
 
-/// Below this many views of an instant, surfaces are not pinned down between them.
+/// Below this many views of a time, surfaces are not pinned down between them.
 const FEW_CAMERAS: usize = 6;
 /// Narrower rigs see little parallax, degrees.
 const NARROW_DEGREES: f64 = 20.0;
 /// Seconds from which f32 has steps of a millisecond.
 const FAR_CLOCK: f64 = 1e4;
-/// Gaps between instants may differ by this factor before the clock is called uneven.
+/// Gaps between times may differ by this factor before the clock is called uneven.
 const UNEVEN: f64 = 1.5;
 /// Angle and relative distance below which two cameras add little to each other.
 const CLOSE_DEGREES: f64 = 0.5;
@@ -93,7 +93,7 @@ impl Capture {
             let remedy = match aspect(warning) {
                 // The remark says what to do.
                 Some(_) => "",
-                None => "docs/capture-format.md says what the layout expects.",
+                None => "See docs/capture-format.md for the layout.",
             };
             let found = finding(Severity::Warning, warning.clone(), remedy);
             findings.push(Finding { aspect: aspect(warning), ..found });
@@ -186,7 +186,7 @@ impl Capture {
         }
         findings.push(finding(
             Severity::Note,
-            format!("The instants are unevenly spaced: gaps from {low:.4} s to {high:.4} s."),
+            format!("The times are unevenly spaced: gaps from {low:.4} s to {high:.4} s."),
             "Check frame numbers and time offsets; missing frames and unsynchronised cameras blur fast motion.",
         ));
     }
@@ -209,7 +209,7 @@ impl Capture {
             findings.push(finding(
                 Severity::Warning,
                 format!("Cameras recorded at other times than most others: {}.", first_names(&late)),
-                "Check their clocks: what moves is seen by them at no time that others see.",
+                "Check their clocks: they have no time in common with the other cameras.",
             ));
         }
     }

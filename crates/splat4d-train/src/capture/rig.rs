@@ -60,7 +60,7 @@ pub(super) struct Naming {
     pub cameras: Vec<String>,
     /// For each image its camera and its frame number, counted from the smallest.
     pub frames: Vec<(usize, usize)>,
-    /// Whether the names tell cameras apart (`cam/frame`, `cam_frameN`), or all belong to one.
+    /// Whether the names separate cameras (`cam/frame`, `cam_frameN`), or all belong to one.
     pub told: bool,
     /// The place of each image among those of its camera, where no camera's numbers reach into those of another.
     pub ranks: Option<Vec<usize>>,

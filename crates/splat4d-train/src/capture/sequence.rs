@@ -1,4 +1,4 @@
-//! Cameras and frame numbers of images that say nothing of time: one moment, or the frames of films, by their names.
+//! Cameras and frame numbers of images that say nothing of time: one time, or the frames of films, by their names.
 
 use super::{Sequence, rig};
 use splat4d::math::Se3;
@@ -12,7 +12,7 @@ pub enum Timing {
     Told,
     /// It states none; the numbers in image names count frames.
     Numbers,
-    /// It states none; all images show one moment.
+    /// It states none; all images show one time.
     Moment,
 }
 
@@ -104,7 +104,7 @@ pub(super) fn order(
     }
 }
 
-/// One moment: every image has a place of its own, and is its own camera.
+/// One time: every image has a place of its own, and is its own camera.
 pub(super) fn moment(names: &[&str]) -> FrameOrder {
     let stem = |name: &str| name.rsplit_once('.').map_or(name, |(stem, _)| stem).to_owned();
     let short = |name: &str| stem(name.rsplit_once('/').map_or(name, |(_, file)| file));

@@ -223,7 +223,7 @@ impl ImageStore {
         queue.clear();
         queue.extend(frames.iter().copied().filter(|f| !kept.contains_key(f) && !loading.contains(f)));
         if queue.is_empty() {
-            // Once everything is kept, nobody is woken for nothing.
+            // Once everything is kept, no thread is woken for nothing.
             return;
         }
         drop(state);

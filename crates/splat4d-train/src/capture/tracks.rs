@@ -39,7 +39,7 @@ impl Tracks {
             };
             if frame >= frames {
                 let what = format!("the track goes to frame {frame}, the camera has {frames}");
-                return bad(what, "Frames are numbered from 0, whatever the images' names say");
+                return bad(what, "Frames are numbered from 0, independent of the images' names");
             }
             let inside = (0..2).all(|k| place[k] >= 0.0 && place[k] < size[k] as f32);
             if !inside {

@@ -161,7 +161,7 @@ impl Document {
         }
         let nodes = top.get("frames")?.list()?;
         let bases = lookup.bases();
-        // Where no size is stated, an image that is there tells that of missing ones.
+        // Where no size is stated, an image that is there gives that of missing ones.
         let there = |node: &Node<'_>| {
             let name = node.value.get("file_path")?.as_str()?;
             picture::header(&lookup.image(&bases, name).ok()??).ok()

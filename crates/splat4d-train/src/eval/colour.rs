@@ -3,7 +3,7 @@
 //! A view is a handful of sums (the normal equations of the fit), whatever its size; the squared error after any such
 //! matrix is a quadratic form of them. So no image is looked at twice, and a camera of a thousand views costs some 200
 //! bytes each. What the matrix makes of a render is not clamped again, which sums could not do: the true error is never
-//! above the one told, since the truth lies in `[0,1]`.
+//! above the given one, since the truth lies in `[0,1]`.
 
 use splat4d::math::cholesky::Cholesky;
 use splat4d::scene::Planes;
@@ -79,10 +79,11 @@ impl ColourSums {
         self.values += other.values;
     }
 
-    /// The matrix with the least squared error; `None` where the colours do not tell one (a grey image, a single
+    /// The matrix with the least squared error; `None` where the colours do not determine one (a grey image, a single
     /// colour, NaN).
     ///
-    /// Source: FreeTimeGS++ 2026 measures renders with an affine colour correction a camera, to tell colour from shape.
+    /// Source: FreeTimeGS++ 2026 measures renders with an affine colour correction a camera, to separate colour from
+    /// shape.
     pub(crate) fn fit(&self) -> Option<ColourMatrix> {
         // xx Δ = xe; Δ is what differs from the identity.
         let factor = Cholesky::with_pivots(IN, self.xx.as_flattened().to_vec(), SINGULAR)?;

@@ -1,6 +1,6 @@
-//! Localisation: from where and when an image was taken, told by a scene that stays as it is.
+//! Localisation: pose and time of an image in a fixed scene.
 //!
-//! The best of some starts, at some moments, are found in small images. Each is then moved to where the scene
+//! The best of some starts, at some times, are found in small images. Each is then moved to where the scene
 //! differs least
 //! from the image, by Gauss and Newton's method with damping (Levenberg and Marquardt) and a robust loss, in larger and
 //! larger images: there are six unknowns of the pose, one of the time where the scene moves, and one of the focal
@@ -18,13 +18,13 @@ use splat4d::scene::{Camera, Planes, Time};
 
 /// Longer sides of images, small to large, and starts that are still followed in each.
 const LEVELS: [(usize, usize); 4] = [(48, 6), (96, 3), (192, 1), (384, 1)];
-/// Moments of the clip at which a start is tried.
+/// Times of the clip at which a start is tried.
 const MOMENTS: usize = 12;
 /// Starts that are tried, evenly chosen.
 const MOST_STARTS: usize = 128;
 /// Steps of Newton's method in images of a size, at most.
 const STEPS: usize = 15;
-/// Pixels by which what is seen moves when a derivative is taken, and the movement that is no longer worth a step.
+/// Pixels by which what is seen moves when a derivative is taken, and the movement below which no step is made.
 const DIFFERENCE: f64 = 0.5;
 const SMALL: f64 = 0.01;
 /// Damping at first, its factor from step to step, and how often a step is tried again with more of it.
@@ -140,7 +140,7 @@ pub fn localise(
 }
 
 impl Search<'_> {
-    /// The starts at their best moments, in the smallest images; the best starts first.
+    /// The starts at their best times, in the smallest images; the best starts first.
     fn tried(&mut self, picture: &Planes<f32>, starts: &[Camera]) -> Result<Vec<Candidate>> {
         let [first, last] = self.scene.clip;
         let moment = |k: usize| first + (k as f64 + 0.5) * (last - first) / MOMENTS as f64;

@@ -64,7 +64,7 @@ pub struct CameraScores {
     /// Its views, by their place in [`Split::views`].
     pub places: Vec<usize>,
     /// The affine map of colours, render to truth, with the least squared error over all these views; `None` where they
-    /// tell none (grey images), and the identity stands for it.
+    /// determine none (grey images), and the identity is used.
     pub colour: Option<ColourMatrix>,
 }
 
@@ -183,7 +183,7 @@ pub struct Report {
     pub iteration: u64,
     /// What the figures hold for.
     pub conditions: Conditions,
-    /// The views that were asked for: those held out, unless told otherwise.
+    /// The views that were asked for: those held out, by default.
     pub test: Split,
     /// Training cameras, written apart under `train`; `None` where they were not evaluated.
     pub train: Option<Split>,

@@ -14,7 +14,7 @@
 //! PSNR is clamped to `[0,1]`, not rounded, per image, then the mean. `PSNR-cc` is the same after the affine colour
 //! matrix
 //! that suits all measured views of the image's camera best: what remains is not a matter of white balance. It is
-//! told next to the plain one and never in its place, for it has seen the truth. The dynamic region (pixels that
+//! reported next to the plain one and never instead of it, for it has seen the truth. The dynamic region (pixels that
 //! leave their
 //! camera's temporal mean) and flicker are defined for fixed cameras only. Where an image was undistorted, pixels
 //! without an original take the truth's colour, so that they count as right in every metric.

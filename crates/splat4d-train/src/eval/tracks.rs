@@ -4,7 +4,7 @@
 //! in benchmarks of point tracking: the few Gaussians nearest to it then carry it on by their mean displacement, and the
 //! error is its distance to the truth at all later frames. Next to it stands the error of the nearest Gaussian
 //! itself, its
-//! distance at the first frame included (the median trajectory error of Luiten et al. 2024). Moments at which none of a
+//! distance at the first frame included (the median trajectory error of Luiten et al. 2024). Times at which none of a
 //! point's Gaussians is alive are not counted, but the share that is counted is reported.
 
 use crate::capture::Capture;

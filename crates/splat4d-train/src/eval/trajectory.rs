@@ -91,9 +91,12 @@ pub fn trajectory_error(found: &Capture, truth: &Capture) -> Result<TrajectoryEr
         }
     }
     let few = || {
-        Error::input(format!("{} of the run's cameras have a truth; {FEWEST} that stand apart are needed", names.len()))
-            .at(truth.root.display())
-            .remedy("Give the capture whose cameras have the same names and images as those that were trained on")
+        Error::input(format!(
+            "{} of the run's cameras have a truth; {FEWEST} at different positions are needed",
+            names.len()
+        ))
+        .at(truth.root.display())
+        .remedy("Give the capture whose cameras have the same names and images as those that were trained on")
     };
     if names.len() < FEWEST {
         return Err(few());

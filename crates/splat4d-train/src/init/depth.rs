@@ -1,6 +1,6 @@
 //! Points that depth maps show: pixels of training images, unprojected. A point through which an image of another time
-//! sees what is farther away belongs to something that moves: it lives about its moment, and begins with the velocity that
-//! optical flow and the depth at both of its ends tell ([`super::scene_flow`]). All others stand still.
+//! sees what is farther away belongs to something that moves: it lives about its time, and begins with the velocity
+//! that optical flow and the depth at both of its ends determine ([`super::scene_flow`]). All others stand still.
 
 use super::map::Map;
 use super::{Seeds, scene_flow};
@@ -16,8 +16,8 @@ const VIEWS: usize = 100;
 const CANDIDATES: usize = 4;
 /// Pixels of an image of which is asked whether they move, at most.
 const ASKED: usize = 20_000;
-/// As a share of the wanted points, those on what moves that are alive at a moment: lives are as wide as that takes, within
-/// bounds in times between moments. Shorter ones leave holes between moments; over longer ones velocities change.
+/// As a share of the wanted points, those on dynamic regions that are alive at a time: lives are as wide as that takes,
+/// within bounds in times between times. Shorter ones leave holes between times; over longer ones velocities change.
 const ALIVE_SHARE: f64 = 0.15;
 const LIFE: [f64; 2] = [0.5, 2.0];
 
@@ -32,7 +32,7 @@ struct Candidate {
 }
 
 /// About `count` points of metric depth maps that stand still; none where there are no such maps. With `moving`, up to as
-/// many again on what moves: few pixels show it, and at every moment others. They are taken from every image that is
+/// many again on dynamic regions: few pixels show it, and at every time others. They are taken from every image that is
 /// looked at.
 pub(crate) fn points(frames: &dyn Frames, count: usize, moving: bool, rng: Rng) -> Result<Seeds> {
     let step = frames.len().div_ceil(VIEWS).max(1);
@@ -177,7 +177,7 @@ mod tests {
         assert!(life >= 0.5 * gap && life <= 2.0 * gap, "{life}");
         let none = points(&deep.0, 400, true, Rng::new(1, "test", 0)).unwrap();
         assert!(none.is_empty(), "no maps, no points");
-        // Gaussians that live through the whole clip begin with what moves at one moment of it.
+        // Gaussians that live through the whole clip begin with what moves at one time of it.
         let recipe = Recipe::default().with(|r| r.init.count = 400);
         let plan = TrainContext { clip: [deep.0.time_of(0), deep.0.time_of(2)], times: 3, fps: 10.0, ..recipe.plan() };
         let one = super::super::one_moment(&plan, &recipe.init, &deep, None).unwrap();

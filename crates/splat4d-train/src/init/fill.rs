@@ -1,7 +1,7 @@
 //! Points between the points: where a capture brings few, every camera sees surfaces that go on from one to the next.
 //!
 //! Structure from motion finds points where there is texture. Gaussians that have to spread from there over plain walls
-//! settle wherever the training cameras cannot tell, as haze in front of views that were not trained on. Here every
+//! settle wherever the training cameras cannot see them, as haze in front of views that were not trained on. Here every
 //! training camera's image is covered by a lattice; the inverse depth of a lattice pixel is that of the plane through
 //! the points seen around it (1/z of a plane is affine in pixels).
 

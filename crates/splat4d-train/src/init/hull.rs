@@ -1,5 +1,5 @@
-//! Visual hull: a random point is kept where (almost) every camera that sees it at that moment has it in its silhouette: the
-//! mask, or where fixed cameras have none, what differs from what stands still.
+//! Visual hull: a random point is kept where (almost) every camera that sees it at that time has it in its silhouette:
+//! the mask, or where fixed cameras have none, what differs from the static background.
 
 use super::Seeds;
 use super::volume::Volume;
@@ -21,8 +21,8 @@ const MARGIN: f64 = 0.05;
 /// it looks like what is behind it (0.25 gave more ghosts: 0.3 dB less where nothing moves).
 const MISSES: f64 = 0.05;
 const MOVING_MISSES: f64 = 0.15;
-/// Points of what moves, of those that are asked for: all of them took Gaussians away from what stands still (0.4 dB less there,
-/// as good where things move).
+/// Points of dynamic regions, of those that are asked for: all of them took Gaussians away from the static background
+/// (0.4 dB less there, as good where things move).
 const MOVING_SHARE: f64 = 0.3;
 /// What moves is grown by so many pixels, since it hides the edges of what is behind it.
 const GROWN: usize = 1;
@@ -33,7 +33,7 @@ const MOVING_CAMERAS: usize = 5;
 const MOVING_PICTURE: f64 = 0.5;
 /// A point must be seen by at least so many images.
 const MIN_VIEWS: usize = 2;
-/// One moving camera: images of so many moments around stand in for other cameras.
+/// One moving camera: images of so many times around stand in for other cameras.
 const MONOCULAR_PICTURES: usize = 60;
 
 /// About `count` points over all `times`. For a still scene (`moving` false) masks of the first time stand for all.
@@ -47,7 +47,7 @@ pub(crate) fn carve(
 ) -> Result<Seeds> {
     let each = count.div_ceil(times.len().max(1));
     let mut out = Seeds::default();
-    // A single camera sees one side at a time: all moments together carve one hull, good for every moment.
+    // A single camera sees one side at a time: all times together carve one hull, good for every time.
     let monocular = pictures_near(frames, times[0]).1.len() < MIN_VIEWS;
     for (k, &t) in times.iter().enumerate() {
         let (near, mut pictures) = pictures_near(frames, t);
@@ -106,7 +106,8 @@ fn spread(frames: &dyn Frames) -> Vec<usize> {
     (0..frames.len()).step_by(step).collect()
 }
 
-/// Points on what moves over all `times`, [`MOVING_SHARE`] of `count`, of fixed cameras without masks; none where cameras move or are few.
+/// Points on dynamic regions over all `times`, [`MOVING_SHARE`] of `count`, of fixed cameras without masks; none where
+/// cameras move or are few.
 pub(crate) fn carve_moving(
     frames: &dyn Frames,
     volume: &Volume,
@@ -152,7 +153,7 @@ fn grown(mask: &[bool], width: usize) -> Vec<bool> {
     (0..mask.len()).map(any).collect()
 }
 
-/// What one camera shows at a moment, by pixels.
+/// What one camera shows at a time, by pixels.
 struct Silhouette<'a> {
     camera: &'a Camera,
     inside: &'a (dyn Fn(usize) -> bool + Sync),
@@ -170,7 +171,7 @@ struct Silhouettes<'a> {
     shown: &'a Shown<'a>,
 }
 
-/// Carves one moment in rounds: each looks only in the box of what the last one kept, so that a small object in a large
+/// Carves one time in rounds: each looks only in the box of what the last one kept, so that a small object in a large
 /// volume still gets its points.
 fn carve_moment(silhouettes: &Silhouettes<'_>, volume: &Volume, wanted: usize, rng: Rng) -> Result<Seeds> {
     let mut low = volume.center.map(|c| c - volume.radius);

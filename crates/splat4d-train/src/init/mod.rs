@@ -123,7 +123,7 @@ pub(crate) const COUNT: usize = 10_000;
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Source {
     /// The capture's points and those of its depth maps; without maps, where points are few or leave out a part of what cameras
-    /// see, those that its images show, and more between them; the hull of masks, or of what moves before fixed
+    /// see, those that its images show, and more between them; the hull of masks, or of dynamic regions before fixed
     /// cameras; else at random.
     Auto,
     /// The capture's points.
@@ -183,7 +183,7 @@ const SMALLEST_SCALE: f64 = 1e-5;
 /// Softness of an interval life's ends at the start, frames.
 const INITIAL_SOFTNESS_FRAMES: f64 = 1.0;
 
-/// Half-width and softness of an interval life at the start where the point's moment is not known, clips: alive in the
+/// Half-width and softness of an interval life at the start where the point's time is not known, clips: alive in the
 /// middle, three quarters there at the ends, and free to move both.
 const OPEN_LIFE: (f64, f64) = (0.3, 0.25);
 
@@ -267,7 +267,7 @@ pub(crate) fn one_moment(
     let single = InitSettings { keyframes: settings.keyframes.max(1), ..settings.clone() };
     let mut out = seeds(plan, &single, frames, points, true)?;
     if out.life.take().is_some() {
-        // Depth maps show every moment: of what moves only one is wanted.
+        // Depth maps show every time: of dynamic regions only one is wanted.
         let middle = 0.5 * (plan.clip[0] + plan.clip[1]);
         let nearest =
             out.times.iter().flatten().copied().min_by(|a, b| (a - middle).abs().total_cmp(&(b - middle).abs()));
@@ -277,7 +277,7 @@ pub(crate) fn one_moment(
     Ok(out)
 }
 
-/// One layer of Gaussians at the seeds: isotropic, as large as the distance to their neighbours of the same moment.
+/// One layer of Gaussians at the seeds: isotropic, as large as the distance to their neighbours of the same time.
 pub fn scene(
     plan: &TrainContext,
     settings: &InitSettings,
@@ -305,7 +305,7 @@ pub fn scene(
             let (center, mut width) = beginnings[i].life;
             let mut softness = INITIAL_SOFTNESS_FRAMES / plan.fps;
             if life == LifeKind::Interval && seeds.times[i].is_none() {
-                // Flat ends outside the clip would never be felt: nobody could learn to come or go.
+                // Flat ends outside the clip would have no gradient: no Gaussian could learn to appear or vanish.
                 (width, softness) = (OPEN_LIFE.0 * plan.seconds(), OPEN_LIFE.1 * plan.seconds());
             }
             params[LIFE].write(i, 0, [center as f32, width.ln() as f32]);
@@ -336,7 +336,7 @@ fn first_life(plan: &TrainContext, settings: &InitSettings, seeds: &Seeds, i: us
     }
 }
 
-/// Root mean square distance to the three nearest seeds of the same moment (Kerbl et al. 2023), clamped.
+/// Root mean square distance to the three nearest seeds of the same time (Kerbl et al. 2023), clamped.
 fn scales(seeds: &Seeds, plan: &TrainContext) -> Vec<f64> {
     let mut order: Vec<usize> = (0..seeds.len()).collect();
     let key = |i: usize| seeds.times[i].unwrap_or(f64::NEG_INFINITY);
@@ -346,7 +346,7 @@ fn scales(seeds: &Seeds, plan: &TrainContext) -> Vec<f64> {
     while let Some(&first) = rest.first() {
         let count = rest.partition_point(|&i| key(i) == key(first));
         let (group, tail) = rest.split_at(count);
-        // Random points have a moment each; then all of them are one group.
+        // Random points have a time each; then all of them are one group.
         let group = if count < 8 { rest } else { group };
         let points: Vec<[f32; 3]> = group.iter().map(|&i| seeds.points[i].map(|x| x as f32)).collect();
         for (&i, d) in group.iter().zip(mean_square_distance(&points)) {

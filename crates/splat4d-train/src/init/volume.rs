@@ -58,7 +58,7 @@ const SEEN_SHARE: f64 = 0.25;
 /// Candidates a wanted point, at most.
 const CANDIDATES: usize = 32;
 
-/// Uniform points of the box where cameras look; with `clip`, each at a random moment of it. Fewer than `count` if
+/// Uniform points of the box where cameras look; with `clip`, each at a random time of it. Fewer than `count` if
 /// cameras see hardly any of the box.
 pub(crate) fn random(frames: &dyn Frames, volume: &Volume, count: usize, clip: Option<[f64; 2]>, rng: Rng) -> Seeds {
     let asked = frames.len().min(ASKED);

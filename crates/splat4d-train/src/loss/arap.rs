@@ -30,8 +30,8 @@ pub(crate) fn rotations<F: Real>(graph: &Graph<F>, first: &[[F; 3]], second: &[[
     (0..n).into_par_iter().with_min_len(64).map(one).collect()
 }
 
-/// As rigid as possible between two instants: Σ w ‖e¹ − R̂ e²‖² / Σ w, (scene units)². Each point's R̂ is that of
-/// [`rotations`]; being the best, it needs no derivative (the envelope theorem). Adds to the gradients of both instants.
+/// As rigid as possible between two times: Σ w ‖e¹ − R̂ e²‖² / Σ w, (scene units)². Each point's R̂ is that of
+/// [`rotations`]; being the best, it needs no derivative (the envelope theorem). Adds to the gradients of both times.
 ///
 /// Source: Sorkine and Alexa 2007; SC-GS (Huang et al. 2024).
 pub(crate) fn arap<F: Real>(
@@ -70,10 +70,10 @@ pub(crate) fn arap<F: Real>(
         })
 }
 
-/// V / (stopgrad\[V\] + `floor`), V the mean over edges of the variance of their lengths over the instants, (scene
-/// units)²: its gradient is that of ln V, whatever the unit. Adds to the gradients of every instant.
+/// V / (stopgrad\[V\] + `floor`), V the mean over edges of the variance of their lengths over the times, (scene
+/// units)²: its gradient is that of ln V, whatever the unit. Adds to the gradients of every time.
 ///
-/// Source: SC-GS (Huang et al. 2024), with `floor` = [`OWN_FLOOR`] and eight instants.
+/// Source: SC-GS (Huang et al. 2024), with `floor` = [`OWN_FLOOR`] and eight times.
 pub(crate) fn elastic<F: Real>(
     graph: &Graph<F>,
     at: &[&[[F; 3]]],
@@ -115,7 +115,7 @@ pub(crate) fn elastic<F: Real>(
 }
 
 /// A / (stopgrad\[A\] + `floor`), A the mean of ‖x(t−δ) − 2 x(t) + x(t+δ)‖, scene units: against jitter, whatever the
-/// unit. Adds to the gradients of the three instants.
+/// unit. Adds to the gradients of the three times.
 ///
 /// Source: SC-GS (Huang et al. 2024), with `floor` = [`OWN_FLOOR`] and δ = 3 frames.
 pub(crate) fn acceleration<F: Real>(at: [&[[F; 3]]; 3], floor: f64, weight: f64, d: [&mut [[F; 3]]; 3]) -> f64 {

@@ -1,9 +1,9 @@
-//! Losses on how the splats of any motion model move: from means and covariances at several instants, without quaternions.
+//! Losses on how the splats of any motion model move: from means and covariances at several times, without quaternions.
 //!
 //! The rotation that [`rigid`](super::rigid) reads from a Gaussian's quaternion is here its neighbourhood's, the best
 //! rotation of its neighbours' offsets ([`arap::rotations`](super::arap::rotations)), held constant in the gradient: for
 //! the sum of squares that is exact (the envelope theorem), for the robust forms below it is one step of reweighting.
-//! Every function adds `weight` times its gradient to all instants and returns `weight` times its value; the same bits
+//! Every function adds `weight` times its gradient to all times and returns `weight` times its value; the same bits
 //! with any number of threads.
 
 use super::LossSettings;
@@ -200,9 +200,9 @@ pub(crate) fn rotation<F: Real>(
         })
 }
 
-/// Isometry: mean over edges of √(w (‖e‖ − ‖e*‖)² + ε), scene units: distances are alike at any two instants.
+/// Isometry: mean over edges of √(w (‖e‖ − ‖e*‖)² + ε), scene units: distances are alike at any two times.
 ///
-/// Source: Luiten et al. 2024, equation 10, with another instant in place of the first frame.
+/// Source: Luiten et al. 2024, equation 10, with another time in place of the first frame.
 pub(crate) fn isometry<F: Real>(
     graph: &Graph<F>,
     [one, other]: [&[[F; 3]]; 2],
@@ -240,7 +240,7 @@ pub(crate) fn isometry<F: Real>(
         })
 }
 
-/// Velocity: mean over edges of ‖v_i − v_j‖², (scene units)², v = x − x⁰ the way from one instant to the next: neighbours
+/// Velocity: mean over edges of ‖v_i − v_j‖², (scene units)², v = x − x⁰ the way from one time to the next: neighbours
 /// move alike. Edges count alike, whatever the graph's weights say.
 pub(crate) fn velocity<F: Real>(
     graph: &Graph<F>,
@@ -271,7 +271,7 @@ pub(crate) fn velocity<F: Real>(
         })
 }
 
-/// Jerk: mean over points of ‖x₃ − 3 x₂ + 3 x₁ − x₀‖, scene units, of four instants one step apart: steady acceleration
+/// Jerk: mean over points of ‖x₃ − 3 x₂ + 3 x₁ − x₀‖, scene units, of four times one step apart: steady acceleration
 /// is free, jitter is not.
 pub(crate) fn jerk<F: Real>(at: [&[[F; 3]]; 4], weight: f64, d: [&mut [[F; 3]]; 4]) -> f64 {
     let n = at[0].len();
@@ -298,7 +298,7 @@ pub(crate) fn jerk<F: Real>(at: [&[[F; 3]]; 4], weight: f64, d: [&mut [[F; 3]]; 
     scale * sum
 }
 
-/// Acceleration: mean over points of ½‖s⁺ + s⁻‖², s⁺ = x₂ − x₁ the flow to the next instant and s⁻ = x₀ − x₁ to the last
+/// Acceleration: mean over points of ½‖s⁺ + s⁻‖², s⁺ = x₂ − x₁ the flow to the next time and s⁻ = x₀ − x₁ to the last
 /// one, scene units²: steady motion is free.
 ///
 /// Source: Li et al. 2021 (NSFF), temporal scene flow smoothness.

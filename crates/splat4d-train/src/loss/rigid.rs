@@ -1,12 +1,12 @@
-//! Local rigidity between two instants: neighbours keep their offsets, their turns and their distances.
+//! Local rigidity between two times: neighbours keep their offsets, their turns and their distances.
 //!
 //! For every edge i → j of a [`Graph`], with q_rel = q̂_t ⊗ conj(q̂_{t−1}) of the normalised quaternions, R its matrix,
 //! e = x_j − x_i now and e⁰ before:
 //! - rigidity: mean √(w ‖R_iᵀ e − e⁰‖² + ε), scene units;
 //! - rotation: mean √(w ‖q_rel,j − s q_rel,i‖² + ε), no unit; s = ±1 picks the nearer of the two signs of one turn (ours);
-//! - isometry: mean √(w (‖e‖ − d0)² + ε), scene units; d0 is the graph's length at rest, not the instant before.
+//! - isometry: mean √(w (‖e‖ − d0)² + ε), scene units; d0 is the graph's length at rest, not the time before.
 //!
-//! The root makes them robust, like an L1: one torn edge does not move its neighbours. Gradients go to the later instant;
+//! The root makes them robust, like an L1: one torn edge does not move its neighbours. Gradients go to the later time;
 //! what was before is known. Every function adds `weight` times its gradient and returns `weight` times its value; the
 //! same bits with any number of threads.
 //! Source: Luiten et al. 2024, "Dynamic 3D Gaussians", equations 8 to 10.
@@ -18,7 +18,7 @@ use splat4d::math::{Real, quat};
 /// Keeps the root's derivative finite where an edge is exactly as it was (Luiten et al. 2024).
 const UNDER_ROOT: f64 = 1e-20;
 
-/// Where points are and how they are turned at an instant.
+/// Where points are and how they are turned at a time.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Poses<'a, F> {
     /// Positions, scene units.
@@ -27,7 +27,7 @@ pub(crate) struct Poses<'a, F> {
     pub q: &'a [[F; 4]],
 }
 
-/// The turn from one instant to the next.
+/// The turn from one time to the next.
 fn relative<F: Real>(now: [F; 4], before: [F; 4]) -> [F; 4] {
     quat::product(quat::normalize(now).0, quat::conjugate(quat::normalize(before).0))
 }
@@ -67,7 +67,7 @@ pub(crate) fn rigidity<F: Real>(
             let w = graph.weights()[e];
             let root = (w * square(r) + eps).sqrt();
             sum += root.f64();
-            // The gradient to the residual, in the axes of the instant before.
+            // The gradient to the residual, in the axes of the time before.
             let by = factor * w / root;
             let g = r.map(|x| by * x);
             let force = turn(&rotations[i], g);

@@ -90,7 +90,7 @@ pub trait ParamLoss<F: Real>: Send + Sync {
 pub trait Codec<F: Real>: Send + Sync {
     /// Its name, in messages.
     fn name(&self) -> &str;
-    /// Brings `shown` up to date, as far as splats at the given times can tell: it is as the last call left it, or, after
+    /// Brings `shown` up to date, as far as splats at the given times allow: it is as the last call left it, or, after
     /// [`reset`](Self::reset), a copy of `scene`.
     fn show(&self, scene: &Scene<F>, times: &[Time], shown: &mut Scene<F>);
     /// All of `scene` as a reader would see it. Changes nothing of what `show` remembers.

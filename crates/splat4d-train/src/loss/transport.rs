@@ -203,7 +203,7 @@ impl<F: Real> ProbeLoss<F> for Transport {
         let Some(times) = self.times(info) else { return Vec::new() };
         let Some(layer) = scene.layers.get(self.layer) else { return Vec::new() };
         self.now.store(self.settings.factor(info.progress).to_bits(), Ordering::Relaxed);
-        // Whom nobody sees in the middle frame needs no steadying.
+        // Gaussians that no view sees in the middle frame need no smoothing.
         let mut ids = Vec::new();
         let rows = if layer.active(times[1], &mut ids) { None } else { Some(ids) };
         vec![Probe { layer: self.layer, of: Space::Gaussians, rows, times: times.to_vec() }]

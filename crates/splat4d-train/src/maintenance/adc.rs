@@ -126,7 +126,7 @@ impl AdcSettings {
         let Some(path) = motion.polynomial().filter(|_| *life != LifeKind::Infinite && self.split_in_time > 0.0) else {
             return 0.0;
         };
-        // A life that is longer than the clip is worth no more than the clip.
+        // A life that is longer than the clip counts as the clip.
         let clip = 0.5 * (scene.clip[1] - scene.clip[0]);
         let width = f64::from(params[LIFE].get(row, LOG_WIDTH)).exp().min(clip);
         let way = path.travel(params, row, width);
@@ -273,7 +273,7 @@ mod tests {
         let velocities = layer.params.find("velocities").unwrap();
         let size = (-2.0f32).exp();
         // Row 0 goes three times its size in a width of its life and row 1 half of it; row 2 lives longer than the clip;
-        // row 3 is fast, but nobody asks for more of it.
+        // row 3 is fast, but no rule splits it.
         for (row, [life, way]) in [[0.5, 3.0], [0.5, 0.5], [50.0, 3.0], [0.5, 3.0]].into_iter().enumerate() {
             layer.params[LIFE].write(row, 0, [2.5, f32::ln(life)]);
             layer.params[velocities].write(row, 0, [way * size / life.min(2.0), 0.0, 0.0, 0.0, 0.01, 0.0]);

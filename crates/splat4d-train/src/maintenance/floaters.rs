@@ -109,7 +109,7 @@ impl<'a> Places<'a> {
 
     /// The median distance at which cameras see these; `None`: they see none.
     fn depth(&self, points: &[[f64; 3]]) -> Option<f64> {
-        /// So many tell the median.
+        /// Samples of the median.
         const AMONG: usize = 1000;
         let some = points.iter().step_by(points.len().div_ceil(AMONG).max(1));
         let mut all: Vec<f64> =

@@ -14,7 +14,7 @@ use splat4d::math::Rng;
 use splat4d::scene::params::OPACITY;
 use splat4d::scene::{Born, GEOMETRY, RowEdit, Space};
 
-/// More copies than this on one place are not told apart (as in gsplat).
+/// More copies than this at one position are not distinguished (as in gsplat).
 const MAX_COPIES: usize = 51;
 
 settings! {

@@ -1,4 +1,4 @@
-//! Pruning by worth while a scene is trained: again and again a share of the Gaussians goes, and what remains learns on.
+//! Pruning by importance during training: repeatedly a share of the Gaussians is removed, and the rest trains on.
 //! Source: 4DGS-1K (Yuan et al. 2025), there once, after training.
 
 use super::importance::{ScoreConfig, Scores, Spatial, prune, score};

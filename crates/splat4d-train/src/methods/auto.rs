@@ -11,23 +11,22 @@ const LOOKS: (usize, usize) = (4, 8);
 /// A pixel that changes by more than this from frame to frame (mean of the channels, in [0, 1]) has moved: above the
 /// noise of ordinary cameras.
 const CHANGED: f32 = 0.06;
-/// Moments from which on a take is long.
+/// Times from which on a take is long.
 const LONG: usize = 600;
 
 /// The motion that a capture shows.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CaptureStats {
-    /// Moments.
+    /// Times.
     pub times: usize,
-    /// Training images a moment.
+    /// Training images a time.
     pub cameras: f64,
-    /// Share of the pixels of fixed cameras that change from one of their frames to the next; none where that cannot be
-    /// told.
+    /// Share of the pixels of fixed cameras that change from one of their frames to the next; none where undetermined.
     pub changing: Option<f64>,
     /// How far matches of frames of a moving camera agree with a static scene; none where cameras are fixed, or too little
     /// matches.
     pub agreement: Option<Agreement>,
-    /// Fewest images of fixed cameras at a moment.
+    /// Fewest images of fixed cameras at a time.
     pub fewest: usize,
     /// Images have masks.
     pub masks: bool,
@@ -58,7 +57,7 @@ impl CaptureStats {
         self.times >= LONG
     }
 
-    /// The cameras that see a moment, in words.
+    /// The cameras that see a time, in words.
     pub(crate) fn cameras_in_words(&self) -> String {
         if self.cameras < 1.5 { "one camera sees".to_owned() } else { format!("{:.1} cameras see", self.cameras) }
     }
@@ -226,7 +225,7 @@ mod tests {
         is(Made::new(1, 50, 4, true), false, "control", "one camera");
         is(Made::new(1, 50, 4, false), false, "deform-mlp", "one camera");
         is(Made::new(2, 700, 4, true), true, "deform-mlp", "of 700");
-        // What depth maps show of every moment is where it is, whatever moves the camera.
+        // What depth maps show of every time is where it is, whatever moves the camera.
         is(Made { depth: true, ..Made::new(1, 50, 4, false) }, false, "spacetime", "depth");
         is(Made { depth: true, ..Made::new(2, 700, 4, false) }, true, "spacetime", "depth");
         is(Made { depth: true, observe: 0.8, ..Made::new(1, 50, 4, true) }, false, "control", "one camera");

@@ -16,7 +16,7 @@ const LARGE_X_LEVELS: usize = 10;
 /// Grids learn so much faster than networks: an entry is met by few Gaussians.
 const GRID_SPEEDUP: f64 = 50.0;
 /// Canonical positions start so much slower than the recipe's, which suit Gaussians that live for a moment: a cloud that
-/// is seen at every moment has to settle. Chosen next to other settings in runs of 400 steps; not measured alone.
+/// is seen at every time has to settle. Chosen next to other settings in runs of 400 steps; not measured alone.
 const CANONICAL_SLOWDOWN: f64 = 4.0;
 /// Share of the iterations until the noise on time is zero: 20,000 of 40,000 (Yang et al. 2024).
 const NOISE_STEPS: f64 = 0.5;
@@ -114,7 +114,7 @@ impl Method for DeformMethod {
         if warmup > 0 {
             let mut first = self.stage(plan, 0, warmup);
             first.name = "deform-mlp, still".into();
-            // A network that rests and learns nothing is not asked; nobody need wait for it.
+            // A network that is frozen is not evaluated.
             first.start = Some(learns(false));
             first.end = Some(learns(true));
             out.push(first);
@@ -145,7 +145,7 @@ fn spec(plan: &TrainContext, deform: &DeformSettings) -> DeformSpec {
     let encoded = |x_levels| Input::Encoded { x_levels, t_levels: deform.t_levels, time_net: deform.time_net };
     let trunk = match deform.trunk {
         // Grids follow more motion: by a small network a ball before a wall is lost, and a hand-held take has 1.9 dB less
-        // (docs/suite.md). Of one object alone, seen once a moment, the network generalises better (docs/models.md).
+        // (docs/suite.md). Of one object alone, seen once a time, the network generalises better (docs/models.md).
         Trunk::Auto if plan.masks && plan.fixed_cameras == 0 => Trunk::Small,
         Trunk::Auto => Trunk::Hash,
         chosen => chosen,
@@ -169,7 +169,7 @@ impl DeformMethod {
     }
 }
 
-/// Lets positions start as slowly as those of a cloud must that is seen at every moment.
+/// Lets positions start as slowly as those of a cloud must that is seen at every time.
 pub(super) fn canonical(stage: &mut Stage) {
     for group in stage.groups.iter_mut().filter(|g| g.column == "means") {
         group.rate.start /= CANONICAL_SLOWDOWN;

@@ -101,7 +101,7 @@ pub struct TrainContext {
     pub clip: [f64; 2],
     /// Frames a second.
     pub fps: f64,
-    /// Distinct times in the capture; of a rig of fixed cameras whose shutters do not open at once, its moments.
+    /// Distinct times in the capture; of a rig of fixed cameras whose shutters do not open at once, its times.
     pub times: usize,
     /// Cameras with training images that do not move.
     pub fixed_cameras: usize,
@@ -329,8 +329,8 @@ pub trait Method: Send + Sync {
     }
     /// The life its Gaussians have: the recipe's. Where it leaves the choice to the model, those of a cloud that lasts
     /// ([`one_moment`](Self::one_moment)) may come and go before fixed cameras, which see that a place is empty before something
-    /// comes there (docs/models.md); a camera that moves sees every place at few moments, and lives gain nothing. Others, and
-    /// those whose future is to be predicted, are there for ever.
+    /// comes there (docs/models.md); a camera that moves sees every place at few times, and lives gain nothing. Others,
+    /// and those whose future is to be predicted, are there for ever.
     fn life(&self, plan: &TrainContext) -> LifeKind {
         let lasting = self.one_moment(plan) && plan.fixed_cameras > 0 && !plan.predicted;
         plan.common.life.kind.unwrap_or(if lasting { LifeKind::Interval } else { LifeKind::Infinite })
@@ -345,8 +345,8 @@ pub trait Method: Send + Sync {
     fn check(&self, _plan: &TrainContext) -> Result<()> {
         Ok(())
     }
-    /// Whether all Gaussians live through the whole clip, so that training should start from one moment's cloud and not
-    /// from the clouds of many moments together.
+    /// Whether all Gaussians live through the whole clip, so that training should start from one time's cloud and not
+    /// from the clouds of many times together.
     fn one_moment(&self, _plan: &TrainContext) -> bool {
         false
     }

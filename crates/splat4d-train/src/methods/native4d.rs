@@ -73,7 +73,7 @@ impl Method for Native4dMethod {
             return Ok(());
         }
         Err(Error::input(format!(
-            "native4d has a life of its own and takes no life=\"{}\"",
+            "native4d has its own lifespans and accepts no life=\"{}\"",
             plan.common.life.kind.word()
         ))
         .remedy("Leave life at auto, or train spacetime with it"))

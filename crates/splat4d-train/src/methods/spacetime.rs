@@ -12,7 +12,7 @@ use splat4d::motion::{SpacetimeSpec, Spec};
 use splat4d::scene::head::{HEAD_IN, HEAD_OUT};
 use splat4d::scene::{LifeKind, Params};
 
-/// Cameras at a moment from which on a scene is seen from all sides at once.
+/// Cameras at a time from which on a scene is seen from all sides at once.
 const MANY_CAMERAS: f64 = 3.0;
 
 choices! {
@@ -112,7 +112,7 @@ impl Method for SpacetimeMethod {
     fn stages(&self, plan: &TrainContext) -> Vec<Stage> {
         let c = &plan.common;
         let clip = plan.seconds();
-        // Velocities are there to compare (`VelocitySmoothness`), which costs no further instant.
+        // Velocities are there to compare (`VelocitySmoothness`), which costs no further time.
         let mut base = plan.clone();
         base.common.loss.velocity = 0.0;
         let mut stage = still::stage("spacetime", &base);

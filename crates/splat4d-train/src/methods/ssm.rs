@@ -161,7 +161,7 @@ fn place(layer: &mut Layer) {
     let count = skin.count(p);
     let solid: Vec<u32> = (0..p.len() as u32).filter(|&i| p[GEOMETRY].get(i as usize, OPACITY) > SOLID_LOGIT).collect();
     let centers = farthest_points(&p[GEOMETRY].gather(&solid), count);
-    // A file and its moments have as many nodes as at the start: where the cloud is too small they stay where they are.
+    // A file and its times have as many nodes as at the start: where the cloud is too small they stay where they are.
     if centers.len() < count {
         return;
     }

@@ -103,7 +103,7 @@ impl Method for TrackedMethod {
             .remedy(format!("Use another --motion: {}", others.join(", "))));
         }
         if plan.common.prune.interval > 0 {
-            return Err(Error::input("`tracked` cannot prune while it trains: it does not know the frames to come")
+            return Err(Error::input("`tracked` cannot prune during training: later frames are not trained yet")
                 .remedy("Leave prune_interval at 0, or prune afterwards with `splat4d compress`"));
         }
         Ok(())

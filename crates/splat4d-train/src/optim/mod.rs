@@ -155,7 +155,7 @@ impl<F: Real> Moments<F> {
             let views = [table.view_mut(), self.tables[key.0 as usize].view_mut(), gradient.view_mut()];
             let faults = par_split(views, &|views| dispatch(simd, adam::Step { rule: &rule, views }));
             if faults > 0.0 {
-                // Whoever asks what went wrong looks at the gradient.
+                // The caller inspects the gradient.
                 let _ = d.of([key]);
                 bad.push(key);
             }

@@ -8,7 +8,7 @@ use splat4d::render::ResidentNoise;
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{GEOMETRY, Grads, Rows, Space};
 
-/// Opaque Gaussians get less than a ten-thousandth of the noise: not worth three normal numbers.
+/// Opaque Gaussians get less than a ten-thousandth of the noise: too little for three normal numbers.
 const LEAST_GATE: f64 = 1e-4;
 /// Extent at which the published weights of 3DGS as MCMC hold as they are, scene units: that of NeRF's synthetic captures.
 pub(crate) const MCMC_EXTENT: f64 = 4.4;

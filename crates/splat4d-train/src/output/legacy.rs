@@ -96,7 +96,7 @@ fn collect(root: &Path, at: &Path, out: &mut Vec<PathBuf>) {
                 out.extend(matching(root, &chunks.join(&part), |n| n == "lock"));
             }
         }
-        // The medians of what stands still, a capture of our own.
+        // The medians of the static background, a capture of our own.
         all(root, &chunks.join("shared/capture"), out);
     }
 }

@@ -185,7 +185,7 @@ impl Owner {
         }
     }
 
-    /// Who has the folder now, without a trace in it; the inner `None`: somebody whose record cannot be read.
+    /// Who has the folder now, without a trace in it; the inner `None`: an owner whose record cannot be read.
     pub fn holder(folder: &Path) -> Option<Option<Standing>> {
         let (record, lock) = (folder.join(STATE).join(RECORD), folder.join(STATE).join(LOCK));
         check_plain(&lock).ok()?;

@@ -81,7 +81,7 @@ fn id(path: &Path) -> Option<Id> {
     std::fs::metadata(path).ok().map(|m| (m.dev(), m.ino()))
 }
 
-/// The real path in lower case: systems without numbers of files mostly do not tell case apart.
+/// The real path in lower case: systems without numbers of files mostly ignore case.
 #[cfg(not(unix))]
 fn id(path: &Path) -> Option<Id> {
     path.canonicalize().ok().map(|p| p.to_string_lossy().to_lowercase())

@@ -38,7 +38,7 @@ fn is_left_over(path: &Path) -> bool {
     let Some(name) = name.strip_prefix('.').and_then(|n| n.strip_suffix(ENDING)) else { return false };
     let mut parts = name.rsplit('.').next().unwrap_or_default().split('-');
     let (Some(of), Some(Ok(process))) = (parts.next(), parts.next().map(str::parse::<u32>)) else { return false };
-    // Of a process of this machine, as long as that runs, it is known; of others the time tells.
+    // Of a process of this machine, as long as that runs, it is known; of others the time decides.
     let procs = Path::new("/proc/self").exists();
     if of == machine() && procs {
         return process != std::process::id() && !Path::new(&format!("/proc/{process}")).exists();

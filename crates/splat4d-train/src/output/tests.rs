@@ -232,7 +232,7 @@ fn the_same_command_continues_and_another_does_not() {
     out.clear().unwrap();
     assert!(tree(&folder).is_empty() && OutputFolder::asked(&folder).as_deref() == Some("one"));
     write_all(&folder, &[("recipe.toml", "")]);
-    // While it runs nobody else does anything.
+    // While it runs no other process does anything.
     assert!(begin("one").unwrap_err().to_string().contains("in use by"));
     assert!(OutputFolder::amend(&folder, "eval").unwrap_err().to_string().contains("in use by"));
     out.finished();

@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 const LOOKS: f64 = 32.0;
 /// Of the time, what the end may be off before a run is planned again.
 const TOLERANCE: f64 = 0.015;
-/// Weight of what was measured since the last look in the machine's speed: one busy moment is not taken for the rest.
+/// Weight of what was measured since the last look in the machine's speed: one busy time is not taken for the rest.
 const NEWEST: f64 = 0.5;
 /// Steps of the schedule that a step may stand for, and steps that may stand for one of the schedule: with fewer the scene
 /// would be taken apart by rates and densifications meant for many.
@@ -170,7 +170,7 @@ mod tests {
     const STEPS: usize = 6000;
     const START: usize = 5000;
     const CAP: usize = 30_000;
-    /// Steps' worth of what follows the last.
+    /// Time of what follows the last step, in steps.
     const FINISH: f64 = 200.0;
 
     /// A run on a machine with a clock of its own: seconds in all, and the plans.

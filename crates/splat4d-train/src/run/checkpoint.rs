@@ -212,7 +212,8 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
     })
 }
 
-/// The array of a table's moments. Tables are identified by name: a reader may make them in another order than training did.
+/// The array of a table's moments. Tables are identified by name: a reader may make them in another order than training
+/// did.
 fn moments_name(layer: usize, params: &Params<f32>, key: Key) -> String {
     format!("moments.{layer}.{}", params.info(key).name)
 }

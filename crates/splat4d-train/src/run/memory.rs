@@ -115,7 +115,7 @@ pub fn available_memory() -> Option<u64> {
     Some(group.map_or(system, |(most, now)| system.min(most.saturating_sub(now))))
 }
 
-/// Peak resident memory of this process, bytes; 0 where the system does not tell.
+/// Peak resident memory of this process, bytes; 0 where the system does not report it.
 pub fn peak_memory() -> u64 {
     std::fs::read_to_string("/proc/self/status")
         .ok()

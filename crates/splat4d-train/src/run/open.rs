@@ -59,7 +59,7 @@ pub fn open_frames(path: &Path, recipe: &Recipe, frames: Vec<Range<usize>>, lens
     let options = CaptureOptions { frames, lenses: lenses.clone(), ..capture_options(recipe)? };
     let mut capture = Capture::open(path, &options)?;
     if recipe.loss.flow == 0.0 {
-        // Nobody looks at it: it need not be decoded.
+        // It is not used: it need not be decoded.
         capture.frames.iter_mut().for_each(|f| f.flow = None);
     }
     if recipe.loss.tracks == 0.0 {
@@ -136,14 +136,14 @@ pub fn plan(capture: &Capture, recipe: &Recipe) -> TrainContext {
     let fixed = |i: &&usize| capture.cameras[capture.frames[**i].camera].fixed;
     let mut seen: Vec<f64> = capture.train.iter().filter(fixed).map(|&i| capture.frames[i].time.0).collect();
     seen.sort_by(f64::total_cmp);
-    // A fixed camera that is held out tells training nothing.
+    // A fixed camera that is held out contributes nothing to training.
     let mut rigs: Vec<usize> = capture.train.iter().filter(fixed).map(|&i| capture.frames[i].camera).collect();
     rigs.sort_unstable();
     rigs.dedup();
     let of_rigs = capture.train.iter().map(|&i| (capture.frames[i].camera, capture.frames[i].time.0));
     let views = |t: f64| seen.partition_point(|s| *s <= t) - seen.partition_point(|s| *s < t);
     let moments = times.iter().map(|&t| (t, views(t))).collect();
-    // Cameras that all stand in one place say nothing of the scene's size.
+    // Cameras that all have the same position say nothing of the scene's size.
     let (center, radius) = capture.center_and_radius();
     TrainContext {
         extent: if radius > SINGLE_PLACE { radius } else { 1.0 },
@@ -191,7 +191,7 @@ impl OpenCapture {
         Ok(Self::with(training_frames(capture, recipe)?))
     }
 
-    /// With frames that somebody else looks at too.
+    /// With frames that are shared.
     pub(crate) fn with(frames: Arc<Dataset>) -> Self {
         Self { capture: frames.capture().clone(), frames, simd: Simd::detect(), device: Device::Cpu }
     }
@@ -305,7 +305,7 @@ impl OpenCapture {
         };
         let mut trained: Vec<usize> = self.capture.train.iter().map(|&i| self.capture.frames[i].camera).collect();
         trained.sort_unstable();
-        // Cameras of a rig have colours of their own, and one image of each tells them. Photos of one camera differ
+        // Cameras of a rig have colours of their own, and one image of each shows them. Photos of one camera differ
         // where it
         // chose its exposure, which goes with the place and is then the scene's (docs/suite.md).
         let pictures = if self.capture.named || c.appearance.exposure_single { 1 } else { 2 };

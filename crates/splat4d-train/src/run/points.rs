@@ -113,7 +113,7 @@ fn uncovered(camera: &Camera, points: &[[f64; 3]]) -> f64 {
     covered.iter().filter(|c| !**c).count() as f64 / covered.len() as f64
 }
 
-/// The moments at which moving points are wanted.
+/// The times at which moving points are wanted.
 fn moments(recipe: &Recipe, plan: &TrainContext) -> Result<Vec<f64>> {
     let program = recipe.program()?;
     let mut settings = recipe.init.clone();

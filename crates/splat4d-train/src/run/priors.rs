@@ -1,4 +1,4 @@
-//! What files say of a capture next to its images, held against these: before training what can be told at once,
+//! What files say of a capture next to its images, held against these: before training what can be checked at once,
 //! after it
 //! what the scene made of them.
 
@@ -211,7 +211,7 @@ pub(super) fn believed(opened: OpenCapture, recipe: &Recipe) -> Result<(OpenCapt
     let message = match found {
         Depths::Fit => return Ok((opened, None)),
         Depths::Scaled(ratio) => format!(
-            "the capture's points are {ratio:.3} times as far away as its depth maps say: maps are taken times \
+            "the capture's points are {ratio:.3} times as far away as in its depth maps: maps are multiplied by \
              {ratio:.3}; correct depth_scale (docs/priors.md)"
         ),
         Depths::Foreign(scatter) => format!(

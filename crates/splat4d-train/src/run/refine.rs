@@ -24,7 +24,7 @@ use std::sync::atomic::AtomicBool;
 
 /// A refinement of a scene.
 pub(crate) struct Refine {
-    /// The verb that asks for it: run.json names it, and errors tell the user to continue with it.
+    /// The verb that asks for it: run.json names it, and errors suggest to continue with it.
     pub made_by: String,
     /// The scene before the first stage.
     pub scene: Scene<f32>,

@@ -91,7 +91,7 @@ const AT_CAP: f64 = 0.98;
 /// with 30,000 Gaussians and at 27.4 with 150,000; captures that have enough end above 29 (studies/records/2026-11-26-real-size.md).
 const UNDER_FITTED: f64 = 28.0;
 
-/// What a run that ends at its cap with blurred training views should tell the user.
+/// Advice for a run that ends at its cap with blurred training views.
 fn under_fitted(gaussians: usize, cap: usize, psnr: f64) -> Option<String> {
     let full = gaussians as f64 >= AT_CAP * cap as f64;
     (full && psnr < UNDER_FITTED).then(|| {
@@ -230,7 +230,7 @@ impl Session<'_> {
         Ok(state)
     }
 
-    /// Steps until all stages are done or somebody says stop.
+    /// Steps until all stages are done or a stop is requested.
     pub(super) fn drive(
         &self,
         trainer: &mut Trainer<'_>,
@@ -274,7 +274,7 @@ impl Session<'_> {
             let expected = self.budget.map_or(0.0, |b| Place::of(trainer).step_seconds(&b.timing));
             let step = match trainer.step()? {
                 Ok(step) => step,
-                // Whoever says stop within a step, such as a loss that failed, has spoilt it: it counts for nothing.
+                // A step in which a stop was requested, such as by a failed loss, is invalid and does not count.
                 Err(_) if self.stop.load(Ordering::Relaxed) => {
                     state = self.restore(trainer, listen)?;
                     metrics.rewind(trainer.progress.iteration);
@@ -378,7 +378,7 @@ impl Session<'_> {
     /// Says on what it trains, where that was asked for or is not what it was before.
     fn report_device(&self, trainer: &Trainer<'_>, listen: &mut dyn FnMut(&Event)) {
         let device = &trainer.device;
-        // Runs of before there were other devices name none.
+        // Older runs, from before other devices existed, name none.
         let info = read_info(self.run).unwrap_or_default();
         let before = info["device"].as_str().unwrap_or(&trainer.device.name);
         let mut why = device.why.clone();

@@ -28,7 +28,7 @@ const CAMERAS: usize = 64;
 const HELD_VIEWS: usize = 4;
 /// Memory for their decoded images, bytes.
 const HELD_MEMORY: usize = 64 << 20;
-/// Rows whose means tell where the middle of the scene is.
+/// Rows whose means give the middle of the scene.
 const ROWS: usize = 1000;
 
 /// When the next snapshot is due, and what stays the same from one to the next.

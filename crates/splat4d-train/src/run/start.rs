@@ -229,7 +229,7 @@ pub fn resume_with(
         estimate: memory_estimate(&opened.capture, &recipe),
         snapshots: options.snapshots,
         clock: options.clock.clone(),
-        // A run of before there were budgets has none.
+        // An older run, without budgets, has none.
         budget: serde_json::from_value(info["budget"].clone()).ok(),
         own_loss,
         stop,

@@ -469,7 +469,7 @@ fn foreign_checkpoints_are_refused_with_a_reason() {
     });
     std::fs::write(run.join("recipe.toml"), other.to_toml()).unwrap();
     resume_quietly(&run).unwrap();
-    // A recipe of before there were tables.
+    // An older recipe, without tables.
     let run = copy("flat");
     std::fs::write(run.join("recipe.toml"), base.resolve().flat_toml()).unwrap();
     resume_quietly(&run).unwrap();

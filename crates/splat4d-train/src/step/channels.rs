@@ -132,7 +132,7 @@ impl<F: Real> Channels<F> {
         let (_, all) = self.later.iter().find(|(c, _)| c == channel).expect("what is backpropagated was rendered");
         let mut first = 0;
         for (&i, later) in source.asked.iter().zip(all) {
-            // Where the flow goes nowhere in time, it tells the splats nothing.
+            // Where the flow has no duration, it has no effect on the splats.
             if later.question != i {
                 let (now, then) = (evaluation.tape(i).out(), evaluation.tape(later.question).out());
                 let back = |r: usize| {

@@ -1,4 +1,4 @@
-//! Search of clocks: by how much every camera is early or late, told by a scene that need not be finished. A
+//! Search of clocks: by how much every camera is early or late, by a scene that need not be finished. A
 //! camera's images
 //! are compared with the scene at shifted times, and the shift that suits them best wins.
 //!

@@ -18,7 +18,7 @@ const GAMMA: f32 = 0.02;
 /// Rows of pixels of a task: fewer would cost more to hand out than to compute.
 const ROWS: usize = 16;
 
-/// Weights of pixels by how much they differ from what stands still; none where cameras move, or have few images.
+/// Weights of pixels by how much they differ from the static background; none where cameras move, or have few images.
 pub(crate) struct Emphasis {
     /// k: how much more than others a pixel weighs that shows nothing but what moves.
     strength: f32,
@@ -29,7 +29,7 @@ pub(crate) struct Emphasis {
 }
 
 impl Emphasis {
-    /// Looks at what stands still. `None`: nothing is emphasised. Errors: an image cannot be read.
+    /// Looks at the static background. `None`: nothing is emphasised. Errors: an image cannot be read.
     pub(crate) fn new(frames: &dyn Frames, strength: f64) -> Result<Option<Self>> {
         if strength <= 0.0 {
             return Ok(None);

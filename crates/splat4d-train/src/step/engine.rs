@@ -101,8 +101,8 @@ pub trait Engine: Send {
         Ok(Vec::new())
     }
 
-    /// The same, and brings the learner up to date, where its numbers are kept elsewhere: asked before anybody looks at them. Errors:
-    /// they are lost.
+    /// The same, and brings the learner up to date, where its numbers are kept elsewhere: called before they are read.
+    /// Errors: they are lost.
     fn settle(&mut self, _learner: &mut TrainState) -> Result<Vec<Measured>, Fault> {
         Ok(Vec::new())
     }

@@ -54,7 +54,7 @@ pub(crate) struct DeviceEngine<'a> {
     /// Tables that are kept, by layer.
     known: Vec<ResidentMotion>,
     under_way: VecDeque<UnderWay>,
-    /// What steps measured that are done, not told yet.
+    /// Measurements of finished steps, not reported yet.
     ready: Vec<Measured>,
 }
 
@@ -201,7 +201,7 @@ fn known(
     let mut all = Vec::new();
     for (layer, rates) in scene.layers.iter().zip(rates) {
         let Some(known) = ResidentMotion::new(layer, &plan.info.times) else {
-            return Err(format!("the GPU does not know the motion model `{}`", layer.motion.spec().name()));
+            return Err(format!("the GPU does not support the motion model `{}`", layer.motion.spec().name()));
         };
         let plain = layer.masks.is_none() && layer.span == ALWAYS && layer.cross_fade == [0.0; 2];
         if !plain || !layer.frame.is_identity() {
@@ -209,7 +209,7 @@ fn known(
         }
         let learns = |key: &Key| rates.get(key.0 as usize).is_some_and(|r| r.iter().flatten().any(|r| *r != 0.0));
         if let Some(key) = layer.params.keys().filter(learns).find(|k| !known.keys.contains(&Some(*k))) {
-            return Err(format!("`{}` learns, which the GPU does not know", layer.params.column_name(key, 0)));
+            return Err(format!("`{}` is learnt, which the GPU does not support", layer.params.column_name(key, 0)));
         }
         all.push(known);
     }
@@ -221,7 +221,7 @@ fn known(
         None => false,
     };
     match stage.params.iter().find(|loss| !knows(loss.kept())) {
-        Some(loss) => Err(format!("the loss `{}` looks at raw numbers", loss.name())),
+        Some(loss) => Err(format!("the loss `{}` reads raw values", loss.name())),
         None => Ok(all),
     }
 }
@@ -279,7 +279,7 @@ impl Engine for DeviceEngine<'_> {
         let (known, targets) = match (known, targets) {
             (Ok(known), Some(targets)) => (known, targets),
             (known, _) => {
-                // Of losses on images the CPU's engine tells.
+                // Losses on images are reported by the CPU's engine.
                 if let Err(why) = known {
                     self.report(&why, &mut notices);
                 }
@@ -402,7 +402,7 @@ impl Engine for DeviceEngine<'_> {
         if let Some(exposure) = exposure {
             exposure.take_over(&cameras);
         }
-        // Whoever looks may change something, statistics too.
+        // The reader may change something, statistics too.
         self.newest = Newest::TrainState;
         Ok(measured)
     }

@@ -101,8 +101,8 @@ pub(crate) fn pairs(cameras: &[&Camera]) -> Vec<[usize; 2]> {
     out
 }
 
-/// Cameras closer than this stand in one place: of their distance from the world's origin (digits of the poses), and of
-/// the distances in the rig.
+/// Cameras closer than this have the same position: of their distance from the world's origin (digits of the poses),
+/// and of the distances in the rig.
 const SAME_PLACE: f64 = 1e-9;
 const SAME_PLACE_OF_RIG: f64 = 1e-5;
 /// How ranks of neighbours grow: 0 to 4 one by one, then 5, 6, 8, 10, 13.

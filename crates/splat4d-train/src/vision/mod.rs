@@ -35,7 +35,7 @@ pub(crate) struct Point {
 /// The share of the points that is kept for what moves, where something does.
 const MOVING_SHARE: f64 = 0.3;
 
-/// At most `count` points on what stands still, and [`MOVING_SHARE`] more on what moves at these moments.
+/// At most `count` points on the static background, and [`MOVING_SHARE`] more on what moves at these times.
 pub(crate) fn points(
     frames: &dyn Frames,
     moments: &[f64],

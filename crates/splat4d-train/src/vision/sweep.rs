@@ -57,7 +57,7 @@ const STRAY: f64 = 0.02;
 const BEYOND: f64 = 1.6;
 /// Without points: nearest depth, of the distance to the nearest neighbour.
 const UNKNOWN: f64 = 1.0;
-/// Steps in inverse depth at which stands what cannot be told from the horizon.
+/// Steps in inverse depth for what cannot be distinguished from the horizon.
 const FAR: f64 = 0.5;
 /// The angle between cameras, degrees, at which depth is measured best, and how fast that falls to either side
 /// (as Yao et al. 2018 choose views; wider above because rigs have few cameras).

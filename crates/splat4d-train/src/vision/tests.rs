@@ -49,7 +49,7 @@ impl Room {
         Self { cameras, moments: 1, unit, textured: true, far: false, panel: false, one_camera: false }
     }
 
-    /// The panel's middle at a moment, units.
+    /// The panel's middle at a time, units.
     fn panel_at(&self, moment: usize) -> [f64; 3] {
         [-1.0 + 0.4 * moment as f64, 0.0, PANEL.0]
     }
@@ -98,7 +98,7 @@ impl Room {
         value as f32
     }
 
-    /// Distance from the nearest surface of a moment, or of what stands still, of the depth in the first camera.
+    /// Distance from the nearest surface of a time, or of the static background, of the depth in the first camera.
     fn off(&self, x: [f64; 3], moment: Option<usize>) -> f64 {
         let depth = self.cameras[0].project(x).map_or(f64::INFINITY, |(_, z)| z) / self.unit;
         let x = x.map(|v| v / self.unit);
@@ -215,7 +215,7 @@ fn images_without_texture_and_single_cameras_give_no_points() {
 fn wrong_poses_give_few_points() {
     let right = Room::new(6, 1.0);
     let mut wrong = Room::new(6, 1.0);
-    // The images are those of the right cameras: only what is told of them is wrong.
+    // The images are those of the right cameras: only what is stated about them is wrong.
     struct Posed<'a>(&'a Room, &'a Room);
     impl Frames for Posed<'_> {
         fn len(&self) -> usize {
@@ -262,7 +262,7 @@ fn what_moves_keeps_its_time_and_what_stands_has_none() {
     let panel = moving.iter().filter(|p| (p.place[2] - PANEL.0).abs() < 0.05).count();
     assert!(panel * 2 > moving.len(), "{panel} of {} lie on the panel", moving.len());
     let on = share_on(&room, &still, None);
-    assert!(on > 0.95, "{on} of what stands still lies on the wall and the floor");
+    assert!(on > 0.95, "{on} of the static points lie on the wall and the floor");
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! The images that points are looked for in: what stands still as fixed cameras see it, single moments, or the frames
+//! The images that points are looked for in: the static background as fixed cameras see it, single times, or the frames
 //! of moving cameras.
 
 use super::raster::{blurred, grey};
@@ -14,12 +14,12 @@ const VIEWS: usize = 64;
 /// Images are halved until they have no more pixels than this: finer detail places points no better than Gaussians
 /// need.
 const PIXELS: usize = 300_000;
-/// Moments of a fixed camera whose median is what stands still.
+/// Times of a fixed camera whose median is the static background.
 const MEDIAN_OF: usize = 9;
-/// From so many moments on a median knows what stands still.
+/// From so many times on a median knows the static background.
 const MEDIAN_FROM: usize = 3;
-/// A pixel that differs by more than this from what stands still (mean of the channels, in [0, 1]) belongs to something
-/// that moves: above the noise of ordinary cameras.
+/// A pixel that differs by more than this from the static background (mean of the channels, in [0, 1]) belongs to
+/// something that moves: above the noise of ordinary cameras.
 const MOVED: f32 = 0.06;
 /// Differences are blurred by so many pixels: single ones are noise.
 const MOVED_BLUR: f64 = 1.0;
@@ -95,12 +95,12 @@ impl Rigs {
         Self::Fixed(fixed)
     }
 
-    /// Whether a fixed camera has so many moments that their median is what stands still.
+    /// Whether a fixed camera has so many times that their median is the static background.
     pub(crate) fn have_medians(&self) -> bool {
         matches!(self, Self::Fixed(rigs) if rigs.iter().any(|rig| rig.len() >= MEDIAN_FROM))
     }
 
-    /// What stands still, as every camera sees it.
+    /// The static background, as every camera sees it.
     pub(crate) fn still(&self, frames: &dyn Frames) -> Result<Vec<View>> {
         match self {
             Self::Moving(all) => all.par_iter().map(|&i| single(frames, i)).collect(),
@@ -108,8 +108,8 @@ impl Rigs {
         }
     }
 
-    /// What differs from `still` in the frames nearest to time t, and their time; nothing where cameras move or moments are
-    /// few.
+    /// What differs from `still` in the frames nearest to time t, and their time; nothing where cameras move or times
+    /// are few.
     pub(crate) fn moving(&self, frames: &dyn Frames, still: &[View], t: f64) -> Result<Option<(Vec<View>, f64)>> {
         let Self::Fixed(rigs) = self else { return Ok(None) };
         if !self.have_medians() {

@@ -8,7 +8,7 @@ use std::fmt::Write;
 
 /// Sections that are listed; `--json` has them all.
 const LISTED: usize = 24;
-/// Moments of the clip that are looked at.
+/// Times of the clip that are looked at.
 const MOMENTS: usize = 5;
 
 /// The index in words and as JSON.

@@ -8,7 +8,7 @@
 //! ]}
 //! ```
 //! `time` is the film's second; `scene_time` the scene's (left out: the scene plays along). `up` is the scene's own and
-//! `fov_y` (degrees) the training cameras' unless told. Positions follow a Catmull-Rom spline, rotations great arcs,
+//! `fov_y` (degrees) the training cameras' by default. Positions follow a Catmull-Rom spline, rotations great arcs,
 //! fields of view and scene times straight lines.
 
 use crate::camera_file::{json, numbers, pose};

@@ -67,14 +67,14 @@ impl std::str::FromStr for Route {
     }
 }
 
-/// Which moments are shown, and how fast.
+/// Which times are shown, and how fast.
 #[derive(Clone, Debug)]
 pub struct Clock {
     /// First second of the scene that is shown.
     pub from: f64,
     /// Last second of the scene that is shown.
     pub to: f64,
-    /// Everything at this one moment.
+    /// Everything at this one time.
     pub freeze: Option<f64>,
     /// How many times slower than life; `None`: as the route likes.
     pub slow_motion: Option<f64>,
@@ -147,7 +147,7 @@ pub fn shots(
         }
         Route::Test | Route::Train => {
             let held = *route == Route::Test;
-            // Views outside the asked range are left out; a frozen moment shows each camera once.
+            // Views outside the asked range are left out; a frozen time shows each camera once.
             let mut seen: Vec<&str> = Vec::new();
             let mut out = Vec::new();
             for view in views.iter().filter(|v| v.held == held) {

@@ -18,7 +18,7 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-/// Forecasts one frame ahead, each from the corrected frame before; what they are worth.
+/// Forecasts one frame ahead, each from the corrected frame before, and their scores.
 ///
 /// Errors: a model without nodes of its own, no images of training cameras in the future.
 pub(super) fn run(
@@ -46,7 +46,7 @@ pub(super) fn run(
         if frames.is_empty() {
             break;
         }
-        // Of an ensemble the variance in the open loop tells how fast certainty is lost.
+        // An ensemble's open-loop variance shows how fast certainty is lost.
         let square = |h: usize, k: usize| of.spread.as_ref().map_or(0.0, |s| s[h][k].powi(2));
         let before = |k: usize| if h > 1 { square(h - 2, k) } else { 0.0 };
         let growth: Vec<f64> = (0..paths.nodes()).map(|k| square(h - 1, k) - before(k)).collect();

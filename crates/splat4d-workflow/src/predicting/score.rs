@@ -24,7 +24,7 @@ use std::sync::atomic::AtomicBool;
 const CHANGED: f32 = 0.05;
 /// Nodes that carry a true point.
 const CARRIERS: usize = 4;
-/// dB at which equal images stand: 8 bits tell no more.
+/// dB at which equal images stand: 8 bits resolve no more.
 const MOST_DB: f64 = 99.0;
 
 /// An image of the future, and the last observed one of the same camera.

@@ -75,7 +75,7 @@ fn worst(entries: &[Entry]) -> Vec<ViewScore> {
     super::worst(&shared, VIEWS).into_iter().map(|i| shared[i].clone()).collect()
 }
 
-/// Means of as many points as a chart can tell apart: single steps jump from camera to camera.
+/// Means of as many points as a chart can resolve: single steps jump from camera to camera.
 fn smooth(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     let stride = points.len().div_ceil(CURVE_POINTS).max(1);
     let mean = |part: &[(f64, f64)], of: fn(&(f64, f64)) -> f64| part.iter().map(of).sum::<f64>() / part.len() as f64;

@@ -24,7 +24,7 @@ pub struct Compressed {
     /// The run that was compressed.
     #[serde(with = "splat4d_train::path_text")]
     pub source: PathBuf,
-    /// 0, 1 or 2; `None` where settings were told instead.
+    /// 0, 1 or 2; `None` where settings were given instead.
     pub level: Option<u8>,
     /// Every setting and its value.
     pub settings: Value,

@@ -325,7 +325,7 @@ fn lives(out: &mut String, run: &Run) {
     };
     let row = |(bin, n): (usize, &f64)| (share(bin), 100.0 * n / all, format!("{:.1} %", 100.0 * n / all));
     let rows: Vec<(String, f64, String)> = counts.iter().enumerate().map(row).collect();
-    // A scene in which all live for ever has nothing to tell.
+    // A scene of permanent Gaussians has nothing to show.
     if counts.iter().filter(|n| **n > 0.0).count() > 1 {
         let chart = bars(&rows, 0.0, "Gaussians by the share of the clip in which they are visible");
         panels(

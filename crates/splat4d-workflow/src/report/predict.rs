@@ -58,7 +58,7 @@ pub struct ModelScores {
     pub node_error: Option<Vec<f64>>,
     /// Mean distance of known points from where they truly were, scene units, by horizon.
     pub track_error: Option<Vec<f64>>,
-    /// Mean node error of forecasts of a fifth of the observed part, from three moments of it, scene units.
+    /// Mean node error of forecasts of a fifth of the observed part, from three times of it, scene units.
     pub backtest: Option<f64>,
     /// The first frame at which it left the scene.
     pub diverged: Option<usize>,

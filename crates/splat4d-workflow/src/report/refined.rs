@@ -55,7 +55,7 @@ pub fn refined_in_words(refined: &Value) -> Option<String> {
 
 /// How far cameras were moved, those that went furthest first.
 pub(super) fn section(out: &mut String, run: &Run) {
-    // A damaged file was told of when the run was measured.
+    // A damaged file was reported when the run was measured.
     let Some(refined) = corrected::read(&run.path).ok().flatten() else { return };
     let Some(words) = refined_in_words(&refined) else { return };
     let number = |row: &Value, key: &str| row[key].as_f64().unwrap_or(0.0);

@@ -89,7 +89,7 @@ impl Curve {
         if !holds(self.at(high)) {
             return None;
         }
-        // Forty halvings of the logarithm: beyond what the interpolation can tell.
+        // Forty halvings of the logarithm: beyond what the interpolation can resolve.
         for _ in 0..40 {
             let middle = (low * high).sqrt();
             if holds(self.at(middle)) { high = middle } else { low = middle }

@@ -26,7 +26,7 @@ pub struct Likeness {
     pub pictures: usize,
 }
 
-/// The primitives of one moment as splats; memory is reused.
+/// The primitives of one time as splats; memory is reused.
 #[derive(Debug)]
 pub struct Moment {
     out: Table<f32>,

@@ -35,7 +35,7 @@ pub use bakery::{Bakery, Curve, Cut};
 pub use compare::{Likeness, Moment, Shown, compare};
 
 /// Default of [`Options::tolerance`], pixels: on models that no straight line holds, baked and model then differ by
-/// less than 40 dB can tell (measured; see the tests), at a fraction of the pieces that a tenth of it would need.
+/// less than 40 dB can show (measured; see the tests), at a fraction of the pieces that a tenth of it would need.
 pub const TOLERANCE: f64 = 0.25;
 /// Default of [`Options::segment`], seconds: what a player fetches for a seek; shorter ones repeat too much.
 pub const SEGMENT: f64 = 1.0;
@@ -43,7 +43,7 @@ pub const SEGMENT: f64 = 1.0;
 pub const LOOKS: f64 = 30.0;
 /// Most rounds of [`Options::repeat`].
 pub const MAX_REPEAT: usize = 10_000;
-/// Default of [`Options::renders`]: as many as are worth their time.
+/// Default of [`Options::renders`]: as many as pay off.
 pub const RENDERS: usize =
     if weights::STILL_RENDERS > weights::PATH_RENDERS { weights::STILL_RENDERS } else { weights::PATH_RENDERS };
 /// Default of [`Options::samples`]: 30,000 Gaussians at 27 seconds of 30 frames a second.
@@ -61,7 +61,7 @@ pub struct Options {
     /// Most samples of Gaussians at a time, over all Gaussians whose motion is not straight: bounds the time of baking.
     /// At least the clip's ends are sampled.
     pub samples: usize,
-    /// Most renders each, of cameras that stand still and of one that moves, that measure how strongly images react to errors:
+    /// Most renders each, of fixed cameras and of one that moves, that measure how strongly images react to errors:
     /// bounds the time as well.
     pub renders: usize,
     /// The take is played so many times over.

@@ -1,4 +1,4 @@
-//! A take played many times over: what stands still for ever is kept once, all else once a round.
+//! A take played many times over: the static background for ever is kept once, all else once a round.
 
 use super::fit::LEVEL_PIXELS;
 use super::sampling::Lookout;
@@ -35,7 +35,7 @@ impl Rounds {
             for node in &round {
                 let moved = |p: &Primitive| Primitive { center: p.center + shift, ..p.clone() };
                 let primitives = node.primitives.iter().map(moved).collect();
-                // The very number that the next round begins with, so that no moment is shown twice or never.
+                // The very number that the next round begins with, so that no time is shown twice or never.
                 let border = |t: f64| {
                     if t >= self.first + self.length {
                         self.first + self.length * (i + 1) as f64

@@ -1,4 +1,4 @@
-//! Baking whole scenes: what is straight stays exact, what is not stays within the tolerance, and every moment shows
+//! Baking whole scenes: what is straight stays exact, what is not stays within the tolerance, and every time shows
 //! every Gaussian once.
 
 use super::*;
@@ -153,7 +153,7 @@ fn straight_motion_of_every_life_is_exact() {
 
 #[test]
 fn the_general_way_finds_straight_motion_too() {
-    // The same scene twice: once as what it is, once behind a model that nobody can look into.
+    // The same scene twice: once as what it is, once behind an opaque model.
     let straight = scene(vec![layer(&spacetime(1, false), LifeKind::GaussHalf, 150, 0.3, 2.4)], 2.4);
     let mut hidden = straight.clone();
     hidden.layers[0].motion = Arc::new(Hidden(straight.layers[0].motion.clone()));
@@ -213,7 +213,7 @@ fn every_visible_gaussian_is_shown_once_at_every_time() {
         for pair in baked.nodes.windows(2) {
             assert!((pair[0].from, -pair[0].to) < (pair[1].from, -pair[1].to), "nodes are in order, each once");
         }
-        // Colours do not change, and so they tell which Gaussian a primitive came from.
+        // Colours do not change, and so they identify the Gaussian of a primitive.
         let color = |p: &Primitive| p.sh_rest[..9].iter().map(|c| c.to_bits()).collect::<Vec<_>>();
         let own = |id: usize| (3..12).map(|k| scene.layers[0].params[SH].get(id, k).to_bits()).collect::<Vec<_>>();
         let borders = baked.nodes.iter().flat_map(|n| [n.from, n.to.next_down()]);

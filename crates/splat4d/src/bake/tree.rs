@@ -12,7 +12,7 @@ const MAX_FRAMES: f64 = 1_000_000.0;
 const MAX_PARTS: f64 = 32.0;
 
 /// Borders of spans lie on frames, so that a frame is shown by one node a level and by no two. Where the take has few
-/// frames a second, what is called a frame here is a part of one: a player shows the moments between them too, and a
+/// frames a second, what is called a frame here is a part of one: a player shows the times between them too, and a
 /// model need not be straight there.
 ///
 /// The tree halves the clip at the borders of segments, and a segment, where motion demands it, frame by frame. Its

@@ -1,9 +1,10 @@
 //! How strongly images react to an error of each Gaussian, measured on renders of the model.
 //!
 //! A Gaussian behind a wall, or one of its neighbours' colour, may err by pixels without a trace; the edge of a sign may not.
-//! [`Importance::sensitivities`] gives the exact second moment of the image's gradient for each Gaussian alone. Some cameras
-//! at some times stand for all. Of a camera that moves, each time has its own pose: a Gaussian counts when that camera sees it.
-//! What no render sees keeps a share of what its size and opacity would weigh alone, so that it is not lost for other views.
+//! [`Importance::sensitivities`] gives the exact second moment of the image's gradient for each Gaussian alone. Some
+//! cameras at some times stand for all. Of a camera that moves, each time has its own pose: a Gaussian counts when that
+//! camera sees it. What no render sees keeps a share of what its size and opacity would weigh alone, so that it is not
+//! lost for other views.
 
 use super::sample::GEOMETRY;
 use super::sampling::Lookout;
@@ -13,7 +14,7 @@ use crate::render::{Importance, RenderConfig, Shot};
 use crate::scene::splats::{COV, SPLAT_OPACITY};
 use crate::scene::{Camera, Time};
 
-/// Renders of cameras that stand still, and of one that moves: enough that a rig and a clip are covered; each costs about
+/// Renders of fixed cameras, and of one that moves: enough that a rig and a clip are covered; each costs about
 /// three ordinary ones.
 pub(super) const STILL_RENDERS: usize = 12;
 /// See [`STILL_RENDERS`].
@@ -47,7 +48,7 @@ struct GaussianSums {
     energy: f64,
     /// Squared share of the image's pixels, mean squared error for a change of colour by 1.
     color: f64,
-    /// Renders of cameras that stand still at whose time it was there, and their part of `energy`.
+    /// Renders of fixed cameras at whose time it was there, and their part of `energy`.
     still: [f64; 2],
 }
 

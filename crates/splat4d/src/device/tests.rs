@@ -113,13 +113,13 @@ fn training_goes_on_on_the_cpu_with_the_very_gradients() {
     let (with_extra, without) = (returned(cpu(config).as_mut(), &extra), returned(cpu(config).as_mut(), &plain));
     for going_back in [false, true] {
         let mut backend = WithCpu::new(Box::new(Failing { renderer: Renderer::new(config), drawn: 0, going_back }));
-        // What it refuses is told once, and does not end it.
+        // What it refuses is reported once, and does not end it.
         for _ in 0..2 {
             assert!(returned(&mut backend, &extra) == with_extra);
         }
         assert!(backend.notice().is_some_and(|n| n.contains("blend further channels")) && backend.notice().is_none());
         assert!(returned(&mut backend, &plain) == without && backend.name() == "failing" && backend.notice().is_none());
-        // Its failure is told too, and nothing of the step is lost.
+        // Its failure is reported too, and nothing of the step is lost.
         assert!(returned(&mut backend, &plain) == without && backend.name() == CPU);
         let notice = backend.notice().expect("it is told");
         assert!(notice.contains("goes on on the CPU") && notice.contains("the driver is gone"), "{notice}");
@@ -361,7 +361,7 @@ fn every_backend_draws_what_the_oracle_draws() {
         }
     }
     let only = |r: &(&str, bool)| !r.1 && ["further channels", "a head"].contains(&r.0);
-    assert!(refused.iter().all(only), "the CPU draws everything, a GPU all but {refused:?}");
+    assert!(refused.iter().all(only), "the CPU renders everything, a GPU all but {refused:?}");
 }
 
 #[test]

@@ -71,7 +71,7 @@ pub(super) fn run(step: &Step, scene: &mut Scene<f32>, context: &dyn Context) ->
             Ok(count)
         }
         Step::Move { select, to, keys, about } => {
-            scene.without_head("an edit of places")?;
+            scene.without_head("an edit of positions")?;
             let (selected, count) = find(select, scene)?;
             match (to, keys.as_slice()) {
                 (Some(place), []) => put(scene, &selected, &similarity(place)?),
@@ -111,11 +111,11 @@ pub(super) fn run(step: &Step, scene: &mut Scene<f32>, context: &dyn Context) ->
             span(*from, *to)?;
             let clip = [scene.clip[0].max(*from), scene.clip[1].min(*to)];
             if clip[0] > clip[1] {
-                return Err(Error::input(format!("nothing of the clip lies between {from} and {to} s"))
+                return Err(Error::input(format!("the clip does not overlap {from} to {to} s"))
                     .remedy(format!("It goes from {} to {} s", scene.clip[0], scene.clip[1])));
             }
             let before = scene.len();
-            // The clip's last moment is seen, a window's end is not.
+            // The clip's last time is seen, a window's end is not.
             let part = [clip[0], clip[1].next_up()];
             let open = |layer: Layer<f32>, own: [f64; 2]| Layer { span: own, ..layer };
             let cut = |layer: &Layer<f32>| window(layer, part).map(|w| open(w, layer.span));
@@ -239,8 +239,10 @@ fn similarity(place: &Place) -> Result<Sim3> {
     let still = Sim3 { scale: place.scale.unwrap_or(1.0), rotation, translation: [0.0; 3] };
     let out = Sim3 { translation: sub(add(about, place.shift), still.apply(about)), ..still };
     if !out.is_sound() {
-        return Err(Error::input("a place is no similarity: its scale is not above zero, or a number is not finite")
-            .remedy("Write to = { shift = [0, 0, 1], turn = [0, 0, 1, 90], scale = 1.2, about = [0, 0, 0] }"));
+        return Err(Error::input(
+            "a transform is not a similarity: its scale is not above zero, or a number is not finite",
+        )
+        .remedy("Write to = { shift = [0, 0, 1], turn = [0, 0, 1, 90], scale = 1.2, about = [0, 0, 0] }"));
     }
     Ok(out)
 }
@@ -264,7 +266,7 @@ fn color_map(exposure: f64, tint: Option<[f64; 3]>, saturation: Option<f64>, cur
     }
     if !map.is_sound() || curve.len() == 1 {
         return Err(Error::input(
-            "colours are mapped by numbers that are not finite, or a curve whose corners do not rise",
+            "the colour map has numbers that are not finite, or a curve whose points are not in ascending order",
         )
         .remedy("Write curve = [[0, 0], [0.5, 0.6], [1, 1]]"));
     }

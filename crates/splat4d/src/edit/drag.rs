@@ -16,7 +16,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-/// Nodes unless told (SC-GS).
+/// Nodes by default (SC-GS).
 const NODES: usize = 512;
 /// Rounds of turning and moving: after these no eye sees a difference.
 const ROUNDS: usize = 8;
@@ -202,14 +202,14 @@ fn unmoved(rest: &[[f64; 3]]) -> Vec<NodeOffset> {
     rest.iter().map(|x| (*x, [0.0; 3], [1.0, 0.0, 0.0, 0.0])).collect()
 }
 
-/// A drag under the hand: one moment of a scene, of which nodes are pulled again and again. What is shown is what a step with
-/// the same nodes, handles and pins makes of that moment; away from the second at which places are meant nearly so, because who
-/// follows which node is then told by where all are now.
+/// A drag under the hand: one time of a scene, of which nodes are pulled again and again. What is shown is what a step
+/// with the same nodes, handles and pins makes of that time; away from the second at which places are meant nearly so,
+/// because who follows which node then depends on their current positions.
 #[derive(Clone, Debug)]
 pub struct Dragging {
     scene: Scene<f32>,
     elastic: Elastic,
-    /// Where the nodes are meant, and where they are at the moment that is shown.
+    /// Where the nodes are meant, and where they are at the time that is shown.
     places: Vec<[f64; 3]>,
     nodes: Vec<[f64; 3]>,
     /// Of the layers that bend: their place, and which nodes pull their rows.
@@ -274,7 +274,7 @@ impl Dragging {
         &self.nodes
     }
 
-    /// The moment as it is bent now: the same at any time.
+    /// The time as it is bent now: the same at any time.
     pub fn scene(&self) -> &Scene<f32> {
         &self.scene
     }
@@ -307,10 +307,10 @@ fn fill(layer: &mut Layer<f32>, offsets: &NodeOffsets) {
     edited.fill_drag(offsets, &mut layer.params);
 }
 
-/// Places of nodes at one moment, and [moments, nodes] at all of them.
+/// Places of nodes at one time, and [times, nodes] at all of them.
 type Carried = (Vec<[f64; 3]>, Vec<Vec<[f64; 3]>>);
 
-/// Nodes at the moment `first` of `times`, and at all of them: the model's own, or new ones that are followed.
+/// Nodes at the time `first` of `times`, and at all of them: the model's own, or new ones that are followed.
 fn carried(
     scene: &Scene<f32>,
     selected: &Selected,
@@ -417,7 +417,7 @@ fn pulls(layer: &Layer<f32>, bend: &Bend<'_>, neighbours: usize) -> Vec<(u32, f3
     let mut out = vec![(0, 0.0); spans.len() * neighbours];
     let questions: Vec<(Rows<'_>, Time)> =
         asked.iter().zip(bend.times).map(|(ids, t)| (Rows::Some(ids), Time(*t))).collect();
-    // Tables that pull nobody yet: the answer is that of the model inside.
+    // Tables without any pull yet: the result is that of the model inside.
     sweep(layer, &questions, |k, tape| {
         let nodes = &bend.paths[k];
         let one = |j: usize| {

@@ -1,4 +1,4 @@
-//! Selections evaluated over time: every Gaussian is looked at at some moments of its own life.
+//! Selections evaluated over time: every Gaussian is looked at at some times of its own life.
 
 use super::select::Expr;
 use super::{Context, Mask};
@@ -11,9 +11,9 @@ use crate::scene::splats::{COV, SPLAT_OPACITY};
 use crate::scene::{Camera, Color, GEOMETRY, Rows, Space, Table, Time, features, labels};
 use crate::{Error, Result};
 
-/// Moments at which a Gaussian is looked at, at most, evenly over its life: a bit each.
+/// Times at which a Gaussian is looked at, at most, evenly over its life: a bit each.
 const LOOKS: usize = 8;
-/// Moments of the clip at which neighbours are sought.
+/// Times of the clip at which neighbours are sought.
 const NEIGHBOUR_LOOKS: usize = 8;
 /// Share of the images that have a Gaussian in them in which it must lie on the subject: others may hide it, whose
 /// masks
@@ -23,7 +23,7 @@ const ON_SUBJECT: f32 = 0.75;
 /// By layer and Gaussian: whether it is meant.
 pub type Selected = Vec<Vec<bool>>;
 
-/// Selects in a scene. A predicate of places holds for a Gaussian where it holds at more than half of the moments of its
+/// Selects in a scene. A predicate of places holds for a Gaussian where it holds at more than half of the times of its
 /// life that are looked at; `ever`, `always` and `at` say otherwise.
 ///
 /// Errors: names of cameras, layers or masks that there are not; masks of another size than their camera.
@@ -49,7 +49,7 @@ struct Looks(Vec<LayerLooks>);
 /// A time, the rows that are looked at then, and which of its looks it is for each.
 type Query<'a> = (Time, &'a (Vec<u32>, Vec<u8>));
 
-/// By layer and row: bit i stands for moment i of the row.
+/// By layer and row: bit i stands for time i of the row.
 type Bits = Vec<Vec<u8>>;
 
 impl Looks {
@@ -160,7 +160,7 @@ fn all(count: u8) -> u8 {
     ((1u16 << count) - 1) as u8
 }
 
-/// The rows whose features are like those of the Gaussian that is nearest to a place at any moment that is looked at.
+/// The rows whose features are like those of the Gaussian that is nearest to a place at any time that is looked at.
 ///
 /// Errors: the scene has no features.
 fn alike(scene: &Scene<f32>, looks: &Looks, place: [f64; 3], least: f64) -> Result<Selected> {
@@ -189,7 +189,7 @@ fn alike(scene: &Scene<f32>, looks: &Looks, place: [f64; 3], least: f64) -> Resu
     Ok((0..scene.layers.len()).map(|l| (0..scene.layers[l].params.len()).map(|r| like(l, r)).collect()).collect())
 }
 
-/// The rows for which a selection holds at most moments.
+/// The rows for which a selection holds at most times.
 fn most(bits: &Bits, looks: &Looks) -> Selected {
     let of = |(bits, looks): (&Vec<u8>, &LayerLooks)| {
         bits.iter().zip(&looks.count).map(|(b, n)| 2 * (b & all(*n)).count_ones() > u32::from(*n)).collect()
@@ -346,7 +346,7 @@ fn subject(scene: &Scene<f32>, context: &dyn Context) -> Result<Selected> {
     Ok(votes.iter().map(|v| v.iter().map(inside).collect()).collect())
 }
 
-/// The selected Gaussians and those that come within `distance` of one of them at some moment.
+/// The selected Gaussians and those that come within `distance` of one of them at some time.
 fn grown(scene: &Scene<f32>, mut selected: Selected, distance: f64) -> Selected {
     let [start, end] = scene.clip;
     let moments = if end > start { NEIGHBOUR_LOOKS } else { 1 };

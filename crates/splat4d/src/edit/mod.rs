@@ -53,7 +53,7 @@ impl Edits {
     /// Refuses lists that this version does not know, and those for another scene.
     pub fn check(&self, title: &str) -> Result<()> {
         if self.version != VERSION {
-            let what = format!("the edits have version {}, this splat4d knows {VERSION}", self.version);
+            let what = format!("the edits have version {}, this splat4d supports {VERSION}", self.version);
             return Err(Error::new(ErrorKind::Unsupported, what).remedy("Install a newer splat4d"));
         }
         if let Some(scene) = self.scene.as_ref().filter(|s| *s != title) {
@@ -166,7 +166,7 @@ pub enum Step {
         #[serde(default)]
         about: Option<[f64; 3]>,
     },
-    /// The same once more, as layers of another name.
+    /// The same again, as layers of another name.
     Duplicate {
         /// What.
         select: String,
@@ -285,7 +285,7 @@ pub struct Mask {
 pub trait Context {
     /// The camera of that name.
     fn camera(&self, name: &str) -> Result<Camera> {
-        Err(missing(&format!("camera `{name}`"), "Give a run folder, or a file that brings its cameras along"))
+        Err(missing(&format!("camera `{name}`"), "Give a run folder, or a file with cameras"))
     }
 
     /// The mask image of that name, for images of `camera`: of another size it need not be decoded.

@@ -53,7 +53,7 @@ pub enum Expr {
     Subject,
     /// What holds at that second.
     At(f64, Box<Expr>),
-    /// What holds at any moment of a Gaussian's life.
+    /// What holds at any time of a Gaussian's life.
     Ever(Box<Expr>),
     /// What holds at all of them.
     Always(Box<Expr>),

@@ -345,7 +345,7 @@ fn keys_move_over_time() {
         assert!(psnr(&draw(&moved, 0.1), &draw(&s, 0.1)) > 90.0);
         assert!(psnr(&draw(&moved, 0.5), &draw(&at("[0.3, 0, 0]", 30.0), 0.5)) > 60.0);
         assert!(psnr(&draw(&moved, 0.9), &draw(&at("[0.6, 0, 0]", 60.0), 0.9)) > 60.0);
-        // A single key holds at all times, and a moment taken out has it.
+        // A single key holds at all times, and a time taken out has it.
         let one = run(r#"[{"do": "move", "select": "all", "keys": [{"t": 0, "shift": [0.3, 0, 0]}]}]"#, &s).unwrap();
         let frozen = crate::layers::moment(&one, Time(0.4)).unwrap();
         let still = Layer::new("now", frozen, std::sync::Arc::new(crate::motion::Still), LifeKind::Infinite);
@@ -666,7 +666,7 @@ fn the_preview_of_a_drag_equals_its_step() {
                 Step::Drag { select: "all".into(), at: 0.5, nodes: 24, handles: vec![handle], pins: pins.to_vec() };
             let (bent, _) = replay(&[step], scene.clone(), &bench, &mut |_, _| {}).unwrap();
             let same = psnr(&draw(&bent, now), &draw(dragging.scene(), 0.0));
-            // Elsewhere in time it is told by other places who follows whom.
+            // Elsewhere in time other positions decide which Gaussian follows which node.
             assert!(same > if now == 0.5 { 50.0 } else { 36.0 }, "{same} dB at {now}");
             assert!(psnr(&draw(&scene, now), &draw(dragging.scene(), 0.0)) < 35.0, "something was bent");
             dragging.pull(&[], &[]).unwrap();

@@ -1,8 +1,9 @@
 //! From flow in images back to flow in space: one camera with depth, several cameras without; integration over frames
 //! and how far it drifts.
 //!
-//! One camera cannot tell motion along its rays: with the depth of one frame alone ([`lift_in_plane`]) that part is left
-//! out, with both frames' depths ([`lift`]) it is there, and with three or more cameras ([`triangulate`]) it follows.
+//! One camera cannot observe motion along its rays: with the depth of one frame alone ([`lift_in_plane`]) that part is
+//! left out, with both frames' depths ([`lift`]) it is there, and with three or more cameras ([`triangulate`]) it
+//! follows.
 
 use crate::math::sym3;
 use crate::scene::Camera;

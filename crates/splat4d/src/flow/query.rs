@@ -5,7 +5,7 @@
 //! the pixel's weight is reached (what a translucent edge lets through behind it has another motion), and its point lies on
 //! the pixel's ray at that depth. A place belongs to the Gaussians nearest to it. They carry the point on by their mean
 //! displacement; where half of them have died, the nearest that live on take over, so that points are followed through
-//! models whose Gaussians live for moments, at the price of the drift of an integration.
+//! models with short lifespans, at the price of the drift of an integration.
 
 use super::tracks::Member;
 use crate::layers::{Evaluation, Scene};
@@ -45,7 +45,7 @@ pub struct Query {
     pub place: Place,
 }
 
-/// Where points are at some moments.
+/// Where points are at some times.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Followed {
     /// Seconds.
@@ -57,7 +57,7 @@ pub struct Followed {
 }
 
 impl Followed {
-    /// One query's places, a moment each.
+    /// One query's places, a time each.
     pub fn path(&self, query: usize) -> &[Option<[f64; 3]>] {
         &self.points[query * self.times.len()..(query + 1) * self.times.len()]
     }
@@ -89,7 +89,7 @@ pub fn follow(scene: &Scene<f32>, queries: &[Query], times: &[f64]) -> Followed 
     };
     let columns: Vec<(usize, usize)> = times.iter().enumerate().map(|(c, &t)| (index(t), c)).collect();
     let column = |k: usize| columns.binary_search_by_key(&k, |c| c.0).ok().map(|i| columns[i].1);
-    // Before the first query and behind the last nobody is on the way in the one direction and the other.
+    // Before the first query and behind the last nothing moves in either direction.
     let (first, last) = (begins.iter().min().copied().unwrap_or(0), begins.iter().max().copied().unwrap_or(0));
     let forwards: Vec<usize> = (first..moments.len()).collect();
     let backwards: Vec<usize> = (0..(last + 1).min(moments.len())).rev().collect();
@@ -143,7 +143,7 @@ pub fn sights(scene: &Scene<f32>, camera: &Camera, t: Time, points: &[Option<[f6
     points.par_iter().map(sight).collect()
 }
 
-/// The points whose queries are of moment k.
+/// The points whose queries are of time k.
 fn begin(
     scene: &Scene<f32>,
     now: &ActiveGaussians,

@@ -1,7 +1,7 @@
 //! Tracks: where chosen Gaussians are over time, for any motion model, as data and as JSON or CSV text.
 //!
 //! A track is as honest as its Gaussian is lasting: a model whose Gaussians are born and die gives short ones, and
-//! moments at which a Gaussian is not alive have no position.
+//! times at which a Gaussian is not alive have no position.
 
 use crate::layers::{Evaluation, Scene};
 use crate::math::Real;
@@ -17,7 +17,7 @@ pub struct Member {
     pub row: u32,
 }
 
-/// Where some Gaussians are at some moments.
+/// Where some Gaussians are at some times.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Tracks {
     /// Seconds.
@@ -57,7 +57,7 @@ impl Tracks {
         Self { times: times.to_vec(), members, points }
     }
 
-    /// One member's positions, a moment each.
+    /// One member's positions, a time each.
     pub fn track(&self, member: usize) -> &[Option<[f32; 3]>] {
         &self.points[member * self.times.len()..(member + 1) * self.times.len()]
     }
@@ -85,7 +85,8 @@ impl Tracks {
         out
     }
 
-    /// With `offset` added in f64. As CSV: a header `layer,gaussian,time,x,y,z` and a line for every moment at which a Gaussian is alive.
+    /// With `offset` added in f64. As CSV: a header `layer,gaussian,time,x,y,z` and a line for every time at which a
+    /// Gaussian is alive.
     pub fn to_csv<F: Real>(&self, scene: &Scene<F>, offset: [f64; 3]) -> String {
         let mut out = csv::Writer::from_writer(Vec::new());
         out.write_record(["layer", "gaussian", "time", "x", "y", "z"]).expect("memory takes every row");

@@ -46,7 +46,7 @@ pub struct Dialect {
 /// How a dialect is written. Writers say what was left out.
 #[derive(Clone, Copy)]
 pub enum Writer {
-    /// One moment.
+    /// One time.
     Moment(fn(&Params, &WriteOptions, &mut dyn Write) -> Result<Warnings>),
     /// A moving scene.
     Moving(fn(&Scene<f32>, &WriteOptions, &mut dyn Write) -> Result<Warnings>),
@@ -137,7 +137,7 @@ impl Dialect {
         DIALECTS.iter().rev().find(|d| d.mark.is_some_and(|mark| mark(bytes))).copied()
     }
 
-    /// What a file is by its content; by the ending of its name where nothing in the content could tell it.
+    /// What a file is by its content; by the ending of its name where the content does not decide.
     pub fn of_file(name: &str, bytes: &[u8]) -> Option<Self> {
         Self::of(bytes).or_else(|| Self::by_ending(name).filter(|d| d.mark.is_none()))
     }
@@ -183,7 +183,7 @@ impl Dialect {
     }
 
     /// Writes a scene, whose axes are taken as they are; of a scene that moves, a dialect that does not gets the clip's
-    /// first moment. Says what was left out.
+    /// first time. Says what was left out.
     ///
     /// Errors: it is only read; it cannot hold the scene, or what it should of it; a number is NaN or infinite; the sink's.
     pub fn write(&self, scene: &Scene<f32>, options: &WriteOptions, out: &mut dyn Write) -> Result<Warnings> {
@@ -310,7 +310,7 @@ mod tests {
         assert_eq!(Dialect::by_ending("a.COMPRESSED.ply"), Some(ply::COMPRESSED));
         assert_eq!(Dialect::by_ending("a.b.ply"), Some(ply::DIALECT));
         assert_eq!(Dialect::by_ending("ply"), None);
-        // An ending counts only where nothing else can tell.
+        // An ending counts only where nothing else decides.
         assert_eq!(Dialect::of_file("a.splat", b"GIF89a"), Some(splat::DIALECT));
         assert_eq!(Dialect::of_file("a.splat", &splatv::MAGIC), Some(splatv::DIALECT));
         assert_eq!(Dialect::of_file("a.ply", b"GIF89a"), None);

@@ -35,7 +35,7 @@ pub(super) fn duration(frames: Option<usize>, warnings: &mut Warnings) -> f64 {
             (n - 1) as f64 / DEFAULT_FPS
         }
         None => {
-            warnings.say("the file does not say how long it lasts: one second is assumed");
+            warnings.say("the file does not state its duration: one second is assumed");
             UNKNOWN_CLIP
         }
     }

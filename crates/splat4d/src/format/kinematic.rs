@@ -42,7 +42,7 @@ impl Clock {
 
     /// The clock assumed for a file that gives none.
     pub(super) fn assumed(warnings: &mut Warnings) -> Self {
-        warnings.say("the file does not say how long it lasts: one second is assumed");
+        warnings.say("the file does not state its duration: one second is assumed");
         Self { clip: [0.0, UNKNOWN_CLIP], fps: crate::scene::time::DEFAULT_FPS, duration: UNKNOWN_CLIP }
     }
 }
@@ -70,7 +70,7 @@ pub(super) struct Moving {
 }
 
 impl Moving {
-    /// The same motion told from another centre: the polynomial is expanded there, exactly. The fade moves along.
+    /// The same motion about another centre: the polynomial is expanded there, exactly. The fade moves along.
     pub(super) fn recentered(mut self, center: f64) -> Self {
         let d = center - self.center;
         let [a, b, c] = self.path;
@@ -124,12 +124,12 @@ pub(super) fn rows(
                 cross_fade: layer.cross_fade,
                 clip: scene.clip,
             };
-            // The path is told from the life's centre, or from the layer's own origin.
+            // The path is relative to the lifespan's centre, or from the layer's own origin.
             let center = if columns > 0 { seen.life[0] } else { motion.origin };
             let fade = match seen.exact() {
                 Some(fade) => fade,
                 None if exact => {
-                    return Err(cannot_hold(layer, name, "lives that have a flat top or end at once"));
+                    return Err(cannot_hold(layer, name, "lifespans with a flat top or a hard end"));
                 }
                 None => {
                     let Some(fade) = seen.fit() else {
@@ -181,7 +181,7 @@ pub(super) fn rows(
 fn cannot_hold(layer: &Layer<f32>, name: &str, what: &str) -> Error {
     let text = format!("{name} cannot hold layer `{}`: it has {what}", layer.name);
     Error::new(ErrorKind::Unsupported, text)
-        .remedy("Write one moment (--time T), a file a frame (--frames), or .s4d, which holds every motion.")
+        .remedy("Write one time (--time T), a file a frame (--frames), or .s4d, which stores any motion.")
 }
 
 /// The scene of a file's Gaussians.
@@ -280,7 +280,7 @@ pub(super) mod tests {
                 let back = super::scene(&rows, clock).unwrap();
                 let [mean, cov, opacity] = apart(&scene, &back);
                 assert!(mean < 2e-5 && cov < 2e-5 && opacity < 2e-6, "{life:?} {order}: {mean} {cov} {opacity}");
-                // Told from other centres, the motion stays; the fade must move along, so that opacity is not compared.
+                // About other centres, the motion stays; the fade must move along, so that opacity is not compared.
                 let shifted: Vec<Moving> = rows.iter().map(|m| m.recentered(m.center + 0.1)).collect();
                 let [mean, cov, _] = apart(&scene, &super::scene(&shifted, clock).unwrap());
                 assert!(mean < 5e-5 && cov < 5e-5, "{life:?} {order}: {mean} {cov}");
@@ -317,7 +317,7 @@ pub(super) mod tests {
             assert_eq!(rows.len(), 30);
             let said = warnings.lines().join("\n");
             assert!(said.contains("of 30 Gaussians have a life with a flat top"), "{said}");
-            // Paths and shapes are what they were, told from another centre.
+            // Paths and shapes are unchanged, about another centre.
             let back = super::scene(&rows, clock).unwrap();
             let whole = Scene { layers: vec![Layer { span: ALWAYS, ..scene.layers[0].clone() }], ..scene.clone() };
             let [mean, cov, _] = apart(&whole, &back);

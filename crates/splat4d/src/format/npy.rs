@@ -312,7 +312,7 @@ impl<'a> Parser<'a> {
             let digits = self.rest.find(|c: char| !c.is_ascii_digit()).unwrap_or(self.rest.len());
             let (number, rest) = self.rest.split_at(digits);
             let Ok(number) = number.parse() else {
-                return Err(broken("the shape is not a list of lengths"));
+                return Err(broken("the shape is not a list of sizes"));
             };
             // Python 2 wrote long integers as `3L`.
             self.rest = rest.strip_prefix('L').unwrap_or(rest);

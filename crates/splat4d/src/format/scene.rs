@@ -121,7 +121,7 @@ pub fn spec_from_json(v: &Value) -> Result<Spec> {
     if !BUILT_IN.contains(&model.as_str()) {
         return Err(Error::new(
             ErrorKind::Unsupported,
-            format!("the scene moves by `{model}`, which this version does not know"),
+            format!("the scene moves by `{model}`, which this version does not support"),
         )
         .remedy("Open it with the splat4d that wrote it, or a newer one"));
     }
@@ -272,7 +272,7 @@ fn head(meta: &Value) -> Result<Head> {
     Head::from_name(&name).ok_or_else(|| {
         Error::new(
             ErrorKind::Unsupported,
-            format!("the scene has the pixel head `{name}`, which this version does not know"),
+            format!("the scene has the pixel head `{name}`, which this version does not support"),
         )
         .remedy("Open it with the splat4d that wrote it, or a newer one")
     })

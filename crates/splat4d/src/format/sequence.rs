@@ -7,7 +7,7 @@ use crate::scene::{GEOMETRY, LIFE, LifeKind, Params, SH};
 use crate::{Error, Result};
 use std::sync::Arc;
 
-/// Length of the soft ends of a frame's life, as a share of the frame: so short that no moment shows two frames, and long
+/// Length of the soft ends of a frame's life, as a share of the frame: so short that no time shows two frames, and long
 /// enough for f32 seconds.
 const SOFT: f64 = 1e-3;
 

@@ -49,7 +49,7 @@ pub fn write(scene: &Scene<f32>, options: &WriteOptions, out: &mut impl Write) -
     let mut warnings = Warnings::default();
     let span = scene.clip[1] - scene.clip[0];
     let fps = if scene.fps > 0.0 { scene.fps } else { crate::scene::time::DEFAULT_FPS };
-    // A single moment still needs a clock to stand on.
+    // A single time still needs a clock to stand on.
     let clock = Clock { clip: scene.clip, fps, duration: if span > 0.0 { span } else { 1.0 } };
     let rows = rows(scene, clock, ".splatv", options.exact, &mut warnings)?;
     let height = (rows.len() * ROW / 16).div_ceil(TEXTURE_WIDTH).max(1);
@@ -105,7 +105,7 @@ fn default_camera(rows: &[Moving]) -> Camera {
 }
 
 fn pack(m: &Moving, outside: &mut [bool; 2]) -> [u8; ROW] {
-    // f16 moves the centre by up to 1/4096; the path is told from where the centre really lands.
+    // f16 moves the centre by up to 1/4096; the path is relative to the rounded centre.
     let m = m.recentered(f64::from(f16_to_f32(f32_to_f16(m.center as f32))));
     let [colored, saturated] = outside;
     let mut half = |x: f64| {
@@ -149,7 +149,7 @@ pub fn read(bytes: &[u8]) -> Result<(Scene<f32>, Warnings)> {
     }
     let text: Value =
         serde_json::from_slice(c.take(length)?).map_err(|e| damaged(format!("its description is not JSON: {e}")))?;
-    let chunks = text.as_array().ok_or_else(|| damaged("its description is no list"))?;
+    let chunks = text.as_array().ok_or_else(|| damaged("its description is not a list"))?;
     for chunk in chunks {
         let size = chunk["size"].as_u64().and_then(|n| usize::try_from(n).ok());
         let size = size.ok_or_else(|| damaged("a chunk has no size"))?;

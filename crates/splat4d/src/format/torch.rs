@@ -272,7 +272,7 @@ impl<'a> Machine<'a> {
     fn words(&self, id: Id) -> Result<&str> {
         match &self.objects[id] {
             Value::Text(text) => Ok(text),
-            _ => Err(damaged("its pickle has a name that is no text")),
+            _ => Err(damaged("its pickle has a name that is not text")),
         }
     }
 
@@ -460,7 +460,7 @@ impl<'a> Machine<'a> {
     /// ("storage", class, key, place, numbers)
     fn storage(&self, id: Id) -> Result<Value> {
         let &[_, class, key, _, numbers] = self.items(id) else {
-            return Err(damaged("its pickle refers to something that is no storage"));
+            return Err(damaged("its pickle refers to an object that is not a storage"));
         };
         let Value::Global(class) = &self.objects[class] else { return Ok(Value::Opaque) };
         let (Some(kind), Some(numbers)) = (Kind::of(class), self.count(numbers)) else { return Ok(Value::Opaque) };

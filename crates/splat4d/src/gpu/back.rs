@@ -65,7 +65,7 @@ pub(super) struct Came {
     pub stages: [f64; STAGES],
 }
 
-/// Where a way back ends.
+/// Where a backward pass ends.
 #[derive(Clone, Copy)]
 pub(super) enum End {
     /// At sums of records, to which another band adds.
@@ -221,7 +221,7 @@ impl GpuRenderer {
         }
     }
 
-    /// Takes one band back; `again`: it must be listed and drawn once more; `last`: with what came of the splats.
+    /// Takes one band back; `again`: it must be listed and drawn again; `last`: with what came of the splats.
     fn return_band(
         &self,
         (band, pairs): (Band, usize),

@@ -16,7 +16,7 @@ pub(super) enum Stage {
     RasterizeBack,
     Gather,
     SplatsBack,
-    // Last, because the stages of one submission follow each other in this list, and a way back need not compare.
+    // Last, because the stages of one submission follow each other in this list, and a backward pass need not compare.
     Loss,
     // Those of tables that stay on the GPU.
     Answer,

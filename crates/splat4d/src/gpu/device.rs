@@ -52,7 +52,7 @@ impl Gpu {
         let Some(adapter) = found.into_iter().min_by_key(|a| rank(a.get_info().device_type)) else {
             let software = adapters == Adapters::Hardware && !all_adapters().is_empty();
             let what = if software {
-                "there is no GPU, only a driver that computes on the CPU"
+                "no GPU found, only a driver that computes on the CPU"
             } else {
                 "no Vulkan, Metal or Direct3D 12 driver was found"
             };

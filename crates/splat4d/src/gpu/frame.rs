@@ -413,7 +413,7 @@ impl Back<'_> {
     }
 }
 
-/// Passes of eight bits that tell `tiles` tiles apart, and what belongs to none from them.
+/// Passes of eight bits that separate `tiles` tiles, and splats without a tile.
 pub(super) fn tile_passes(tiles: usize) -> usize {
     let bits = usize::BITS - tiles.leading_zeros();
     (bits as usize).div_ceil(8).clamp(1, TILE_PASSES)

@@ -275,12 +275,12 @@ impl ResidentKernels {
     }
 }
 
-/// Threads of a workgroup of the blend's way back with subgroups, and splats that it reads at a time where subgroups have 8 threads
-/// (subgroup_sums.wgsl).
+/// Threads of a workgroup of the blend's backward pass with subgroups, and splats that it reads at a time where
+/// subgroups have 8 threads (subgroup_sums.wgsl).
 const BACK_THREADS: usize = 64;
 const BACK_SPLATS: usize = 16;
 
-/// The blend's way back that this device and its tuning want.
+/// The blend's backward pass that this device and its tuning want.
 fn rasterize_back(gpu: &Gpu) -> String {
     match (gpu.has_subgroups(), gpu.tuning.back_vectors) {
         (false, _) => wgsl::RASTERIZE_BACK.into(),

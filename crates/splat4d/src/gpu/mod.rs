@@ -193,7 +193,7 @@ impl GpuRenderer {
         if n > MOST_GROUPS * THREADS {
             return Err(Error::new(
                 ErrorKind::Unsupported,
-                format!("{n} Gaussians at one moment are too many for the GPU"),
+                format!("{n} Gaussians at one time are too many for the GPU"),
             )
             .remedy("Render on the CPU."));
         }
@@ -356,7 +356,7 @@ impl GpuRenderer {
         let start = Instant::now();
         recorder.submit();
         let staging = b.staging.get();
-        // Failing to map is told by the view below, or by the device's own error.
+        // A failed map shows in the view below, or as the device's own error.
         staging.map_async(wgpu::MapMode::Read, .., |_| ());
         gpu.wait()?;
         let lost = |e: wgpu::MapRangeError| {

@@ -8,7 +8,7 @@ use crate::{ErrorKind, Result};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
-/// Bytes of images that are kept unless somebody says otherwise: two hundred of 1080p, which cards with 4 GiB have
+/// Bytes of images that are kept by default: two hundred of 1080p, which cards with 4 GiB have
 /// next to a
 /// million Gaussians.
 pub(super) const PICTURE_BYTES: u64 = 2 << 30;

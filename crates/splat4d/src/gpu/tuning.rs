@@ -16,9 +16,10 @@ pub struct Tuning {
     pub subgroups: bool,
     /// Whether the sorts' last dispatch uses them too: no bit depends on it.
     pub sort_subgroups: bool,
-    /// Whether its way back with subgroups holds pixels in vectors (rasterize_back_vector.wgsl): changes last bits.
+    /// Whether its backward pass with subgroups holds pixels in vectors (rasterize_back_vector.wgsl): changes last
+    /// bits.
     pub back_vectors: bool,
-    /// Splats of a round of its way back without them.
+    /// Splats of a round of its backward pass without them.
     pub back_round: usize,
 }
 

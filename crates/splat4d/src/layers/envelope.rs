@@ -1,4 +1,4 @@
-//! The life of a layer's Gaussians as loops over lanes: who is alive, the envelope, and its way back.
+//! The life of a layer's Gaussians as loops over lanes: who is alive, the envelope, and its backward pass.
 
 use super::ALPHA_MIN;
 use crate::math::Real;

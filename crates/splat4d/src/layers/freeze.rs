@@ -1,4 +1,4 @@
-//! A moving scene at one moment as plain Gaussians: what a 3DGS file can hold.
+//! A moving scene at one time as plain Gaussians: what a 3DGS file can hold.
 
 use super::{Evaluation, Layer, LayerTape, Scene};
 use crate::Result;
@@ -37,7 +37,7 @@ pub fn freeze(scene: &Scene<f32>, time: Time) -> Result<Params<f32>> {
     Ok(params)
 }
 
-/// The same, but what stands still anyway keeps its very bits.
+/// The same, but the static background anyway keeps its very bits.
 pub fn moment(scene: &Scene<f32>, time: Time) -> Result<Params<f32>> {
     scene.without_head("plain Gaussians")?;
     match &scene.layers[..] {

@@ -83,7 +83,7 @@ impl Change {
                 bad("clock has no rate, or a rate of zero")
             }
             Change::Path { about, keys } if !path::sound(about, keys) => {
-                bad("path has no keys, or keys that are no similarities")
+                bad("path has no keys, or keys that are not similarities")
             }
             Change::Fade { keys } if !path::sound_fades(keys) => bad("fade has no keys, or factors beyond 0 to 1"),
             Change::Color { map } if !map.is_sound() => bad("colours are mapped by numbers that are none"),

@@ -375,7 +375,8 @@ impl<F: Real> Motion<F> for Filtered<F> {
         let own = tape.own.get_or_default::<Own<F>>();
         let (baseline, history) = (self.spec.baseline, self.spec.history);
         let back = !self.spec.stop_gradient;
-        // Gradients to states by frames earlier; each becomes that to the observation of its frame as the chain goes back.
+        // Gradients to states by frames earlier; each becomes that to the observation of its frame along the backward
+        // chain.
         let mut d_states = std::mem::take(&mut own.d);
         d_states.resize_with(history + 2 + baseline, Table::default);
         for (k, table) in d_states.iter_mut().enumerate().filter(|(k, _)| back || [0, 1, 1 + baseline].contains(k)) {

@@ -33,7 +33,7 @@ pub struct Capabilities {
     /// State runs forward in time: an answer at t depends on no number that stands for a later time, so that what follows
     /// can be learnt or cut off without a change of what was.
     pub causal: bool,
-    /// Fixed cameras that must see every moment for the model to be learnt.
+    /// Fixed cameras that must see every time for the model to be learnt.
     pub fixed_cameras: usize,
     /// Blocks of spherical harmonics in the layer's SH table.
     pub color_blocks: usize,
@@ -110,7 +110,7 @@ impl Polynomial {
     ///
     /// Panics: the layer's Gaussians live for ever.
     pub fn recentre<F: Real>(&self, p: &mut Params<F>, row: usize, shift: f64) {
-        assert!(p[LIFE].width() > 0, "who lives for ever has no centre of life to move");
+        assert!(p[LIFE].width() > 0, "a Gaussian without lifespan has no temporal centre to move");
         let travel = self.travel(p, row, shift);
         p[GEOMETRY].add(row, 0, travel.map(F::of));
         if let Some(key) = self.velocities {
@@ -213,7 +213,7 @@ macro_rules! registry {
                 $(Spec::$w_variant($w_bound) => Model::build($wrapper, p),)*
                 Spec::Custom(name) => outside::build(name, p).unwrap_or_else(|| {
                     Err(Error::input(format!("motion model `{name}` is not one of this version's"))
-                        .remedy(format!("It knows: {}. A newer splat4d may know more", BUILT_IN.join(", "))))
+                        .remedy(format!("Known are: {}. A newer splat4d may have more", BUILT_IN.join(", "))))
                 }),
             }
         }

@@ -29,7 +29,7 @@ const PAGE: [(&str, usize); 2] = [("means", 3), ("quats", 4)];
 const PAGES: &str = "poses";
 /// Name of the table, and of its only column group, that says who is foreground: a logit.
 pub const FOREGROUND: &str = "foreground_logits";
-/// Cameras that must see every moment: with two, what moves along a line between them is not seen to move.
+/// Cameras that must see every time: with two, what moves along a line between them is not seen to move.
 pub const LEAST_CAMERAS: usize = 3;
 /// Most frames of a file that is believed: some nine hours at 30 a second.
 const MAX_FRAMES: usize = 1 << 20;

@@ -6,7 +6,7 @@
 
 use crate::math::Real;
 
-/// More levels than any precision could tell apart; files with more are refused.
+/// More levels than any precision could resolve; files with more are refused.
 pub(crate) const MAX_LEVELS: usize = 24;
 
 /// Numbers that [`encode`] makes of `inputs` numbers: inputs·(2·levels + 1).

@@ -268,8 +268,8 @@ impl Planes {
 }
 
 /// Fills a plane with bilinear blends of `points` by `points` random numbers a channel. Independent grid points, as the
-/// released code has them, give neighbours unrelated features, and networks learn for long before they can tell a motion
-/// of a region from noise: mutant at 200x200 reached 25.9 dB after 600 steps, and 30.1 dB from smooth planes.
+/// released code has them, give neighbours unrelated features, and networks train for long before they can separate a
+/// motion of a region from noise: mutant at 200x200 reached 25.9 dB after 600 steps, and 30.1 dB from smooth planes.
 fn smooth<F: Real>(data: &mut [F], size: [usize; 2], channels: usize, points: usize, stream: Rng) {
     let counts = size.map(|n| points.min(n));
     // The random point before a grid point, and how far that is on the way to the next.

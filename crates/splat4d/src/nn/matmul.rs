@@ -49,7 +49,7 @@ pub fn product<F: Real>(a: Matrix<'_, F>, b: Matrix<'_, F>, out: &mut [F], strid
     }
     // The kernels are fastest where columns of `out` are contiguous: out = a·b is then made as outᵀ = bᵀ·aᵀ.
     let (a, b, [row, column]) = if stride > 1 { (b.t(), a.t(), [1, stride]) } else { (a, b, [stride, 1]) };
-    let distance = |n: usize| isize::try_from(n).expect("a slice is no longer than isize can tell");
+    let distance = |n: usize| isize::try_from(n).expect("a slice is at most isize::MAX long");
     macro_rules! run {
         ($kernel:expr, $one:expr) => {
             // SAFETY: `fits` has found all three matrices inside their slices; `out` is borrowed alone, so nothing

@@ -24,7 +24,7 @@ pub struct Wanted {
 /// An image to draw.
 #[derive(Clone, Copy, Debug)]
 pub struct Shot<'a, F = f32> {
-    /// The scene at one instant.
+    /// The scene at one time.
     pub splats: &'a Splats<'a, F>,
     /// A pinhole; its size is the image's.
     pub camera: &'a Camera,
@@ -57,7 +57,7 @@ pub enum Tables {
     Changing,
     /// A layer's own SH table ([`crate::scene::Color::Sh`] with `base`) that lies at the same address and has the same
     /// size as in the last render is the same table, and is not sent again: right for a scene that is played, wrong
-    /// for one that learns. Everything else of an instant is sent all the same.
+    /// for one that learns. Everything else of a time is sent all the same.
     Constant,
 }
 
@@ -117,7 +117,7 @@ pub trait Backend<F: Real = f32>: Send {
     }
 
     /// Radius of every splat of the last render that was taken back: 3σ of the larger axis, pixels; 0: not drawn. Empty
-    /// where the backend has no way back.
+    /// where the backend has no backward pass.
     fn radii(&self) -> &[F];
 
     /// The limits that it draws with.

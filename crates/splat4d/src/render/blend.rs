@@ -4,7 +4,7 @@
 //! splats can touch it, and for each of these its rows of pixels go through one loop over eight lanes.
 //!
 //! α = min(α_max, o·g), g = exp(−½ dᵀ conic d); α < α_min is skipped; a pixel stops before T(1−α) would fall below
-//! T_min. Source: Kerbl et al. 2023; gradients are 0 where α is at its ceiling, as in gsplat.
+//! T_min. Source: Kerbl et al. 2023; gradients are 0 where α is at its maximum, as in gsplat.
 //!
 //! Backward walks in the same order as forward, so that it meets the same α, T and stops: what lies behind a splat is
 //! what the image holds less what has passed (as in Taming 3DGS, Mallick et al. 2024). It needs no record of the
@@ -580,7 +580,7 @@ impl<F: Real, const N: usize, const WITH_ABS: bool> Visit<F> for Returning<'_, F
                     light[c][l] = weight.fma::<FMA>(g[c][l], light[c][l]);
                 }
                 rest[l] = (-weight).fma::<FMA>(s, rest[l]);
-                // dL/d ln α = w s − α/(1−α)·rest; nothing passes where α is at its ceiling.
+                // dL/d ln α = w s − α/(1−α)·rest; nothing passes where α is at its maximum.
                 let v = (-odds[l]).fma::<FMA>(rest[l], weight * s);
                 let v = select(open & (alphas[l] < alpha_max), v, F::ZERO);
                 let vy = v * dy[l];

@@ -30,7 +30,7 @@ const SUMS: usize = HIDDEN * (FURTHER + 3) + HIDDEN + 3 * HIDDEN + 3;
 
 type Lane<F> = [F; BLOCK];
 
-/// Record of an image with a head for its way back; all memory is reused.
+/// Record of an image with a head for its backward pass; all memory is reused.
 #[derive(Debug, Default)]
 pub(super) struct Headed<F> {
     /// Further channels of every splat, the head's and then the caller's, [splats, 6 + C].

@@ -275,7 +275,7 @@ struct Pixel<F> {
     own: [F; CHANNELS],
     /// α/(1 − α) times what the pixel shows of all that lies behind: α T b. As `own`; 0 where the pixel has stopped.
     hidden: [F; CHANNELS],
-    /// Whether α follows the splat here: it does not where nothing is drawn or α is at its ceiling.
+    /// Whether α follows the splat here: it does not where nothing is drawn or α is at its maximum.
     felt: bool,
     /// The splat's centre less the pixel's, pixels.
     offset: [F; 2],

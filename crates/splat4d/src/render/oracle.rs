@@ -183,7 +183,7 @@ fn ray(camera: &Camera, x: usize, y: usize) -> [f64; 6] {
     [a, b, c, p, q, r]
 }
 
-/// σ(logit b + W₂ relu(W₁x)), the logit as far from 0 and 1 as 8 bits tell, and its tangents beyond.
+/// σ(logit b + W₂ relu(W₁x)), the logit as far from 0 and 1 as 8 bits resolve, and its tangents beyond.
 fn headed<F: Real>(head: &HeadWeights<'_, F>, base: [f64; 3], further: &[f64; FURTHER], ray: [f64; 6]) -> [f64; 3] {
     let x: Vec<f64> = further.iter().copied().chain(ray).collect();
     let row = |h: usize| (0..INPUTS).map(|i| head.first[h * INPUTS + i].f64() * x[i]).sum::<f64>().max(0.0);

@@ -213,7 +213,7 @@ pub struct ResidentNumbers {
 /// Keeps a scene's tables and takes steps on them: evaluate, draw, compare, back, Adam.
 ///
 /// Steps are begun and done later: several may be under way, whose results come in their order. What they come to does not depend on
-/// when anybody looks.
+/// when it is read.
 pub trait Resident {
     /// Takes over all layers, in place of whatever was kept; steps under way are forgotten. `corrections`: Adam's 1/(1 − β₁ⁿ) and
     /// 1/(1 − β₂ⁿ) by step count n, the last for all that follow.
@@ -233,7 +233,7 @@ pub trait Resident {
     /// Errors: the device failed, and nothing kept is to be trusted. Panics: nothing is kept.
     fn step(&mut self, step: &ResidentStep<'_>) -> Result<Option<Vec<ResidentStepped>>>;
 
-    /// The results of all steps that were begun, and not told yet. Errors: as of `step`.
+    /// The results of all steps that were begun, and not reported yet. Errors: as of `step`.
     fn finish(&mut self) -> Result<Vec<ResidentStepped>>;
 
     /// Milliseconds of the stages of the last view that is done, by the device's own clock; 0 where it has none.

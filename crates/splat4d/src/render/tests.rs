@@ -471,7 +471,7 @@ fn degenerate_splats_draw_what_the_oracle_draws() {
 
 #[test]
 fn no_gradient_passes_a_ceiling() {
-    // α is at its ceiling on every pixel: only colours and background may have a gradient.
+    // α is at its maximum on every pixel: only colours and background may have a gradient.
     let (out, rgb) = simple(&[([0.0, 0.0, 2.0], 1e4, 0.95)]);
     let view = frontal(20, 30.0);
     let config = RenderConfig { alpha_max: 0.5, ..complete() };

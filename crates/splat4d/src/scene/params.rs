@@ -375,7 +375,7 @@ impl<F: Real> Grads<F> {
         self.tables.get_disjoint_mut(keys.map(|k| k.0 as usize)).expect("keys of one layer must be distinct")
     }
 
-    /// As [`of`](Self::of) for a number of keys that only the model's sizes tell. Panics: a key stands twice.
+    /// As [`of`](Self::of) for a number of keys that only the model's sizes give. Panics: a key stands twice.
     pub fn many(&mut self, keys: &[Key]) -> Vec<&mut Table<F>> {
         let mut found: Vec<Option<&mut Table<F>>> = keys.iter().map(|_| None).collect();
         for (i, table) in self.tables.iter_mut().enumerate() {

@@ -1,4 +1,4 @@
-//! [`Splats`]: the scene at one instant, activated: all the renderer ever sees.
+//! [`Splats`]: the scene at one time, activated: all the renderer ever sees.
 
 use super::head::HeadWeights;
 use super::rows::Rows;
@@ -34,7 +34,7 @@ pub enum Color<'a, F = f32> {
     },
 }
 
-/// The splats of one layer at one instant.
+/// The splats of one layer at one time.
 #[derive(Clone, Copy, Debug)]
 pub struct Part<'a, F = f32> {
     /// [splats, 10]: world mean 3, world covariance 6, opacity 1 in (0,1), life and edits applied.
@@ -52,7 +52,7 @@ impl<'a, F: Real> Part<'a, F> {
     }
 }
 
-/// A scene at one instant: a part a layer. Splats are numbered through all parts in order.
+/// A scene at one time: a part a layer. Splats are numbered through all parts in order.
 #[derive(Clone, Debug, Default)]
 pub struct Splats<'a, F = f32> {
     /// One a layer.

@@ -208,7 +208,7 @@ fn baked(own: &Layer<f32>, placed: &Layer<f32>) {
         let shots = [0.0, 0.3, 0.5, 0.9].map(|t| (t, camera.clone()));
         let mut backend = splat4d::device::cpu(RenderConfig::default());
         compare(&scene, Shown::Nodes(&baked.nodes), &shots, backend.as_mut(), &mut |_, _| true)
-            .expect("the CPU draws everything")
+            .expect("the CPU renders everything")
             .expect("there are pictures")
             .psnr
     };

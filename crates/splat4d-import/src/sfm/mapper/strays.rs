@@ -6,8 +6,8 @@ use crate::sync::median;
 use rayon::prelude::*;
 
 impl Map<'_> {
-    /// Of every sight the matches that look alike, and those of them that lie on epipolar lines; of what stands still and of
-    /// what moves.
+    /// Of every sight the matches that look alike, and those of them that lie on epipolar lines; of the static
+    /// background and of what moves.
     pub(super) fn agreement(&self, links: &[Link]) -> Vec<[[usize; 2]; 2]> {
         let known: Vec<Option<tracks::Known>> =
             (0..self.sights.len()).into_par_iter().map(|s| self.stands(s)).collect();
@@ -30,11 +30,12 @@ impl Map<'_> {
     }
 }
 
-/// Cameras in which what moves contradicts the others, of what looks alike and what of it fits, of what stands still and of what
-/// moves: a share fits that is small against the other cameras', where what stands still fits. It shows another time, or another
-/// take. Of four cameras of the bundled capture, one of them half a second apart, 23 % and 57 to 62 %; together 64 to 73 %.
+/// Cameras in which what moves contradicts the others, of what looks alike and what of it fits, of the static
+/// background and of what moves: a share fits that is small against the other cameras', where the static background
+/// fits. It shows another time, or another take. Of four cameras of the bundled capture, one of them half a second
+/// apart, 23 % and 57 to 62 %; together 64 to 73 %.
 pub(super) fn of(told: &[[[usize; 2]; 2]]) -> Vec<bool> {
-    /// Matches that tell.
+    /// Matches that are needed.
     const TELL: usize = 40;
     /// Of the others' share.
     const LEAST: f64 = 0.5;

@@ -13,7 +13,7 @@ const FEW_REGISTERED: [f64; 2] = [0.9, 0.7];
 /// Adds the images that share a pose to `shots` and `files`, and says how many are without one.
 ///
 /// A pose can be shared where every camera has exactly one registered image: the usual way to calibrate a fixed rig is to
-/// reconstruct one instant.
+/// reconstruct one time.
 pub(super) fn settle(
     base: &Path,
     shots: &mut Vec<Shot>,
@@ -72,7 +72,7 @@ pub(super) fn settle(
             Severity::Note,
             format!(
                 "COLMAP registered {registered} of {all} images, one of each camera: {shared} others share the pose of their \
-                 camera, which is taken to be fixed. If cameras move, say --set capture.unregistered=leave."
+                 camera, which is assumed to be fixed. If cameras move, use --set capture.unregistered=leave."
             ),
         );
         return;
@@ -86,7 +86,7 @@ pub(super) fn settle(
         _ => "",
     };
     let fixed = match one_each {
-        true => " If the cameras are fixed, say --set capture.unregistered=share.",
+        true => " If the cameras are fixed, use --set capture.unregistered=share.",
         false => "",
     };
     let names: Vec<&str> = others.iter().map(|(name, _)| name.as_str()).collect();

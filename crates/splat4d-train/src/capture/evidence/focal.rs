@@ -22,7 +22,7 @@ const REACH: f64 = 1.0;
 const BETTER: f64 = 1.5;
 const ENOUGH: f64 = 30.0;
 const SHARE: f64 = 0.15;
-/// How well matches may fit half or twice the focal length, of as read, where they tell it.
+/// How well matches may fit half or twice the focal length, of as read, where they determine it.
 const FLAT: f64 = 0.7;
 /// By how much colours of points fit another focal length better, where that is right.
 const COLOURS: f64 = 0.1;

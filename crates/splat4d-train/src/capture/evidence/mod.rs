@@ -42,7 +42,7 @@ struct Measure {
 /// What [`Capture::check_poses`] found.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PoseCheck {
-    /// The convention that the poses are probably written in; `None`: as they were read, or it could not be told.
+    /// The convention that the poses are probably written in; `None`: as they were read, or undetermined.
     pub written_as: Option<Poses>,
     /// What was found, or why nothing could be.
     pub finding: Finding,
@@ -99,7 +99,8 @@ impl Capture {
             points::Unit::Unknown => findings.push(Finding {
                 severity: Severity::Note,
                 aspect: Some(Aspect::NotChecked),
-                what: "Whether depth maps are in scene units: neither initial points nor other maps tell it.".into(),
+                what: "Whether depth maps are in scene units: neither initial points nor other maps allow a check."
+                    .into(),
                 remedy: String::new(),
             }),
             points::Unit::Wrong(ratio, by, file) => {
@@ -141,7 +142,7 @@ impl Capture {
         self.conclude(&conventions, &measures)
     }
 
-    /// The frames that are looked at: cameras of one instant in their order, or frames of a moving camera in a row.
+    /// The frames that are looked at: cameras of one time in their order, or frames of a moving camera in a row.
     fn looked_at(&self) -> Vec<usize> {
         let pixels = self.frames.first().map_or(1, |f| f.source.width * f.source.height).max(1);
         let most = (PIXELS / pixels).clamp(LOOKS[0], LOOKS[1]);
@@ -282,7 +283,7 @@ fn check_masks(looks: &[SmallImage], poses: &[Se3]) -> Option<Finding> {
 }
 
 /// Whether poses describe upright images (with their EXIF orientation applied), by colours of points and by matches between
-/// images; `None`: it cannot be told. `unsure` are frames whose sizes do not tell.
+/// images; `None`: undetermined. `unsure` are frames whose sizes do not decide.
 pub(super) fn upright(capture: &Capture, unsure: &[usize]) -> Option<bool> {
     let others = (0..capture.frames.len()).filter(|i| !unsure.contains(i)).take(LOOKS[0]);
     let some: Vec<usize> = unsure.iter().copied().take(LOOKS[1] - LOOKS[0]).collect();
@@ -338,7 +339,7 @@ impl Measure {
                 Some(Aspect::NotChecked),
                 format!(
                     "Whether the poses are right: {} initial points, of which {:.0} % are in images, and {} matches between \
-                     images, of which {} fit, say too little.",
+                     images, of which {} fit, are too few.",
                     self.points.asked,
                     100.0 * self.points.seen,
                     self.pairs.matches,

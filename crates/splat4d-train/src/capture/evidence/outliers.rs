@@ -157,7 +157,8 @@ impl Strange {
             100.0 * self.gains[0].max(0.0),
             100.0 * self.gains[1]
         );
-        let remedy = "Check that the image shows what its name says, that it is not turned or black, and that its pose is right.";
+        let remedy =
+            "Check that the image matches its name, that it is not turned or black, and that its pose is right.";
         Finding { severity: Severity::Warning, aspect: Some(Aspect::Assumed), what, remedy: remedy.into() }
     }
 }
@@ -367,7 +368,7 @@ mod tests {
         let pair = |a: usize, b: usize, fitting: usize| Pair { looks: [a, b], matches: 40, fitting };
         let pairs = [pair(0, 1, 30), pair(1, 2, 2), pair(0, 2, 1), pair(2, 3, 0), pair(3, 4, 28), pair(1, 3, 25)];
         assert_eq!(wrong(5, &pairs), [2]);
-        // Of two images alone nobody knows which is wrong.
+        // Of two images alone it is not known which is wrong.
         assert!(wrong(2, &pairs[1..2]).is_empty());
         let moving: Vec<Pair> = (0..5).map(|k| pair(k, k + 1, 3)).chain([pair(5, 6, 30)]).collect();
         assert!(wrong(7, &moving).len() <= 1);

@@ -14,7 +14,7 @@ pub(super) const STRICT: f64 = 0.7;
 const NEAR: f64 = 1.5;
 /// Angle between rays below which nothing says which side of the cameras they meet on, radians.
 const PARALLEL: f64 = 0.006;
-/// Of the cameras' spread: cameras nearer to one another stand in one place.
+/// Of the cameras' spread: cameras nearer to one another have the same position.
 const ONE_PLACE: f64 = 1e-6;
 /// Matches that one convention fits and the other does not, at least, and how many times as many as the other way round.
 const MORE: (usize, usize) = (20, 4);
@@ -169,8 +169,8 @@ pub(super) fn distance(m: &Match, looks: &[SmallImage], poses: &[Se3]) -> f64 {
     0.5 * (looks[a].focal() + looks[b].focal()) * offset(m, &motion, in_one_place)
 }
 
-/// The Sampson distance of a match from its epipolar line, or of the turned ray where the cameras stand in one place; in
-/// units of the focal length.
+/// The Sampson distance of a match from its epipolar line, or of the turned ray where the cameras have the same
+/// position; in units of the focal length.
 fn offset(m: &Match, motion: &Se3, in_one_place: bool) -> f64 {
     let [p, q] = m.rays.map(|[x, y]| [x, y, 1.0]);
     let turned = mat_vec(&motion.rotation, p);

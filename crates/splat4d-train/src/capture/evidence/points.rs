@@ -174,7 +174,7 @@ pub(super) fn blind(capture: &Capture) -> Vec<usize> {
 const MAPS: usize = 3;
 const IN_MAP: usize = 30;
 const SAME_UNIT: f64 = 2.0;
-/// Between the quarters of the ratios: where they are farther apart than this factor, they tell no unit.
+/// Between the quarters of the ratios: where they are farther apart than this factor, they determine no unit.
 const STEADY: f64 = 3.0;
 
 /// Views with metric depth that are compared, evenly chosen.
@@ -184,7 +184,7 @@ fn with_depth(capture: &Capture) -> Vec<&Frame> {
     frames.iter().step_by(frames.len().div_ceil(MAPS).max(1)).copied().collect()
 }
 
-/// How many times as far away points are as metric depth maps say, and a map's file. `None`: it cannot be told.
+/// How many times as far away points are as metric depth maps say, and a map's file. `None`: undetermined.
 fn by_points(capture: &Capture) -> Option<f64> {
     let cloud = capture.points.as_ref()?;
     let mut ratios = Vec::new();
@@ -306,7 +306,7 @@ pub(super) enum Unit<'a> {
     Right,
     /// How many times as far away things are as they say, the evidence, and a map's file.
     Wrong(f64, &'static str, &'a DepthFile),
-    /// Neither points nor other maps tell it.
+    /// Neither points nor other maps determine it.
     Unknown,
 }
 

@@ -401,7 +401,7 @@ fn focal_lengths_are_named_by_points_and_by_matches() {
         assert!(!warns(&focal(1.0, points)), "what is right is not called wrong");
         for factor in [0.5, 2.0] {
             let found = focal(factor, points);
-            // Points tell the length; matches may fit others as well, which is said.
+            // Points determine the length; matches may fit others as well, which is reported.
             assert!(if points { warns(&found) } else { !found.is_empty() }, "{factor} {points}: {found:?}");
             let told = |f: &Finding| f.what.split(" if they are ").nth(1)?.split(' ').next()?.parse::<f64>().ok();
             if let Some(times) = found.iter().find_map(told) {

@@ -19,7 +19,7 @@ pub(super) const EXPORT: Export = Export { find, is, read };
 
 /// The usual name; others are looked into.
 const NAME: &str = "cameras.xml";
-/// Skew that is not worth a word, pixels.
+/// Skew that is not reported, pixels.
 const MAX_SKEW: f64 = 0.5;
 /// Bytes at the beginning of a file in which it names its elements.
 const HEAD: usize = 4096;

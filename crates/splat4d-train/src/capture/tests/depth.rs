@@ -53,7 +53,7 @@ fn maps_are_read_in_scene_units_and_reduced_on_one_surface_only() {
     assert!(load(&sample, 1, 0).unwrap().is_none(), "camera 0 has none");
     let (half, _) = load(&sample, 2, 2).unwrap().unwrap();
     assert!((half.get(0, 1, 3) - 1.0675).abs() < 1e-6 && half.get(0, 1, WIDTH / 2 - 1) == 0.0);
-    // An edge between a near and a far surface is nobody's depth.
+    // An edge between a near and a far surface is no surface's depth.
     let edge: Vec<f32> = (0..WIDTH * HEIGHT).map(|p| if p % WIDTH < 7 { 1.0 } else { 3.0 }).collect();
     write_npy(&sample, &[HEIGHT, WIDTH], &edge);
     sample.edit("capture.json", |v| v["cameras"][1]["depth_scale"] = json!(2.0));
@@ -169,7 +169,7 @@ fn what_is_no_depth_is_refused_by_file_and_frame() {
     write_npy(&sample, &[HEIGHT, WIDTH], &values);
     assert_says(&message(&sample), &["0005.npy", "(3, 1) is -0.001"]);
     write_npy(&sample, &[HEIGHT, WIDTH], &all(0.0));
-    assert_says(&message(&sample), &["0005.npy", "knows no pixel"]);
+    assert_says(&message(&sample), &["0005.npy", "depth map is empty"]);
     write_npy(&sample, &[WIDTH, HEIGHT], &all(2.0));
     assert_says(&message(&sample), &["0005.npy", "16x24", "24x16"]);
     write_npy(&sample, &[2, HEIGHT, WIDTH / 2], &all(2.0));

@@ -36,7 +36,7 @@ fn values_number_labels_and_the_largest_is_nobodys() {
     let labels = read(&capture.frames[2], &capture).unwrap().unwrap();
     let at = |x: usize, y: usize| labels[y * WIDTH + x];
     assert_eq!([at(3, 0), at(11, 1), at(12, 1), at(23, 15)], [UNKNOWN, 0, 1, 1]);
-    // A pixel of four that do not agree is nobody's.
+    // A pixel of four that do not agree has no label.
     let half = read(&open(&sample, 2).unwrap().frames[2], &open(&sample, 2).unwrap()).unwrap().unwrap();
     assert_eq!((half.len(), half[0], half[WIDTH / 2 + 5], half[WIDTH / 2 + 6]), (WIDTH * HEIGHT / 4, UNKNOWN, 0, 1));
     // The same in 16 bits.

@@ -160,7 +160,7 @@ fn cache_keeps_its_budget_and_never_changes_pixels() {
 
 #[test]
 fn an_image_is_undistorted_while_all_workers_are_busy() {
-    // A worker that waits for an image cannot help to make it: whoever makes one must not need the workers.
+    // A worker that waits for an image cannot help to make it: the thread that makes one must not need the workers.
     let sample = samples::own();
     sample.edit("capture.json", |v| {
         v["cameras"][1]["distortion"] = json!({"model": "opencv", "k": [-0.2, 0.03], "p": [0.002, -0.001]});

@@ -165,7 +165,7 @@ pub(in crate::capture) fn panoptic() -> Sample {
     sample
 }
 
-/// A camera that moves, in HyperNeRF's layout: three moments to train on, one held out; the world is twice as large and
+/// A camera that moves, in HyperNeRF's layout: three times to train on, one held out; the world is twice as large and
 /// elsewhere.
 pub(in crate::capture) fn nerfies() -> Sample {
     let sample = Sample::new(&["dataset.json", "metadata.json", "scene.json", "camera/000001.json"]);
@@ -230,7 +230,7 @@ fn colmap_pictures(sample: &Sample) -> Vec<String> {
     (0..3).map(|c| format!("cam{c}/0000.png")).collect()
 }
 
-/// Binary model of one instant.
+/// Binary model of one time.
 pub(in crate::capture) fn colmap_bin() -> Sample {
     let sample = Sample::new(&["sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin"]);
     let names = colmap_pictures(&sample);

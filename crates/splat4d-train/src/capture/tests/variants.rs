@@ -123,7 +123,7 @@ fn names_in_every_spelling_lead_to_the_same_capture() {
             change(&sample);
             let capture = open(&sample);
             assert_same(&format!("{layout}, {way}"), &expected, &capture);
-            // Ending-less names of D-NeRF, and listings, have nothing to tell.
+            // Ending-less names of D-NeRF, and listings, have no number.
             let tells = said(&capture, Aspect::Assumed, Severity::Note, &["differ from their files", way]);
             assert!(tells || by_listing || layout == "dnerf", "{layout}, {way}: {:?}", capture.account);
         }
@@ -219,7 +219,7 @@ fn poses_of_a_given_convention_are_read() {
         let plain = open(&sample);
         let told = CaptureOptions { poses: "inverse".parse().unwrap(), ..CaptureOptions::default() };
         let Ok(other) = Capture::open(sample.root(), &told) else {
-            // Cameras at one distance stand in one place when their poses are inverted.
+            // Cameras at one distance have the same position when their poses are inverted.
             continue;
         };
         for (f, g) in plain.frames.iter().zip(&other.frames) {
@@ -316,7 +316,7 @@ fn times_are_read_as_what_they_count() {
     let steps = |step: f64| (0..9).map(|i| step * i as f64).collect::<Vec<f64>>();
     type Case<'a> = (Vec<f64>, Option<f64>, &'a dyn Fn(usize) -> String, f64, Severity, &'a str);
     let cases: [Case<'_>; 12] = [
-        // Frame numbers, as names tell, and as a stated rate makes likely.
+        // Frame numbers, by the names, and as a stated rate makes likely.
         (steps(1.0), Some(30.0), &numbered, 8.0 / 30.0, Severity::Note, "frame numbers"),
         (steps(1.0), None, &numbered, 8.0 / 30.0, Severity::Note, "frame numbers"),
         (steps(1.0), Some(30.0), &lettered, 8.0 / 30.0, Severity::Warning, "frame numbers"),

@@ -21,7 +21,7 @@ const FEWER: f64 = 0.2;
 /// A step of so few frames that is this far from a whole number of them is of another rate.
 const FEW_FRAMES: f64 = 3.0;
 const BETWEEN: f64 = 0.1;
-/// Frames between neighbouring instants from which another unit than seconds is likelier than a time lapse.
+/// Frames between neighbouring times from which another unit than seconds is likelier than a time lapse.
 const MANY_FRAMES: f64 = 29.5;
 
 /// Seconds from which the start of a clock is subtracted: lifespans are f32, which has steps of a millisecond there.
@@ -39,7 +39,7 @@ pub(super) struct Rate {
 struct Reading {
     times: Times,
     scale: f64,
-    /// Frames per second, where the steps tell them.
+    /// Frames per second, where the steps give them.
     fps: f64,
     doubt: Option<String>,
 }
@@ -173,7 +173,7 @@ fn read(
 fn report(reading: &Reading, instants: &[f64], rate: Rate, account: &mut Account) {
     let [Some(first), Some(last)] = [instants.first(), instants.last()] else { return };
     if first == last {
-        let what = format!("All times are {first}: the images show one instant, and nothing moves.");
+        let what = format!("All times are {first}: all images have one time, so the scene is static.");
         account.add(Aspect::Assumed, Severity::Note, what);
         return;
     }
@@ -184,10 +184,10 @@ fn report(reading: &Reading, instants: &[f64], rate: Rate, account: &mut Account
     };
     let from = if rate.stated { "stated" } else { "not stated" };
     let doubt = reading.doubt.as_ref().map_or_else(String::new, |d| {
-        format!(" This is not sure: {d}. Else say --set capture.times=seconds, fractions or frames.")
+        format!(" This is not sure: {d}. Otherwise use --set capture.times=seconds, fractions or frames.")
     });
     let what = format!(
-        "Times are read as {word}: {} instants from {first} to {last} at {} frames a second ({from}): {:.3} s.{doubt}",
+        "Times are read as {word}: {} times from {first} to {last} at {} frames a second ({from}): {:.3} s.{doubt}",
         instants.len(),
         reading.fps,
         (last - first) * reading.scale
@@ -196,7 +196,7 @@ fn report(reading: &Reading, instants: &[f64], rate: Rate, account: &mut Account
     account.add(Aspect::Assumed, severity, what);
 }
 
-/// The number of the instant that is nearest to `t`, of two the later.
+/// The number of the time that is nearest to `t`, of two the later.
 fn nearest(instants: &[f64], t: f64) -> usize {
     let after = instants.partition_point(|&i| i < t);
     let earlier = after > 0 && instants.get(after).is_none_or(|&i| t - instants[after - 1] < i - t);

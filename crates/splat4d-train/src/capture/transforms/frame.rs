@@ -57,7 +57,7 @@ pub(super) fn read(file: &File<'_>, node: &Node<'_>) -> Result<Entry> {
     let path = |key: &str| Ok::<_, Error>(node.opt(key)?.filter(|n| n.value.as_str() != Some("")));
     let mask = path("mask_path")?.map(beside).transpose()?;
     let depth = path("depth_file_path")?.map(|n| depth(file.top, node, beside(n)?)).transpose()?;
-    // Names tell cameras apart by forward slashes.
+    // Names separate cameras by forward slashes.
     Ok(Entry { name: name.replace('\\', "/"), image, source, by_angle, time, mask, depth, split: Split::Train })
 }
 

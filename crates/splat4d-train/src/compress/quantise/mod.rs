@@ -184,7 +184,7 @@ pub(crate) fn palette_rate(rates: &RateSettings, share: f64) -> Rate {
 }
 
 /// A stage on the pages of a file, whatever model they were baked from: all groups of kinematic primitives with a life,
-/// in every layer. Its `start` is still to be told: it ends with [`Quantised::begin`].
+/// in every layer. Its `start` is still to be set: it ends with [`Quantised::begin`].
 pub(crate) fn stage(
     recipe: &Recipe,
     plan: &TrainContext,
@@ -210,7 +210,7 @@ pub(crate) fn stage(
         name: "quantised".into(),
         iterations,
         groups: tuned(base.groups, share).into_iter().map(|g| Group { layer: EVERY, ..g }).collect(),
-        // Pages say with a width next to nothing that a life is an instant.
+        // Pages say with a width next to nothing that a life is a time.
         min_log_life: None,
         half_size_steps: 0,
         sh_interval: 0,

@@ -156,7 +156,7 @@ fn an_entry_gets_the_sum_of_its_rows() {
             assert!((got - x).abs() < tolerance * (1.0 + x.abs()), "entry {entry}, plane {plane}: {got}, not {x}");
         }
     }
-    // Adam's first step is the rate, against the gradient's sign; entries that nobody looked at rest.
+    // Adam's first step is the rate, against the gradient's sign; entries that no step used stay.
     let before = shared.tables()[0].clone();
     drop(memory);
     assert!(codec.learn(&mut d.clone(), 0.0, 0.5));

@@ -26,7 +26,7 @@ fn zeros() -> Vec<[f64; 3]> {
     vec![[0.0; 3]; N]
 }
 
-/// Gradients of `loss` over several instants against finite differences of `value`.
+/// Gradients of `loss` over several times against finite differences of `value`.
 fn check(
     at: &[Vec<[f64; 3]>],
     loss: impl Fn(&[Vec<[f64; 3]>], &mut [Vec<[f64; 3]>]) -> f64,

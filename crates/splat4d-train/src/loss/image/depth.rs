@@ -141,9 +141,9 @@ pub(crate) enum Apart {
     Correlation(f64),
 }
 
-/// How far the depth of an image, Σ z α T and A, is from a map; `None`: too little of it is known to tell.
+/// How far the depth of an image, Σ z α T and A, is from a map; `None`: too little of it is known.
 pub(crate) fn apart([depth, alpha]: [&Planes<f32>; 2], truth: DepthTruth<'_>) -> Option<Apart> {
-    /// Pixels from which on they tell something.
+    /// Pixels from which on they are used.
     const ENOUGH: usize = 50;
     let expected: Vec<f32> = depth.data.iter().zip(&alpha.data).map(|(&d, &a)| d / a.max(SEEN as f32)).collect();
     let pixels = compared(&expected, &alpha.data, truth.values);

@@ -1,4 +1,4 @@
-//! Which Gaussians are worth drawing around which key time: the temporal filter of 4DGS-1K (Yuan et al. 2025, §4.2),
+//! Which Gaussians are rendered around which key time: the temporal filter of 4DGS-1K (Yuan et al. 2025, §4.2),
 //! united with the lives that no key time meets.
 
 use super::temporal::Spatial;

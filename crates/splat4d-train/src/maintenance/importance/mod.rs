@@ -24,7 +24,7 @@ use splat4d::scene::{RowEdit, Space};
 /// `Layer::edit`. Panics: scores of
 /// another scene, a ratio outside of 0 to 1.
 pub fn prune(scene: &Scene<f32>, scores: &Scores, ratio: f64) -> Vec<RowEdit> {
-    assert!((0.0..=1.0).contains(&ratio), "a share lies between 0 and 1, not at {ratio}");
+    assert!((0.0..=1.0).contains(&ratio), "expected a share between 0 and 1, found {ratio}");
     let sizes =
         |rows: usize, layer: usize| assert_eq!(rows, scene.layers[layer].params.len(), "scores of layer {layer}");
     assert_eq!(scores.layers.len(), scene.layers.len(), "scores by layer");

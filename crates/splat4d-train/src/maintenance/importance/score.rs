@@ -1,4 +1,4 @@
-//! Importance scores of Gaussians: how much of the training images each is, at instants that its life serves well.
+//! Importance scores of Gaussians: how much of the training images each is, at times that its life serves well.
 //!
 //! Source: 4DGS-1K (Yuan et al. 2025, §4.1); the volume as LightGaussian (Fan et al. 2024).
 
@@ -19,7 +19,7 @@ use splat4d::scene::Time;
 const VOLUME_PERCENTILE: f64 = 0.9;
 /// Power of the relative volume (LightGaussian).
 const VOLUME_POWER: f64 = 0.1;
-/// Variances below this share of the largest are not told apart: covariances are f32.
+/// Variances below this share of the largest are not distinguished: covariances are f32.
 const THINNEST: f64 = 1e-6;
 /// Frames of a unit of time: a second at the 30 frames a second of 4DGS-1K's captures.
 pub const UNIT_FRAMES: f64 = 30.0;
@@ -47,7 +47,7 @@ pub struct ScoreConfig {
 }
 
 impl Default for ScoreConfig {
-    /// Per-instant product of |p''| and the spatial score, with the volume, from all views.
+    /// Per-time product of |p''| and the spatial score, with the volume, from all views.
     fn default() -> Self {
         Self {
             spatial: Spatial::default(),
@@ -99,7 +99,7 @@ pub fn score(
     let lives: Vec<Lives> = scene.layers.iter().map(|l| Lives::new(l, clip, config.unit / fps)).collect();
 
     let zeros = || -> Vec<Vec<f64>> { scene.layers.iter().map(|l| vec![0.0; l.params.len()]).collect() };
-    // Σ_t S(t), Σ_t S(t)·T(t) and Σ of T(t) over the instants at which S(t) > 0.
+    // Σ_t S(t), Σ_t S(t)·T(t) and Σ of T(t) over the times at which S(t) > 0.
     let (mut spatial, mut product, mut served) = (zeros(), zeros(), zeros());
     let mut touched = zeros();
     let (mut weighing, mut done) = (Weighing::new(config.spatial, config.antialias), 0);
@@ -126,7 +126,7 @@ pub fn score(
         }
     }
 
-    // A score of all views together takes the place of the sum; how its instants are served is as the views felt it.
+    // A score of all views together takes the place of the sum; how its times are served is as the views felt it.
     for layer in 0..scene.layers.len() {
         let Some(whole) = weighing.whole(layer) else { continue };
         for ((spatial, product), whole) in spatial[layer].iter_mut().zip(&mut product[layer]).zip(whole) {

@@ -2,9 +2,9 @@
 //! and its variants.
 //!
 //! The paper's S^TV = Σ_t 1/(½ tanh p''(t) + ½), p the life, summed over the whole clip, ranks the other way round than
-//! its text says: a term is 1 + exp(−2p''), so that it overflows at the peak of a short life, and an instant at which
+//! its text says: a term is 1 + exp(−2p''), so that it overflows at the peak of a short life, and a time at which
 //! the Gaussian is not there counts 2, the most that |p''| could give. The reading that does what the text says takes
-//! the product with the spatial score instant by instant: absent instants vanish, and each present one weighs 1
+//! the product with the spatial score time by time: absent times vanish, and each present one weighs 1
 //! (flickers) to 2 (lasts). That is [`Temporal::InstantAbs`], the default; the others are kept for comparison.
 
 use crate::settings::nearest;
@@ -21,16 +21,16 @@ const LITERAL_LIMIT: f64 = 8.0;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Temporal {
-    /// 1/(½ tanh|p''(t)| + ½) at every instant.
+    /// 1/(½ tanh|p''(t)| + ½) at every time.
     #[default]
     InstantAbs,
-    /// Σ over all instants of the clip of 1/(½ tanh p''(t) + ½), signed as the paper prints it, |p''| at most 8.
+    /// Σ over all times of the clip of 1/(½ tanh p''(t) + ½), signed as the paper prints it, |p''| at most 8.
     LiteralSignedClamped,
-    /// 1/(½ tanh|p'(t)| + ½) at every instant.
+    /// 1/(½ tanh|p'(t)| + ½) at every time.
     FirstDerivative,
     /// The variance of the life, the clip's length squared at most.
     Width,
-    /// The mean of p over all instants of the clip.
+    /// The mean of p over all times of the clip.
     ActiveFraction,
     /// 1: the spatial score alone.
     None,
@@ -48,7 +48,7 @@ pub enum Spatial {
     Change,
     /// The geometric mean of both in each view: neither what covers nor what differs from what lies behind goes first.
     Both,
-    /// Opacity at every instant at which a view shows it (3DGS).
+    /// Opacity at every time at which a view shows it (3DGS).
     Opacity,
     /// The share, times min(V/V₉₀, 1)^0.1 of the volume: the global significance of LightGaussian (Fan et al. 2024).
     LightGaussian,
@@ -64,12 +64,12 @@ pub enum Spatial {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Combine {
-    /// Their product, instant by instant.
+    /// Their product, time by time.
     #[default]
     Product,
-    /// Their sum, each over its mean, the temporal one over the instants at which the Gaussian is seen.
+    /// Their sum, each over its mean, the temporal one over the times at which the Gaussian is seen.
     Sum,
-    /// The temporal score alone, over the instants at which the Gaussian is seen.
+    /// The temporal score alone, over the times at which the Gaussian is seen.
     TemporalAlone,
 }
 
@@ -150,7 +150,7 @@ impl Lives {
         Self { kind, rows, span: layer.span, clip, unit }
     }
 
-    /// The score of an instant at which the Gaussian is seen; 1 where the score is one of the whole life.
+    /// The score of a time at which the Gaussian is seen; 1 where the score is one of the whole life.
     pub(super) fn instant(&self, temporal: Temporal, row: usize, t: Time) -> f64 {
         let row = self.rows[row];
         let steepness = match temporal {
@@ -161,7 +161,7 @@ impl Lives {
         1.0 / (0.5 * steepness.abs().tanh() + 0.5)
     }
 
-    /// The score of the whole life, of which `times` are the instants; 1 where the score is one of instants.
+    /// The score of the whole life, of which `times` are the times; 1 where the score is one of times.
     pub(super) fn whole(&self, temporal: Temporal, row: usize, times: &[Time]) -> f64 {
         let row = self.rows[row];
         let seen = || times.iter().filter(|t| self.span[0] <= t.0 && t.0 < self.span[1]);
@@ -215,7 +215,7 @@ mod tests {
 
     const LIVES: [f64; 7] = [1.0, 3.0, 7.0, 15.0, 30.0, 67.0, 212.0];
 
-    /// The default score of lives whose spatial score at an instant is p.
+    /// The default score of lives whose spatial score at a time is p.
     #[test]
     fn the_default_grows_with_life() {
         let score = |frames: f64| {

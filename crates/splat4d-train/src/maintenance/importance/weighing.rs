@@ -6,7 +6,7 @@ use splat4d::render::{Antialias, Importance, RenderConfig, Sensitivity, Shot};
 use splat4d::scene::splats::SPLAT_OPACITY;
 use splat4d::scene::{Camera, Time};
 
-/// Pivots of a Fisher block, over its own diagonal, are not told from 0 below this: sums are made in f32.
+/// Pivots of a Fisher block, over its own diagonal, are not distinguished from 0 below this: sums are made in f32.
 const LEAST_PIVOT: f64 = 1e-6;
 
 /// A number by layer and row, summed over the views at one time; all memory is reused.

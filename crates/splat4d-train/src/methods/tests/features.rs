@@ -115,7 +115,7 @@ fn error_of(scene: &Scene<f32>, frames: &dyn Frames) -> f64 {
 fn colours_that_change_with_time_and_view_are_learnt_better_with_a_head() {
     let frames: Arc<dyn Frames> = Arc::new(Changing(Made::new(6, 3, 24)));
     let learn = |features: Option<FeatureSpec>| {
-        // Everything stays for the whole clip: nobody can show a new colour by being born.
+        // Everything stays for the whole clip: no new colour can appear by birth.
         let mut p = cloud::<f32>(160, LifeKind::Infinite, 4);
         let spec = SpacetimeSpec { order: 1, origin: 0.1, features, ..SpacetimeSpec::default() };
         let motion = build_as(&Spec::Spacetime(spec), &mut p).unwrap();

@@ -19,7 +19,7 @@ const FPS: f64 = 10.0;
 const RADIUS: f64 = 0.4;
 const SKY: [f32; 3] = [0.15, 0.2, 0.3];
 
-/// Centre, colour, and whether it is there at moment k.
+/// Centre, colour, and whether it is there at time k.
 type Guest = ([f64; 3], [f32; 3], fn(usize) -> bool);
 
 const GUESTS: [Guest; 3] = [
@@ -127,7 +127,7 @@ fn errors(motion: &str, life: &str) -> [f64; 2] {
         ..recipe.plan()
     };
     let program = recipe.program().unwrap();
-    // Points on all guests: nobody knows yet who comes and goes.
+    // Points on all guests: it is not known yet who comes and goes.
     let mut seeds = Seeds::default();
     let rng = Rng::new(8, "guests", 0);
     for i in 0..300usize {
@@ -189,7 +189,7 @@ fn nobody_leaves_a_ghost() {
         let [ghost, _] = errors(motion, "infinite");
         assert!(ghost > GHOST, "{motion} without lives: a ghost of {ghost}");
     }
-    // Without lives a still cloud has ghosts, or nobody at all.
+    // Without lifespans a static cloud has ghosts, or no guest at all.
     let [ghost, there] = errors("still", "infinite");
     assert!(ghost > 2.0 * GHOST || there > 2.0 * OFF, "{ghost} {there}");
 }

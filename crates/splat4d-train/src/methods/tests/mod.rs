@@ -317,7 +317,7 @@ fn shake<F: Real>(p: &mut Params<F>, key: Key, size: f64, seed: u64) {
     }
 }
 
-/// An ordinary trainer on the synthetic capture: 4 cameras, 3 moments, 16 pixels.
+/// An ordinary trainer on the synthetic capture: 4 cameras, 3 times, 16 pixels.
 fn trainer(scene: Scene<f32>, stages: Vec<Stage>, cap: usize) -> Trainer<'static> {
     trainer_on(Arc::new(Made::new(4, 3, 16)), scene, stages, cap)
 }

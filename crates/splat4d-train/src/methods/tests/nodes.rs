@@ -154,7 +154,7 @@ impl<F: Real> Motion<F> for Skinned {
         _: &mut Cache,
         d: &mut Grads<F>,
     ) -> f64 {
-        // Gaussians pull on nodes: whoever learns poses must say that nodes take part.
+        // Gaussians pull on nodes: a learner of poses must state that nodes take part.
         d.activate(Space::Nodes, splat4d::scene::Rows::All);
         let mut d_time = 0.0;
         for j in 0..q.len() {

@@ -6,7 +6,7 @@ use crate::train_state::{Corrections, Origin, RefineSettings, Scale};
 /// Half the step of the differences, a power of two: of numbers that are kept in f32 it makes exact neighbours.
 const NEAR: f32 = 1.0 / 65_536.0;
 const CAMERAS: usize = 3;
-/// Two moments, seconds.
+/// Two times, seconds.
 const MOMENTS: [f64; 2] = [0.03, 0.14];
 
 /// Corrections that are not nothing, as they are after some steps.

@@ -18,7 +18,7 @@ use std::sync::Arc;
 const PROBES: f64 = 0.06;
 /// Seconds that timing steps takes where only the length is asked for.
 const PREDICTION: f64 = 6.0;
-/// Fewest Gaussians of a chunk that a memory limit may leave: with fewer nothing can be told in the images.
+/// Fewest Gaussians of a chunk that a memory limit may leave: with fewer nothing can be recognised in the images.
 const FEWEST: usize = 1000;
 /// By how much the number of Gaussians falls from try to try.
 const LESS: f64 = 0.8;

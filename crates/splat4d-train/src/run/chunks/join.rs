@@ -65,7 +65,7 @@ impl Chunked {
         let missing: Vec<String> =
             self.parts().into_iter().filter(|p| !self.is_done(*p)).map(|p| format!("--chunk {p}")).collect();
         if !missing.is_empty() {
-            return Err(Error::input("parts of the take are not finished")
+            return Err(Error::input("parts of the capture are not finished")
                 .at(self.run.display())
                 .remedy(format!("Train these first: {}", missing.join(", "))));
         }
@@ -167,7 +167,7 @@ impl Chunked {
     fn check_made(&self, chunk: usize) -> Result<()> {
         let folder = self.folder(Part::Chunk(chunk));
         let other = |what: String| {
-            Error::new(ErrorKind::Unsupported, format!("chunk {chunk} was made by another {what} than the take's"))
+            Error::new(ErrorKind::Unsupported, format!("chunk {chunk} was made by another {what} than the capture's"))
                 .at(folder.display())
                 .remedy("Delete its folder and train it again")
         };
@@ -186,7 +186,7 @@ impl Chunked {
         Ok(())
     }
 
-    /// How well chunks meet, by cameras that stand still: those that training never saw, where there are any. `None`: there
+    /// How well chunks meet, by fixed cameras: those that training never saw, where there are any. `None`: there
     /// is no such camera, or no time. Before each cut `go_on` is asked; it hears how many are done. Errors: chunks
     /// or images that
     /// cannot be read.

@@ -59,7 +59,7 @@ pub(super) const MADE_BY: &str = "train --chunk";
 /// A part of the work on a take.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Part {
-    /// What stands still, and the cameras' exposures.
+    /// The static background, and the cameras' exposures.
     Shared,
     /// A chunk.
     Chunk(usize),
@@ -124,7 +124,7 @@ impl Chunked {
         let lenses = capture.lenses.clone();
         let begun = Self { run: run.to_owned(), source, recipe, plan, lenses, pacing: None };
         begun.write_info(&capture.name, elsewhere(capture), None)?;
-        // Last: whoever finds it finds the others.
+        // Last: a process that finds it finds the others.
         let text = serde_json::to_string_pretty(&begun.plan).expect("a plan is plain data");
         write_atomically(&run.join(FOLDER).join(PLAN), text.as_bytes())?;
         Ok(Some(begun))
@@ -384,7 +384,7 @@ fn beginning(capture: &Capture, plan: &ChunkPlan) -> Capture {
     Capture { train, ..capture.clone() }
 }
 
-/// The frames of a capture to look at first: with them it can be told whether it is a long take.
+/// The frames of a capture to look at first: they show whether it is a long capture.
 pub fn look_ahead(recipe: &Recipe) -> Vec<Range<usize>> {
     let first = recipe.capture.first_frame;
     let look = first..first.saturating_add(recipe.chunks.frames.max(WHOLE)).saturating_add(1);
@@ -407,12 +407,12 @@ fn check(recipe: &Recipe) -> Result<()> {
     let (what, remedy) = if recipe.spacetime.has_features() {
         ("a network that makes colours (features = full)", "Use --set features=none")
     } else if learnt.poses || learnt.focal || learnt.times {
-        ("cameras that are refined", "Refine them on a part of the take first (--set max_frames=60)")
+        ("cameras that are refined", "Refine them on a part of the capture first (--set max_frames=60)")
     } else if recipe.capture.observe < 1.0 {
         ("a future that is not looked at (--observe)", "Leave --observe away")
     } else {
         return Ok(());
     };
     Err(Error::new(ErrorKind::Unsupported, format!("chunks cannot share {what}"))
-        .remedy(format!("{remedy}, or train at once with --chunk-frames above the take's length")))
+        .remedy(format!("{remedy}, or train without chunks: --chunk-frames above the number of frames")))
 }

@@ -1,4 +1,4 @@
-//! What chunks share: the layer of what stands still all the time, and the cameras' exposures.
+//! What chunks share: the layer of the static background all the time, and the cameras' exposures.
 //!
 //! Temporal medians of every fixed camera over parts of the take are a capture of their own, on which a still scene is trained
 //! as any other run is. Of its Gaussians those stay that most cameras see where next to nothing ever changes: what is left out
@@ -36,7 +36,7 @@ pub(super) const FILE: &str = "still.safetensors";
 pub(super) const LAYER: &str = "still";
 /// Folder of the medians.
 const CAPTURE: &str = "capture";
-/// Parts of the take, each of which has a median: more than one, so that exposures can be told from the scene.
+/// Parts of the take, each of which has a median: more than one, so that exposures can be separated from the scene.
 const PARTS: usize = 4;
 /// Frames whose median that is.
 const MEDIAN_OF: usize = 9;
@@ -52,7 +52,7 @@ const AGREED: f64 = 0.5;
 
 /// What a finished part says.
 pub(super) struct Shared {
-    /// What stands still, as it was learnt; none: nothing does.
+    /// The static background, as it was learnt; none: nothing does.
     pub still: Option<Layer<f32>>,
     /// What shows where no Gaussian is.
     pub background: [f32; 3],
@@ -190,7 +190,7 @@ fn medians(
     let capture = &opened.capture;
     let (mut cameras, mut names) = (Vec::new(), Vec::new());
     for rig in 0..capture.cameras.len() {
-        listen(&Event::Phase { name: "what stands still".into(), done: rig, total: capture.cameras.len() });
+        listen(&Event::Phase { name: "static background".into(), done: rig, total: capture.cameras.len() });
         // Frames of the data set stand in the order of `train`.
         let frames: Vec<usize> =
             (0..capture.train.len()).filter(|&i| capture.frames[capture.train[i]].camera == rig).collect();
@@ -238,7 +238,7 @@ fn medians(
         cloud
     });
     if let Some(cloud) = points.filter(|c| !c.points.is_empty()) {
-        write_atomically(&folder.join("points.ply"), &cloud.to_ply("comment points of what stands still"))?;
+        write_atomically(&folder.join("points.ply"), &cloud.to_ply("comment points of the static background"))?;
         all["points"] = json!("points.ply");
     }
     write_atomically(&folder.join("cameras.json"), json!(names).to_string().as_bytes())?;

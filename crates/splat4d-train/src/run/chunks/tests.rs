@@ -43,7 +43,7 @@ fn the_scene_does_not_depend_on_who_does_which_chunk_when_and_how_often_they_are
     assert!(one.work_all(&options, &never, &mut || Ok(()), &mut |_| {}).unwrap().is_none());
     let other = begin(&place, "other", &recipe).unwrap().unwrap();
     for part in [Part::Shared, Part::Chunk(2), Part::Chunk(0), Part::Chunk(1)] {
-        // Stopped in the midst of it, and gone on with by somebody who knows the folder alone.
+        // Stopped in the midst of it, and continued by a process that has only the folder.
         let stop = AtomicBool::new(false);
         let halt = |event: &Event| {
             if matches!(event, Event::Checkpoint { iteration: 10.., .. }) {
@@ -246,7 +246,7 @@ fn a_plan_keeps_to_its_memory_and_its_minutes() {
     assert!(tight.memory <= limit && tight.recipe.densify.max_cap < free.recipe.densify.max_cap);
     assert!(tight.plan.len() >= free.plan.len() && tight.recipe.chunks.frames >= 3 * 2);
     assert!(outlook(&["memory_limit=1000000"], None).unwrap_err().to_string().contains("more memory"));
-    // Of two times, the longer one is worth more steps, and all parts together take no more than it.
+    // Of two times, the longer one gets more steps, and all parts together take no more than it.
     let steps = [0.02, 0.2].map(|m| outlook(&[], Some(m)).unwrap().unwrap());
     assert!(steps[0].recipe.run.iterations < steps[1].recipe.run.iterations);
     assert!(steps[1].seconds.unwrap() <= 60.0 * 0.2);
@@ -271,7 +271,7 @@ fn every_motion_model_goes_through_two_chunks() {
         assert_eq!(run.plan.len(), 2, "{motion}");
         let own = whole.layers.iter().filter(|l| l.name != shared::LAYER);
         assert!(own.clone().count() == 2 && own.clone().all(|l| l.motion.spec().name() == motion), "{motion}");
-        // Every moment is seen, those that both show too.
+        // Every time is seen, those that both show too.
         for t in [0.0, 0.55, 1.1] {
             let mut seen = splat4d::layers::Evaluation::default();
             whole.at(Time(t), &mut seen);

@@ -86,7 +86,7 @@ pub(super) fn train(
 pub(super) fn of_frames(recipe: &Recipe, frames: Range<usize>) -> Recipe {
     recipe.clone().with(|r| {
         (r.capture.first_frame, r.capture.max_frames) = (frames.start, frames.len());
-        // What stands still is a layer already.
+        // The static background is a layer already.
         r.split.reach = 0.0;
     })
 }

@@ -1,4 +1,4 @@
-//! The device that draws in the run's files: recorded, and told where a run goes on elsewhere.
+//! The rendering device in the run's files: recorded, and reported where a run continues on another one.
 
 use super::*;
 use splat4d::device::Device;
@@ -45,7 +45,7 @@ fn a_run_reports_its_device_and_where_it_resumes() {
 fn a_gpu_that_is_lost_costs_a_run_one_line_and_no_step() {
     let place = Place::new();
     let recipe = recipe(&["motion=spacetime", "antialias=false"]);
-    // It fails at its eighteenth step, or when somebody asks for its tables between the first checkpoint and the second.
+    // It fails at its eighteenth step, or when its tables are read between the first checkpoint and the second.
     for (name, left) in [("step", [usize::MAX, 17, usize::MAX]), ("fetch", [usize::MAX, usize::MAX, 3])] {
         let Some(draw) = crate::step::tests::resident::Failing::new(left) else { return };
         let (mut warnings, mut rolled) = (Vec::new(), 0);

@@ -4,7 +4,7 @@ use super::{MOMENTS, Place, recipe};
 use crate::capture::{Capture, Split};
 use crate::run::open_capture;
 
-/// Share that leaves the last of three moments out.
+/// Share that leaves the last of three times out.
 const SHARE: f64 = 0.6;
 
 #[test]
@@ -58,7 +58,7 @@ fn a_capture_is_split_at_given_times() {
     assert_eq!(cut.train.len() + cut.held.len() + cut.future.len(), whole.frames.len());
     assert!(cut.future.iter().all(|&i| cut.split(i) == Split::Future && cut.frames[i].time.0 > 0.15));
     assert!(open("0").unwrap_err().to_string().contains("leaves nothing"));
-    // The first moment alone is enough for a scene; that it is not for motion, `predict` says.
+    // The first time alone is enough for a scene; that it is not for motion, `predict` says.
     assert_eq!(last(&open("0.0001").unwrap(), &open("0.0001").unwrap().train), 0.0);
     let photos = recipe(&["capture.observe=0.5", "max_frames=1"]);
     let message = open_capture(place.capture.path(), &photos).unwrap_err().to_string();

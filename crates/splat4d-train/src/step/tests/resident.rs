@@ -135,7 +135,7 @@ fn repeats_and_resumes(bed: &Bed, recipe: &Recipe) {
     };
     let Some((whole, checkpoints)) = run() else { return };
     let [first, second] = &checkpoints[..] else { panic!("two checkpoints") };
-    // The same bits again, though nobody looks in between: as many steps are under way as may be.
+    // The same bits again, without reads in between: as many steps are under way as may be.
     let mut unseen = on_gpu(bed, recipe).expect("there was a GPU");
     let (mse, _) = finish(&mut unseen, "unseen");
     assert!(bytes(unseen.scene()) == whole, "it does not depend on who looks when");
@@ -175,7 +175,7 @@ fn a_number_that_is_not_finite_is_found_and_named() {
 /// What a device that fails says, and one that has no room.
 const GONE: &str = "the driver is gone";
 const FULL: &str = "too many for one buffer";
-/// As often as anybody asks.
+/// As often as it is called.
 const ALWAYS: usize = usize::MAX;
 
 /// A device that fails when it has done so much, and does nothing from then on.
@@ -205,7 +205,7 @@ impl Failing {
         if self.gone { Err(Error::new(ErrorKind::Unsupported, GONE)) } else { Ok(&mut self.device) }
     }
 
-    /// Its tables, if it does this once more.
+    /// Its tables, if it does this again.
     fn tables(&mut self, what: usize) -> Result<&mut dyn Resident> {
         let left = self.left[what].checked_sub(1);
         self.gone |= left.is_none();

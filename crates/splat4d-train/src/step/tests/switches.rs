@@ -179,7 +179,7 @@ fn what_stands_still_becomes_a_layer_and_both_layers_learn() {
         assert_eq!(layers.len(), 2, "{line}: nothing was split off");
         assert_eq!(layers[1].motion.spec().name(), "still");
         let learns = at_the_split.unwrap() != places(ran.scene(), 1, Space::Gaussians, 0.0);
-        // Only the newest page of `tracked` learns: what stands still rests.
+        // Only the newest page of `tracked` learns: the static background rests.
         assert_eq!(learns, !motion.starts_with("tracked"), "{line}");
         assert!(!learns || ran.left() < 0.8, "{line}: {}", ran.left());
     }

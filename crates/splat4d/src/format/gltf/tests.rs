@@ -111,7 +111,7 @@ fn an_spz_inside_is_written_and_read() {
     assert!(bin.starts_with(&[0x1F, 0x8B]) && json["extensionsRequired"][1] == SPZ[0]);
     let attributes = json["meshes"][0]["primitives"][0]["attributes"].as_object().unwrap();
     assert_eq!(attributes.len(), 4 + 15, "{attributes:?}");
-    // The name of a former draft, beside the base extension.
+    // The name of a former draft, next to the base extension.
     let mut old = json.clone();
     old["meshes"][0]["primitives"][0]["extensions"] = json!({SPZ[2]: {"bufferView": 0}});
     assert_eq!(DIALECT.open(&joined(&old, &bin)).unwrap().scene.len(), 60);

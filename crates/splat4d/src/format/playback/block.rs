@@ -320,7 +320,7 @@ impl Columns {
             words[6][i] |= width << 24;
             words[7][i] |= softness << 16;
         }
-        // A block of which nothing is ever seen is alive at no more than an instant.
+        // A block of which nothing is ever seen is alive at no more than a time.
         let alive = if alive[0] <= alive[1] { alive } else { [first; 2] };
         h[at::ALIVE] = below(alive[0] - SLACK * alive[0].abs());
         h[at::ALIVE + 1] = above(alive[1] + SLACK * alive[1].abs());

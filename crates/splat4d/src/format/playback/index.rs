@@ -32,7 +32,7 @@ pub enum Kind {
     Page,
     /// Spherical harmonics above degree 0.
     Palette,
-    /// Which Gaussians of a page are worth drawing when.
+    /// Which Gaussians of a page are rendered when.
     Masks,
     /// What the Gaussians of a page are part of.
     Labels,
@@ -286,7 +286,7 @@ impl Index {
         }
         if gaussians != self.meta.gaussians as u64 {
             let claimed = self.meta.gaussians;
-            return Err(broken(format!("its pages hold {gaussians} Gaussians, its JSON says {claimed}")));
+            return Err(broken(format!("its pages hold {gaussians} Gaussians, its JSON states {claimed}")));
         }
         Ok(())
     }
@@ -458,7 +458,7 @@ impl Entry {
         };
         if let Kind::Other(_) = kind {
             if required {
-                let what = format!("the file cannot be drawn without a section `{}`", kind.name());
+                let what = format!("the file cannot be played without a section `{}`", kind.name());
                 return Err(Error::new(ErrorKind::Unsupported, what).remedy("Install a newer splat4d"));
             }
             return Ok(entry);
@@ -484,14 +484,14 @@ impl Entry {
         match self.kind {
             Kind::Page => {
                 if words != PAGE_WORDS {
-                    let what = format!("a page has {words} words a Gaussian, this splat4d knows {PAGE_WORDS}");
+                    let what = format!("a page has {words} words a Gaussian, this splat4d supports {PAGE_WORDS}");
                     return Err(Error::new(ErrorKind::Unsupported, what).remedy("Install a newer splat4d"));
                 }
                 if !(1..=MAX_PAGE_GAUSSIANS).contains(&count) || self.bytes as usize != page_bytes(count) {
                     return Err(broken(format!("a page of {count} Gaussians does not have {} bytes", self.bytes)));
                 }
                 if !(self.span.iter().all(|t| t.is_finite()) && self.span[0] < self.span[1]) {
-                    return Err(broken(format!("a page cannot be drawn from {} to {} s", self.span[0], self.span[1])));
+                    return Err(broken(format!("a page cannot be played from {} to {} s", self.span[0], self.span[1])));
                 }
             }
             Kind::Palette => {
@@ -581,7 +581,7 @@ fn read_u32(bytes: &[u8], at: usize) -> Option<u32> {
 }
 
 fn short() -> Error {
-    broken("its index is shorter than it says".into())
+    broken("its index is shorter than stated".into())
 }
 
 fn foreign() -> Error {

@@ -1,4 +1,4 @@
-//! Masks: which Gaussians of a page are worth drawing when, a bit a Gaussian and key time (docs/format.md, "Masks").
+//! Masks: which Gaussians of a page are rendered when, a bit a Gaussian and key time (docs/format.md, "Masks").
 
 use super::index::{MASK_HEAD, MAX_KEYS, broken, mask_keys};
 use super::page::unpack;

@@ -15,7 +15,7 @@ const MOST_BYTES: usize = 1 << 20;
 pub struct Provenance {
     /// Program and version.
     pub made_with: String,
-    /// Moment of making, RFC 3339 in UTC.
+    /// Time of making, RFC 3339 in UTC.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub when: Option<String>,
     /// Hash of the capture's names, poses and times, 16 hexadecimal digits.

@@ -18,8 +18,8 @@ use std::io::Write;
 const GAUSSIANS_PER_ENTRY: usize = 12;
 /// A palette may always have this many entries: 11 kB.
 const SMALL_PALETTE: usize = 256;
-/// Share of a node's Gaussians in its first tier, and the least worth a page of its own. Ranked by what images lack, so many
-/// show the bundled scene at 28 dB, its dynamic regions at 29 dB; a quarter shows it at 22 and 23 dB.
+/// Share of a node's Gaussians in its first tier, and the fewest for a page of its own. Ranked by what images lack, so
+/// many show the bundled scene at 28 dB, its dynamic regions at 29 dB; a quarter shows it at 22 and 23 dB.
 const FIRST_TIER: f64 = 0.4;
 const SMALLEST_TIER: usize = 4096;
 /// The program that writes, as files name it.
@@ -377,7 +377,7 @@ fn pieces(draft: &Draft, config: &WriteConfig) -> Vec<Piece> {
         rows.sort_by(|&a, &b| importance(b).total_cmp(&importance(a)).then(a.cmp(&b)));
         let share = ((rows.len() as f64 * FIRST_TIER) as usize).max(SMALLEST_TIER);
         let first = if config.tier > 0 { config.tier } else { share }.min(MAX_PAGE_GAUSSIANS);
-        // A rest that is smaller than its tier is not worth another request.
+        // A rest that is smaller than its tier does not justify another request.
         let first = if rows.len() < 2 * first && rows.len() <= MAX_PAGE_GAUSSIANS { rows.len() } else { first };
         let (head, rest) = rows.split_at(first);
         let size = rest.len().div_ceil(rest.len().div_ceil(MAX_PAGE_GAUSSIANS).max(1)).max(1);

@@ -104,18 +104,14 @@ fn write_ftgs(scene: &Scene<f32>, options: &WriteOptions, out: &mut impl Write) 
     let [curved, turning, brief] = [curved.count(), turning.count(), brief.count()];
     if options.exact && curved + turning + brief > 0 {
         let what = format!(
-            "FTGS holds straight paths, one rotation and lives of 0.02 clips: {curved} paths curve, \
+            "FTGS stores linear paths, one rotation, and lifespans of at least 0.02 clips: {curved} paths curve, \
             {turning} rotate, {brief} are shorter"
         );
         return Err(Error::new(ErrorKind::Unsupported, what).remedy("Leave --exact out to fit them, or write .s4d."));
     }
-    warnings.counted(
-        curved,
-        rows.len(),
-        "have curved paths: those along the tangent at the middle of their lives are stored",
-    );
-    warnings.counted(turning, rows.len(), "rotate: their rotation at the middle of their lives is stored");
-    warnings.counted(brief, rows.len(), "live for less than 0.02 of the clip, the shortest that players know");
+    warnings.counted(curved, rows.len(), "have curved paths: the tangents at the middle of their lifespans are stored");
+    warnings.counted(turning, rows.len(), "rotate: the rotation at the middle of their lifespans is stored");
+    warnings.counted(brief, rows.len(), "live for less than 0.02 of the clip, the shortest that players support");
     let absorbed: Vec<_> = scene.layers.iter().map(|layer| layer.with_frame_absorbed()).collect();
     let width = scene.layers.iter().map(|l| l.params[SH].width()).max().unwrap_or(3);
     let rest = F_REST_COUNTS.into_iter().find(|n| n + 3 >= width).unwrap_or(0);

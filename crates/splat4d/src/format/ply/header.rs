@@ -183,7 +183,7 @@ fn property<'a>(line: &str, mut words: impl Iterator<Item = &'a str>) -> Result<
         let word = word.ok_or_else(malformed)?;
         Scalar::parse(word).ok_or_else(|| {
             Error::new(ErrorKind::Unsupported, format!("the type `{word}` is not known"))
-                .remedy("PLY knows char, short, int, their unsigned kinds, float and double")
+                .remedy("PLY has char, short, int, their unsigned kinds, float and double")
         })
     };
     let first = words.next();

@@ -251,7 +251,7 @@ fn gaussian_columns(vertex: &Element) -> Result<(Vec<usize>, Vec<usize>, bool)> 
             "this is a point cloud without Gaussians: its points have {} only, no scale, rotation or opacity",
             names.join(", ")
         ))
-        .remedy("A point cloud can start a training, but it cannot be drawn; give a trained .ply"));
+        .remedy("A point cloud can initialise training, but it cannot be rendered. Give a trained .ply"));
     }
     if !missing.is_empty() {
         return Err(Error::input(format!("the element `vertex` lacks the properties {}", missing.join(", "))).remedy(

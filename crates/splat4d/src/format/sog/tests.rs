@@ -141,7 +141,7 @@ fn archives_are_inflated_no_further_than_a_scene_needs() {
     let mut huge = zip.clone();
     huge[at[0] + 24..at[0] + 28].copy_from_slice(&u32::MAX.to_le_bytes());
     assert!(error(&huge).contains("zip64"), "{}", error(&huge));
-    // meta.json is the first: nobody inflates 100 MiB of it.
+    // meta.json is the first: no reader inflates 100 MiB of it.
     let mut meta = zip.clone();
     meta[at[0] + 24..at[0] + 28].copy_from_slice(&(100u32 << 20).to_le_bytes());
     assert!(error(&meta).contains("longer than"), "{}", error(&meta));

@@ -65,7 +65,7 @@ pub(super) fn open<'a>(bytes: &'a [u8], warnings: &mut Warnings) -> Result<Opene
     let mut cursor = Cursor::new(bytes, ".spz file");
     cursor.take(MAGIC.len())?;
     if matches!(cursor.u32()?, 2 | 3) {
-        // Nobody should write these versions without gzip, but test data of the field does.
+        // These versions should have gzip, but test data of the field has none.
         let header = old_header(cursor_start(bytes)?)?;
         let body = &bytes[OLD_HEADER..];
         let streams = split(&header, Cow::Borrowed(body))?;
@@ -152,7 +152,7 @@ fn new_streams<'a>(bytes: &'a [u8], warnings: &mut Warnings) -> Result<Opened<'a
     for (stream, &length) in streams.iter_mut().zip(&lengths).filter(|(_, n)| **n > 0) {
         let (packed, plain) = (entries.u64()?, entries.u64()?);
         if plain != length as u64 {
-            return Err(damaged(format!("a stream should have {length} bytes, but its entry says {plain}")));
+            return Err(damaged(format!("expected a stream of {length} bytes, but its entry states {plain}")));
         }
         let packed = usize::try_from(packed).map_err(|_| damaged("a stream is longer than the file"))?;
         *stream = Cow::Owned(inflate(data.take(packed)?, length)?);

@@ -135,14 +135,14 @@ pub fn write(params: &Params, version: u32, up: [f64; 3], out: &mut impl Write) 
     let count = u32::try_from(rows.len()).map_err(|_| Error::input("there are more than 2^32 Gaussians"))?;
     if rows.is_empty() {
         return Err(Error::input("there are no Gaussians, and an .spz file cannot be empty")
-            .remedy("Choose another moment, or write .ply files, which can be."));
+            .remedy("Choose another time, or write .ply files, which can be."));
     }
     let degree = degree_of(params[SH].width() / 3).expect("a layer has at least the base colour");
     let fraction_bits = streams::fraction_bits(params, &rows);
     let axes = axes::Axes::of_up(up).filter(|_| version >= NAMES_AXES);
     if axes.is_none() && up != Y_DOWN {
         let what = "the file does not name its axes (version 2, or up lies along none of them)";
-        warnings.say(format!("{what}: other programs will take y as down, as in .ply"));
+        warnings.say(format!("{what}: other programs will read y as down, as in .ply"));
     }
     let flags = if axes.is_some() { EXTENDED } else { 0 };
     let header = Header { version, count: count as usize, degree, fraction_bits, flags };

@@ -216,7 +216,7 @@ fn what_is_clipped_is_counted() {
     p[SH].set(3, 5, -1.5);
     let mut file = Vec::new();
     let said = write(&p, 3, Y_DOWN, &mut file).unwrap().lines().join("\n");
-    for part in ["farther out", "a scale outside", "base colour", "spherical harmonics above"] {
+    for part in ["were outside of the range", "a scale outside", "base colour", "spherical harmonics above"] {
         assert!(said.contains(&format!("1 of 4 Gaussians {}", sentence(&said, part))), "{part}: {said}");
     }
     assert!(write(&Params::new(0, 1, &[]), 3, Y_DOWN, &mut Vec::new()).is_err());

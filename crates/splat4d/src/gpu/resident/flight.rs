@@ -65,7 +65,7 @@ struct Flight {
 #[derive(Debug, Default)]
 pub(in crate::gpu) struct Flights {
     under_way: VecDeque<Flight>,
-    /// Those that are done, not told yet.
+    /// Those that are done, not reported yet.
     done: Vec<ResidentStepped>,
     /// Memory of records that are not in use.
     spare: Vec<Grown>,

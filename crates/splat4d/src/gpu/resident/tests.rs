@@ -217,7 +217,7 @@ fn one(camera: &Camera) -> [(&[Camera], f64); 1] {
 #[test]
 fn tunings_change_no_bit() {
     let camera = camera([0.0, 0.0, -4.0], 61, 47);
-    // By the forms of the blend's way back, which alone change bits.
+    // By the forms of the blend's backward pass, which alone change bits.
     let mut first = std::collections::HashMap::<[bool; 2], After>::new();
     for tuning in crate::gpu::Tuning::sweep() {
         let Some(gpu) = crate::gpu::tests::gpu() else { return };

@@ -122,8 +122,8 @@ fn the_map_carries_one_to_the_other() {
         let [(_, a), (_, b)] = normals(seed, 0.8);
         let t = Transport::new(&a, &b);
         assert_near(&sandwich(&t.map, &a), &b, EXACT, "f64");
-        assert_near(&mul(&t.map, &t.back()), &IDENTITY, 1e-9, "the way back");
-        assert_near(&Transport::new(&b, &a).map, &t.back(), 1e-9, "the way back");
+        assert_near(&mul(&t.map, &t.back()), &IDENTITY, 1e-9, "the backward pass");
+        assert_near(&Transport::new(&b, &a).map, &t.back(), 1e-9, "the backward pass");
         let (a, b) = (stiff(seed), stiff(seed + 1000));
         assert_near(&sandwich(&Transport::new(&a, &b).map, &a), &b, EXACT, "f64, condition 1e4");
         // As stored in 32 bits.

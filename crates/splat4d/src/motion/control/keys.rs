@@ -53,7 +53,7 @@ impl Timeline {
 
     fn place(&self, t: Time) -> Place {
         let segments = if self.curve == Curve::Cubic { self.keys - 3 } else { self.keys - 1 };
-        // A clip of one moment has no rate of time.
+        // A clip of one time has no rate of time.
         let length = self.clip[1] - self.clip[0];
         let rate = if length > 0.0 { segments as f64 / length } else { 0.0 };
         let along = (t.0 - self.clip[0]) * rate;

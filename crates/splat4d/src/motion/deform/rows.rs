@@ -65,7 +65,7 @@ impl<F: Real> Bounds<F> {
         std::array::from_fn(|k| (x[k] - self.center[k]) / self.radius)
     }
 
-    /// Width of what moves a position, and the gains of δq and δs.
+    /// Width of dynamic regions a position, and the gains of δq and δs.
     #[inline(always)]
     fn layout(&self) -> (usize, F, F) {
         (if self.rigid { 6 } else { 3 }, F::of(GAINS[2]), F::of(GAINS[3]) * self.radius)

@@ -152,7 +152,7 @@ fn check_row(at: [Normal; 3], w: &Normal, fusion: Fusion, predictor: Predictor, 
     usize::from(f.open > 0.0 && f.open < trust)
 }
 
-/// Means that a table of frames says, linear in between: balls that somebody has watched.
+/// Means that a table of frames says, linear in between: tracked balls.
 struct Watched {
     frames: Vec<[f64; 3]>,
 }

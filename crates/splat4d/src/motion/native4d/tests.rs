@@ -295,7 +295,7 @@ fn the_life_shown_is_the_life_drawn_and_its_integral_is_that_of_the_marginal() {
         let expected = g[OPACITY].sigmoid() * (TAU * variance).sqrt() / SPEC.speed;
         assert!((sum / expected - 1.0).abs() < 1e-9, "{sum} {expected}");
     }
-    // Whoever is left out of the active set is fainter than what is drawn.
+    // A Gaussian left out of the active set is fainter than what is rendered.
     let mut ids = Vec::new();
     l.active(Time(2.5), &mut ids);
     let out = splats(&l, 2.5);

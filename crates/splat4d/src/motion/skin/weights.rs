@@ -477,7 +477,7 @@ pub fn farthest_points<F: Real>(geometry: &Table<F>, count: usize) -> Vec<[F; 3]
     let mut out = Vec::with_capacity(count.min(n));
     while out.len() < count.min(n) {
         let best = (0..n).fold(0, |best, i| if far[i] > far[best] { i } else { best });
-        // From the second on these are squared distances to the nearest chosen point; doubles are not worth a node.
+        // From the second on these are squared distances to the nearest chosen point; duplicates get no node.
         if !out.is_empty() && far[best] <= 0.0 {
             break;
         }

@@ -12,7 +12,7 @@ fn featured(n: usize) -> Draft {
     let mut draft = made_up(n, 1, 7);
     draft.meta.features = vec![[-1.0, 2.0], [0.5, 0.5], [0.0, 10.0]];
     for (i, p) in draft.nodes[0].primitives.iter_mut().enumerate() {
-        // What tells a Gaussian from others in the file: its first colour.
+        // What identifies a Gaussian in the file: its first colour.
         p.features = if i % 4 == 3 { Vec::new() } else { vec![3.0 * p.base_color[0] - 1.0, 0.5, i as f32 % 10.0] };
     }
     draft

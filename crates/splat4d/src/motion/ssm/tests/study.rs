@@ -165,7 +165,7 @@ fn fit_mlp(path: Path, ticks: usize, seconds: f64, width: usize, steps: usize) -
     let inputs = encoded(1, OCTAVES) + SOURCES;
     let shape = MlpShape { inputs, width, layers: 4, skip: None, outputs: 3 };
     let mlp = Mlp::new("mlp", shape, 1.0, Rng::new(1, "mlp", 0), &mut p).unwrap();
-    // Which node is told by a one, which is an embedding that is learnt in the first layer.
+    // A one-hot input selects the node: an embedding that the first layer learns.
     let ask = |range: std::ops::Range<usize>| {
         let (mut x, mut target) = (Vec::new(), Vec::new());
         for t in range {
