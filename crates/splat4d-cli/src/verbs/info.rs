@@ -23,7 +23,7 @@ use splat4d_train::run::{Stopwatch, memory_estimate, open_capture};
 use splat4d_workflow::files::{self, grouped, human_bytes, human_seconds};
 use splat4d_workflow::run_folder::{Origin, Run};
 use splat4d_workflow::source::{Source, bundle, cloud};
-use splat4d_workflow::{chunked, status};
+use splat4d_workflow::{chunked, sequence, status};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -87,7 +87,14 @@ pub(crate) struct Args {
 }
 
 /// What readers say of values that cannot be right as they were read; all else that they say is a note.
-const DOUBTS: [&str; 2] = ["--linear", "where single precision has steps"];
+const DOUBTS: [&str; 6] = [
+    "--linear",
+    "where single precision has steps",
+    "more rows than its header states",
+    "a network that splat4d does not read",
+    "steps of a training rather than frames",
+    "rendered as Gaussians, which looks different",
+];
 
 /// Output of the verb: a JSON object, and the same for people.
 struct Told {
@@ -110,7 +117,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let marker = capture::is_metadata(path);
     let sog = path.join(sog::META).is_file() || path.file_name().is_some_and(|name| name == sog::META);
     let levels = path.file_name().is_some_and(|name| name == sog::levels::LEVELS);
-    let foreign = sog || levels || (path.is_dir() && bundle::is_scene(path));
+    // Numbered files of Gaussians, in a folder or by a pattern, unless a capture's folder holds them.
+    let frames = || !capture::is_folder(path) && sequence::frames(path).is_ok();
+    let foreign = sog || levels || (path.is_dir() && (bundle::is_scene(path) || frames()));
     let is_capture = !Run::is(path) && !foreign && (path.is_dir() || marker);
     if args.doctor && !is_capture {
         return Err(Error::input("the doctor checks captures only")
