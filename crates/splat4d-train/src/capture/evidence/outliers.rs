@@ -131,17 +131,15 @@ pub(super) fn check(capture: &Capture, looks: Vec<Look>, pixels: usize) -> Vec<F
             first_names(&open)
         )));
     }
-    // Neither points nor matches say anything of these.
+    // Neither points nor matches show that these are right or wrong.
     let silent: Vec<String> = (0..looks.len())
-        .filter(|&k| {
-            doubtful.contains(&at[k]) && !measured.iter().any(|p| p.has(k)) && !named.contains(&looks[k].frame)
-        })
+        .filter(|&k| doubtful.contains(&at[k]) && !good(k) && !named.contains(&looks[k].frame))
         .map(|k| told(k).0)
         .filter(|name| !open.contains(name))
         .collect();
     if !silent.is_empty() {
         findings.push(note(format!(
-            "The poses of {} of {} images: they show too few initial points, and too few matches with the images around them ({}).",
+            "The poses of {} of {} images: neither initial points nor matches with the images around them decide ({}).",
             silent.len(),
             order.len(),
             first_names(&silent)
