@@ -6,6 +6,10 @@ use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
+/// How a file begins that Git LFS left in the place of the real one, and how long it is at most.
+const POINTER: &[u8] = b"version https://git-lfs";
+const POINTER_BYTES: u64 = 1024;
+
 /// What to do about a file that cannot be read.
 const CHECK: &str = "Check that the file exists and may be read by you.";
 
@@ -54,6 +58,11 @@ pub(crate) fn read_with(path: &Path, remedy: &str) -> Result<Vec<u8>> {
             .remedy(CHECK));
     }
     file.take(length).read_to_end(&mut bytes).map_err(|e| cannot_read(path, e, remedy))?;
+    if length <= POINTER_BYTES && bytes.starts_with(POINTER) {
+        return Err(Error::input("is a pointer of Git LFS, not the file itself")
+            .at(path.display())
+            .remedy("Fetch the files of its repository with `git lfs pull`."));
+    }
     Ok(bytes)
 }
 
@@ -78,6 +87,8 @@ mod tests {
         let file = folder.path().join("a.txt");
         std::fs::write(&file, "text").unwrap();
         assert_eq!(read_text(&file).unwrap(), "text");
+        std::fs::write(&file, "version https://git-lfs.github.com/spec/v1\noid sha256:1\nsize 9\n").unwrap();
+        assert!(read(&file).unwrap_err().to_string().contains("git lfs pull"));
         std::fs::write(&file, b"a\xff").unwrap();
         assert!(read_text(&file).unwrap_err().to_string().contains("UTF-8"));
         let mut odd = vec![folder.path().to_owned()];

@@ -9,7 +9,7 @@ use crate::source::{Source, not_empty};
 use serde_json::json;
 use splat4d::bake::Likeness;
 use splat4d::format::dialect::{self, WriteOptions};
-use splat4d::format::mend::from_linear;
+use splat4d::format::linear::from_linear;
 use splat4d::format::{self, DIALECTS, Dialect, Linear, Warnings, playback, spz};
 use splat4d::layers::{self, Constant, Scene, rotation_between};
 use splat4d::math::Se3;

@@ -47,7 +47,14 @@ const MANY_LAYERS: usize = 8;
 const BAR: usize = 32;
 
 /// What readers say of values that cannot be right as they were read; all else that they say is a note.
-const DOUBTS: [&str; 2] = ["--linear", "where single precision has steps"];
+const DOUBTS: [&str; 6] = [
+    "--linear",
+    "where single precision has steps",
+    "more rows than its header states",
+    "a network that splat4d does not read",
+    "steps of a training rather than frames",
+    "rendered as Gaussians, which looks different",
+];
 
 /// Options of [`inspect`].
 #[derive(Clone, Debug, Default)]
@@ -100,7 +107,9 @@ pub fn inspect(path: &Path, options: &InspectOptions, console: &dyn Listener) ->
     let marker = capture::is_metadata(path);
     let sog = path.join(sog::META).is_file() || path.file_name().is_some_and(|name| name == sog::META);
     let levels = path.file_name().is_some_and(|name| name == sog::levels::LEVELS);
-    let foreign = sog || levels || (path.is_dir() && bundle::is_scene(path));
+    // Numbered files of Gaussians, in a folder or by a pattern, unless a capture's folder holds them.
+    let frames = || !capture::is_folder(path) && sequence::frames(path).is_ok();
+    let foreign = sog || levels || (path.is_dir() && (bundle::is_scene(path) || frames()));
     let is_capture = !Run::is(path) && !foreign && (path.is_dir() || marker);
     if options.doctor.is_some() && !is_capture {
         return Err(Error::input("the doctor checks captures only")

@@ -14,6 +14,9 @@ use std::path::{Path, PathBuf};
 const MAX_FILES: f64 = 100_000.0;
 /// Most digits of a padded number in a pattern.
 const MAX_DIGITS: usize = 9;
+/// Programs save their Gaussians every so many steps (or a multiple of it; some count from 0): Brush every 5,000, 3DGS after 7,000
+/// and 30,000, OpenSplat and gsplat as told. No film has so few of its frames.
+const SNAPSHOTS: u64 = 500;
 /// Gaps of a sequence that are named.
 const NAMED_GAPS: usize = 8;
 /// The name of a frame in a folder, without a pattern.
@@ -148,6 +151,8 @@ pub struct Frames {
     pub numbers: Vec<u64>,
     /// Numbers that are missing between them, as people say it.
     pub missing: Option<String>,
+    /// The newest file, where the numbers look like steps of a training.
+    pub snapshots: Option<PathBuf>,
 }
 
 /// The frames that a folder or a pattern stands for, in the order of their numbers.
@@ -200,8 +205,11 @@ pub fn frames(path: &Path) -> Result<Frames> {
     let gap = |w: &[(u64, OsString)]| (w[1].0 > w[0].0 + step).then(|| (w[0].0 + step, w[1].0 - step));
     let gaps: Vec<(u64, u64)> = found.windows(2).filter_map(gap).collect();
     let numbers = found.iter().map(|(n, _)| (n - first) / step).collect();
-    let files = found.into_iter().map(|(_, name)| folder.join(name)).collect();
-    Ok(Frames { files, numbers, missing: (!gaps.is_empty()).then(|| in_words(&gaps)) })
+    let all = |rest: u64| found.iter().all(|(n, _)| n % SNAPSHOTS == rest);
+    let are_steps = found.len() > 1 && (all(0) || all(SNAPSHOTS - 1));
+    let files: Vec<PathBuf> = found.into_iter().map(|(_, name)| folder.join(name)).collect();
+    let snapshots = files.last().filter(|_| are_steps).cloned();
+    Ok(Frames { files, numbers, missing: (!gaps.is_empty()).then(|| in_words(&gaps)), snapshots })
 }
 
 /// Greatest common divisor (Euclid).
@@ -351,6 +359,21 @@ mod tests {
         (0..=30).for_each(|n| drop(std::fs::remove_file(folder.path().join(format!("g{n}.ply")))));
         std::fs::write(folder.path().join("f4000000000.ply"), b"").unwrap();
         assert!(frames(folder.path()).unwrap_err().to_string().contains("from 1 to 4000000000"));
+    }
+
+    #[test]
+    fn steps_of_a_training_are_no_frames() {
+        let newest = |names: &[&str]| {
+            let folder = tempfile::tempdir().unwrap();
+            names.iter().for_each(|name| std::fs::write(folder.path().join(name), b"").unwrap());
+            let file = frames(folder.path()).unwrap().snapshots?;
+            Some(file.file_name().unwrap().to_str().unwrap().to_owned())
+        };
+        assert_eq!(newest(&["export_5000.ply", "export_10000.ply", "export_30000.ply"]).unwrap(), "export_30000.ply");
+        assert_eq!(newest(&["point_cloud_6999.ply", "point_cloud_29999.ply"]).unwrap(), "point_cloud_29999.ply");
+        assert_eq!(newest(&["f0.ply", "f1.ply", "f2.ply"]), None);
+        assert_eq!(newest(&["f000.ply", "f010.ply", "f500.ply"]), None);
+        assert_eq!(newest(&["f500.ply"]), None);
     }
 
     #[cfg(unix)]

@@ -116,7 +116,15 @@ impl Source {
                 Error::input("unknown format: its first bytes match none that splat4d reads").remedy(remedy())
             })),
         };
-        opened.map_err(|e| e.at(path.display()))
+        let mut source = opened.map_err(|e| e.at(path.display()))?;
+        if let Some(network) = bundle::network_of(path).filter(|_| source.ply.is_some()) {
+            source.warnings.say(format!(
+                "{} belongs to these Gaussians: a network that splat4d does not read moves or generates them, so this is not \
+                 the scene as trained. Export it as a sequence of .ply files",
+                network.display()
+            ));
+        }
+        Ok(source)
     }
 
     /// Leaves out Gaussians whose numbers are not finite: files of other programs have such, and no writer takes them. Says
@@ -185,6 +193,12 @@ fn open_sequence(path: &Path, fps: f64) -> Result<Source> {
     let mut up = None;
     // Frames far from the origin may each have an offset: that of the first is the scene's.
     let mut offset = None;
+    if let Some(newest) = &found.snapshots {
+        warnings.say(format!(
+            "the numbers of these files are steps of a training rather than frames: if so, give the newest, {}",
+            newest.display()
+        ));
+    }
     if let Some(missing) = &found.missing {
         warnings.say(format!("frames are missing: {missing}. The scene is empty at their times"));
     }

@@ -78,7 +78,7 @@ pub(crate) struct Args {
     /// Add the scene's offset: positions in the capture's world, in double precision (.ply)
     #[arg(long)]
     world: bool,
-    /// Read these values of the input as they are, not as logarithms or logits, repeatable
+    /// Read these values of the input as they are, not as logarithms, logits or coefficients, repeatable
     #[arg(long, value_name = "WHAT", value_enum)]
     linear: Vec<LinearValues>,
     /// Version of .spz to write: 3 for most programs, 2 for GaussianSplats3D and spz-js, 4 for PlayCanvas' engine
@@ -121,19 +121,22 @@ impl Up {
     }
 }
 
-/// Values that some programs do not store as logarithms or logits.
+/// Values that some programs do not store as logarithms, logits or coefficients.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum LinearValues {
     /// Scales are lengths
     Scales,
-    /// Opacities are alphas from 0 to 1
+    /// Opacities are alphas from 0 to 1, 100 or 255
     Opacities,
+    /// Base colours are RGB from 0 to 1 or 255
+    Colours,
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let linear = |what: &LinearValues| match what {
         LinearValues::Scales => Linear::Scales,
         LinearValues::Opacities => Linear::Opacities,
+        LinearValues::Colours => Linear::Colours,
     };
     let conversion = Conversion {
         input: args.input.clone(),

@@ -249,6 +249,8 @@ fn a_sequence_keeps_its_gaps_and_takes_over_no_tail() {
     };
     let told = splat4d(&["convert", str(&at("frames")), str(&at("all.safetensors")), "--fps", "10"]).run().told();
     assert!(told.contains("frames are missing: 3"), "{told}");
+    let info = splat4d(&["info", str(&at("frames"))]).run().ok();
+    assert!(info.contains("frames are missing: 3"), "{info}");
     convert("10", &[]).ok();
     assert_eq!(count(&out) - count(&out.join(".splat4d")), 4, "with the frame that is missing, of nothing");
     convert("20", &[]).ok();

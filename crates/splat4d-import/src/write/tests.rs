@@ -126,6 +126,40 @@ fn pictures_of_others_are_neither_taken_for_ours_nor_removed() {
 }
 
 #[test]
+fn alpha_of_videos_is_stored() {
+    if let Err(e) = video::Tools::find() {
+        assert!(std::env::var_os("REQUIRE_FFMPEG").is_none(), "{e}");
+        println!("skipped: {e}");
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let half = "color=c=red:s=64x48:r=10:d=0.3,format=rgba,geq=r=200:g=60:b=30:a=255*gte(X\\,32)";
+    let mut made = Vec::new();
+    for (name, codec) in [
+        ("prores.mov", &["prores_ks", "-profile:v", "4444", "-pix_fmt", "yuva444p10le"][..]),
+        ("vp9.webm", &["libvpx-vp9", "-pix_fmt", "yuva420p", "-deadline", "realtime"]),
+    ] {
+        let path = folder.path().join(name);
+        let mut ffmpeg = std::process::Command::new("ffmpeg");
+        ffmpeg.args(["-loglevel", "error", "-nostdin", "-f", "lavfi", "-i", half, "-c:v"]).args(codec);
+        // Not every ffmpeg can write both.
+        if ffmpeg.arg(&path).status().unwrap().success() {
+            made.push(path);
+        }
+    }
+    assert!(!made.is_empty(), "ffmpeg writes one of the formats with alpha");
+    let sources: Vec<_> = made.iter().map(|path| video::open(path, 25.0).unwrap()).collect();
+    let out = tempfile::tempdir().unwrap();
+    for camera in store(out.path(), &clips(&sources, &Selection::default()), usize::MAX).unwrap() {
+        assert_eq!((camera.shots.len(), camera.file(2).extension().unwrap().to_str()), (3, Some("png")));
+        let stored = image::open(out.path().join(camera.file(2))).unwrap().into_rgba8();
+        let alpha = [8, 56].map(|x| stored.get_pixel(x, 24)[3]);
+        assert!(alpha[0] < 8 && alpha[1] > 247, "{}: {alpha:?}", camera.name);
+        assert!(camera.warnings.iter().any(|w| w.contains("PNG with alpha")), "{:?}", camera.warnings);
+    }
+}
+
+#[test]
 fn names_of_cameras_are_names_of_folders() {
     let names = camera_names(&["GX01/0042", "-rf", "é 1", "gx01_0042", "", "..", "a".repeat(90).as_str()]);
     assert_eq!(&names[..6], ["GX01_0042", "rf", "é_1", "gx01_0042_2", "camera", "__"]);

@@ -9,6 +9,7 @@ mod record3d;
 mod tests;
 
 use super::convention::{Convention, Poses};
+use super::lookup::Twins;
 use super::points::read_ply;
 use super::{CaptureKind, CaptureOptions, DepthFile, PointCloud, RawCapture, RawFrame, Timing, rig, sequence};
 use super::{lookup, pose};
@@ -41,6 +42,11 @@ pub(super) fn read(path: &Path, options: &CaptureOptions) -> Option<Result<RawCa
     EXPORTS.iter().find_map(|e| (e.find)(path).map(|file| (e.read)(path, &file, options)))
 }
 
+/// Whether there is an export in a folder.
+pub(super) fn is_there(folder: &Path) -> bool {
+    EXPORTS.iter().any(|e| (e.find)(folder).is_some())
+}
+
 /// A posed image.
 struct Shot {
     /// Its name, for messages and for the order of images without times.
@@ -62,6 +68,15 @@ struct Said {
     up: Option<[f64; 3]>,
     warnings: Vec<String>,
     notes: Vec<String>,
+}
+
+/// Sorted names of a folder's images, one of each name whatever its ending, and a remark about those left out. Errors: images
+/// of one name differ in size.
+fn images_of(folder: &Path) -> Result<(Vec<String>, Option<String>)> {
+    let mut twins = Twins::default();
+    let kept = twins.single(rig::image_names(folder).iter().map(|name| folder.join(name)).collect())?;
+    let name = |image: &PathBuf| image.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    Ok((kept.iter().map(name).collect(), twins.in_words(folder)))
 }
 
 /// `cam_from_world` of a camera-to-world matrix in OpenGL axes.

@@ -152,9 +152,9 @@ fn read_bounds(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<R
     if n3dv::applies(root) { n3dv::read(root, marker, options) } else { llff::read(root, marker, options) }
 }
 
-/// Whether a folder holds a capture of one of these layouts.
-fn is_capture(folder: &Path) -> bool {
-    READERS.iter().any(|(marker, _)| is_there(folder, marker))
+/// Whether a folder holds a capture of one of these layouts, or another program's export.
+pub(super) fn is_capture(folder: &Path) -> bool {
+    READERS.iter().any(|(marker, _)| is_there(folder, marker)) || foreign::is_there(folder)
 }
 
 /// Says which of several layouts was read, why, and how to choose another.

@@ -4,6 +4,8 @@
 //! normal form (macOS decomposes umlauts) and leading folders (absolute paths of another machine). The exact name goes
 //! first; else the one file that fits is taken, and one remark counts such names. Several files that fit are an error.
 
+mod twins;
+
 use super::account::Severity;
 use super::account::{Account, Aspect, first_names};
 use super::{CaptureOptions, rig};
@@ -13,6 +15,8 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 use unicode_normalization::UnicodeNormalization;
+
+pub(super) use twins::Twins;
 
 /// What names of folders have in which other programs keep masks, whatever white means there.
 const MASK_WORDS: [&str; 3] = ["mask", "matte", "segment"];
@@ -347,6 +351,8 @@ impl Lookup {
             let others: Vec<String> = images.into_iter().flatten().filter(|n| *n != name).cloned().collect();
             let path = folder.join(name);
             if !others.is_empty() {
+                let mut twins = Twins::default();
+                others.iter().try_for_each(|other| twins.add(path.clone(), folder.join(other)))?;
                 self.bare.borrow_mut().insert(path.clone(), others);
             }
             return Ok(Some(path));

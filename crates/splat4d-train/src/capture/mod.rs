@@ -437,6 +437,11 @@ pub fn is_metadata(path: &Path) -> bool {
     layout::is_metadata(path)
 }
 
+/// Whether a folder holds a capture, by the files in it; whether they can be read is not said.
+pub fn is_folder(path: &Path) -> bool {
+    path.is_dir() && layout::is_capture(path)
+}
+
 /// A coloured point cloud from a .ply file. Errors: not a point cloud, damage, absurd counts.
 pub(crate) fn read_points(path: &Path) -> Result<PointCloud> {
     points::read_ply(path)

@@ -3,6 +3,7 @@
 use super::account::Severity;
 use super::account::{Account, Aspect, first_names};
 use super::convention::{Convention, Poses};
+use super::lookup::Twins;
 use super::points::read_ply;
 use super::stray::{ffmpeg_command, videos};
 use super::{CaptureKind, CaptureOptions, PointCloud, RawCapture, RawFrame, Split};
@@ -60,7 +61,11 @@ pub(super) fn points(root: &Path) -> Result<Option<PointCloud>> {
 pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<RawCapture> {
     let place = |e: Error| e.at(marker.display());
     let rows = rows(marker)?;
-    let folders = folders(root);
+    let mut folders = folders(root);
+    let mut twins = Twins::default();
+    for folder in &mut folders {
+        folder.images = twins.single(std::mem::take(&mut folder.images))?;
+    }
     let films = videos(root);
     let fps = options.fps.or_else(|| extracted_rate(root, &folders.first()?.name)).unwrap_or(DEFAULT_FPS);
     let names: Vec<String> = folders.iter().map(|f| f.name.clone()).collect();
@@ -68,6 +73,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         return Err(place(mismatch(rows.len(), &folders, &films)));
     };
     let mut account = Account::default();
+    twins.report(root, &mut account);
     for (severity, what) in about_rows(&names, &which, rows.len()) {
         let aspect = if which.len() < rows.len() { Aspect::NotFound } else { Aspect::Assumed };
         account.add(aspect, severity, what);

@@ -27,6 +27,8 @@ const METADATA: &str = "metadata.json";
 const SCALES: [usize; 5] = [1, 2, 4, 8, 16];
 /// DyCheck's folder of split lists.
 const SPLITS: &str = "splits";
+/// Folders that DyCheck and HyperNeRF add.
+const UNREAD: [&str; 5] = ["depth", "covisible", "keypoint", "resized_mask", "camera-paths"];
 /// Skew above this bends images visibly, and is not modelled, pixels.
 const MOST_SKEW: f64 = 0.5;
 /// Colour of points, which the layout gives none.
@@ -181,6 +183,11 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         account.add(Aspect::NotRead, Severity::Note, what);
     }
     lookup.report(&mut account);
+    let others: Vec<&str> = UNREAD.into_iter().filter(|name| root.join(name).is_dir()).collect();
+    if !others.is_empty() {
+        let what = format!("Folders of the layout: {}. capture.json names depth, masks and others.", others.join(", "));
+        account.add(Aspect::NotRead, Severity::Note, what);
+    }
     let named = cameras.len() > 1;
     Ok(RawCapture {
         cameras: cameras.iter().map(|c| format!("camera{c}")).collect(),

@@ -5,7 +5,7 @@ use super::account::Account;
 use super::convention::Convention;
 use super::json::{self, Node};
 use super::lookup::{self, Lookup};
-use super::points::read_ply;
+use super::points::{read_ply, white_of};
 use super::{CaptureKind, CaptureOptions, PointCloud, RawCapture, RawFrame, Split, rig};
 use splat4d::format::npy::Npy;
 use splat4d::math::Se3;
@@ -128,9 +128,12 @@ fn read_archive(path: &Path) -> Result<PointCloud> {
             return Err(Error::input(what).at(path.display()).remedy("Remove the file to start without it."));
         }
     };
+    let numbers = array.to_f64();
+    let rows = || numbers.chunks_exact(columns);
+    let white = white_of(rows().flat_map(|row| row[3..6].iter().map(|v| *v as f32)));
     let mut cloud = PointCloud::default();
-    for row in array.to_f64().chunks_exact(columns) {
-        cloud.push([row[0], row[1], row[2]], [row[3], row[4], row[5]].map(|v| v as f32), None);
+    for row in rows() {
+        cloud.push([row[0], row[1], row[2]], [row[3], row[4], row[5]].map(|v| v as f32 / white), None);
     }
     Ok(cloud)
 }

@@ -18,14 +18,21 @@ pub(super) fn read_ply(path: &Path) -> Result<PointCloud> {
 
 fn cloud(bytes: &[u8]) -> Result<PointCloud> {
     let read = ply::read_points(&plain_names(bytes))?;
+    let white = white_of(read.colors.iter().flatten().copied());
     let mut cloud = PointCloud::default();
     for (i, point) in read.positions.iter().enumerate() {
         let seen = read.times.get(i).copied();
         // No number: the point was not seen at one time.
         let seen = seen.filter(|t| !t.is_nan());
-        cloud.push(*point, read.colors.get(i).copied().unwrap_or([GREY; 3]), seen);
+        cloud.push(*point, read.colors.get(i).map_or([GREY; 3], |c| c.map(|v| v / white)), seen);
     }
     Ok(cloud)
+}
+
+/// The number that stands for full colour in colours of floating point: 1, or 255 where most are above 1.
+pub(super) fn white_of(colors: impl Iterator<Item = f32>) -> f32 {
+    let (above, all) = colors.fold((0usize, 0usize), |(above, all), c| (above + usize::from(c > 1.0), all + 1));
+    if 2 * above > all { 255.0 } else { 1.0 }
 }
 
 /// Names that MeshLab, VisualSFM and others give to colours, and what they are otherwise called.
@@ -252,6 +259,8 @@ mod tests {
         let floats = "property float r\nproperty float g\nproperty float b\nproperty double t\n";
         let seen = points(floats, "nan 1.5 0.25 7");
         assert_eq!((seen.colors[0], seen.times[0]), ([GREY, 1.0, 0.25], Some(7.0)));
+        let bytes = points(floats, "51 255 0 7");
+        assert_eq!(bytes.colors[0], [0.2, 1.0, 0.0], "bytes that were written as floats");
         let wide = "property ushort red\nproperty ushort green\nproperty ushort blue\n";
         assert_eq!(points(wide, "65535 0 13107").colors[0], [1.0, 0.0, 0.2]);
     }

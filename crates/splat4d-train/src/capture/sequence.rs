@@ -65,6 +65,21 @@ pub(super) fn order(
         Sequence::Video => false,
     };
     let count = names.len();
+    let fixed = groups.iter().all(|group| still(group, poses));
+    if sequence == Sequence::Auto
+        && !fixed
+        && let Some(order) = repeated(names, poses, fps)
+    {
+        notes.push(format!(
+            "The capture has no times: its {count} images have {} poses, which repeat to the last bit. They are read as the frames of \
+             {} fixed cameras, numbered by their names ({} and so on). If they are photos of one time, use --set \
+             capture.sequence=photos.",
+            order.cameras.len(),
+            order.cameras.len(),
+            names[0]
+        ));
+        return order;
+    }
     if sequence == Sequence::Auto && moment && !one_each && count > 1 {
         notes.push(format!(
             "The capture has no times, and its names do not number the frames of a video: its {count} images are \
@@ -115,6 +130,58 @@ pub(super) fn moment(names: &[&str]) -> FrameOrder {
     sorted.values().enumerate().for_each(|(camera, &i)| frames[i].0 = camera);
     let cameras = sorted.keys().map(|(name, _)| (*name).to_owned()).collect();
     FrameOrder { cameras, frames, named: false, timing: Timing::Moment }
+}
+
+/// Fixed cameras whose names say otherwise (`0001/cam00.png`, `cam00_0001.png`): every pose repeats to the last bit, as that of
+/// no photo does. `None`: some do not.
+fn repeated(names: &[&str], poses: &[Se3], fps: f64) -> Option<FrameOrder> {
+    let bits = |p: &Se3| p.rotation.iter().flatten().chain(&p.translation).map(|v| v.to_bits()).collect::<Vec<u64>>();
+    let mut views: BTreeMap<Vec<u64>, Vec<usize>> = BTreeMap::new();
+    (0..names.len()).for_each(|i| views.entry(bits(&poses[i])).or_default().push(i));
+    if views.len() < 2 || views.values().any(|view| view.len() < 2) {
+        return None;
+    }
+    let mut views: Vec<Vec<usize>> = views.into_values().collect();
+    views.iter_mut().for_each(|view| view.sort_by_key(|&i| names[i]));
+    views.sort_by_key(|view| names[view[0]]);
+    let numbers = frame_numbers(names, &views);
+    let first = numbers.iter().min().copied().unwrap_or(0);
+    let mut frames = vec![(0, 0, 0.0); names.len()];
+    for (camera, view) in views.iter().enumerate() {
+        for &i in view {
+            let number = numbers[i] - first;
+            frames[i] = (camera, number, number as f64 / fps);
+        }
+    }
+    let cameras = (0..views.len()).map(|i| format!("view{i:03}")).collect();
+    Some(FrameOrder { cameras, frames, named: false, timing: Timing::Numbers })
+}
+
+/// The number of each image's frame: the one in its name that differs between the images of a view and is found in other views
+/// too; without such a number, its place among the images of its view.
+fn frame_numbers(names: &[&str], views: &[Vec<usize>]) -> Vec<usize> {
+    let all: Vec<Vec<usize>> = names
+        .iter()
+        .map(|n| n.split(|c: char| !c.is_ascii_digit()).filter_map(|digits| digits.parse().ok()).collect())
+        .collect();
+    let places = all.iter().map(Vec::len).min().unwrap_or(0);
+    let counts_frames = |place: &usize| {
+        let of = |view: &Vec<usize>| view.iter().map(|&i| all[i][*place]).collect::<BTreeSet<usize>>();
+        let known: Vec<BTreeSet<usize>> = views.iter().map(of).collect();
+        let span = || known.iter().flatten().max().zip(known.iter().flatten().min()).map_or(0, |(a, b)| a - b);
+        known.iter().zip(views).all(|(numbers, view)| numbers.len() == view.len())
+            && known.windows(2).all(|w| !w[0].is_disjoint(&w[1]))
+            && span() <= rig::MAX_SPAN
+    };
+    let same_length = all.iter().all(|numbers| numbers.len() == places);
+    match (0..places).find(|place| same_length && counts_frames(place)) {
+        Some(place) => all.iter().map(|numbers| numbers[place]).collect(),
+        None => {
+            let mut out = vec![0; names.len()];
+            views.iter().for_each(|view| view.iter().enumerate().for_each(|(rank, &i)| out[i] = rank));
+            out
+        }
+    }
 }
 
 /// Whether the images are frames of one camera's film: it never moves, or they are numbered evenly as films are.
@@ -250,6 +317,34 @@ mod tests {
             order(&["IMG_7.png", "IMG_9.png"], &[poses(1)[0]; 2], Sequence::Auto, 10.0, &mut warnings, &mut notes);
         assert_eq!((still.timing, still.frames), (Timing::Numbers, vec![(0, 0, 0.0), (0, 2, 0.2)]));
         assert!(warnings.is_empty() && notes.is_empty());
+    }
+
+    #[test]
+    fn poses_that_repeat_are_those_of_fixed_cameras_whatever_the_names() {
+        let places = poses(3);
+        let of = |name: &dyn Fn(usize, usize) -> String, sequence: Sequence| {
+            let names: Vec<String> = (0..12).map(|i| name(i / 4, 2 * (i % 4))).collect();
+            let names: Vec<&str> = names.iter().map(String::as_str).collect();
+            let of_each: Vec<Se3> = (0..12).map(|i| places[i / 4]).collect();
+            let (mut warnings, mut notes) = (Vec::new(), Vec::new());
+            let found = order(&names, &of_each, sequence, 10.0, &mut warnings, &mut notes);
+            assert!(warnings.is_empty(), "{warnings:?}");
+            (found.timing, found.cameras.len(), found.frames[7], notes.concat().contains("3 fixed cameras"))
+        };
+        let by_time: [&dyn Fn(usize, usize) -> String; 4] = [
+            &|c, t| format!("{:04}/cam{c:02}.png", t + 3),
+            &|c, t| format!("frame_{t:04}/{c}.png"),
+            &|c, t| format!("cam{c}_{t:04}.png"),
+            &|c, t| format!("{t:04}_left{c}.png"),
+        ];
+        for name in by_time {
+            let found = of(name, Sequence::Auto);
+            assert_eq!(found, (Timing::Numbers, 3, (1, 6, 0.6), true), "{}", name(0, 0));
+        }
+        // Numbers that no two views share say nothing: the order counts.
+        let apart = of(&|c, t| format!("DSC{:04}.png", 100 * c + 7 * t), Sequence::Auto);
+        assert_eq!(apart, (Timing::Numbers, 3, (1, 3, 0.3), true));
+        assert_eq!(of(by_time[0], Sequence::Photos).0, Timing::Moment);
     }
 
     #[test]

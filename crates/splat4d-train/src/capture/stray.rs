@@ -1,6 +1,7 @@
 //! What a folder holds that is no capture, and the way from there to one: archives, captures above and below, files under
 //! other names, images and videos without poses.
 
+use super::account::first_names;
 use super::{colmap, lookup, rig, sequence};
 use crate::path_text::in_command;
 use std::io::Read;
@@ -14,6 +15,10 @@ const ARCHIVE_ENDINGS: &[&str] = &["zip", "7z", "rar", "tar", "tgz", "gz", "r3d"
 const DATABASE: &str = "database.db";
 /// The cameras of a 3DGS output: names of images and poses, without the images.
 const OUTPUT_CAMERAS: &str = "cameras.json";
+/// The settings of a 3DGS output, and the folder of checkpoints of one of Nerfstudio.
+const OUTPUT_SETTINGS: &str = "cfg_args";
+const CHECKPOINTS: &str = "nerfstudio_models";
+const SCENE_ENDINGS: &[&str] = &["ply", "spz", "splat", "splatv", "sog", "ksplat", "glb", "s4d", "pt", "ckpt"];
 /// Bytes of a JSON file in which its keys are looked for.
 const HEAD: u64 = 1 << 16;
 /// Folders that are looked into for a capture.
@@ -35,6 +40,9 @@ pub(super) fn advice(root: &Path, named: &Path, is_capture: &dyn Fn(&Path) -> bo
     }
     if let Some(name) = names.iter().find(|n| ends(Path::new(n), ARCHIVE_ENDINGS)) {
         return Some(format!("{name} is an archive: unpack it, and give the folder that it makes."));
+    }
+    if let Some(advice) = scenes(root, &names) {
+        return Some(advice);
     }
     if root.join(OUTPUT_CAMERAS).is_file() {
         return Some(format!(
@@ -60,6 +68,26 @@ pub(super) fn advice(root: &Path, named: &Path, is_capture: &dyn Fn(&Path) -> bo
     }
     let images = colmap::has_images(root) || folders().any(|folder| !rig::image_names(&folder).is_empty());
     images.then(|| format!("It holds images, but no camera poses: {reconstruct}."))
+}
+
+/// What to do with scenes that are no captures: outputs of trainings and files of Gaussians. `None`: there are none.
+fn scenes(root: &Path, names: &[String]) -> Option<String> {
+    let checkpoints = root.join(CHECKPOINTS);
+    let newest = rig::file_names(&checkpoints).into_iter().rfind(|n| ends(Path::new(n), &["ckpt"]));
+    if let Some(checkpoint) = newest {
+        return Some(format!(
+            "It is the output of a training of Nerfstudio: give its newest checkpoint, {}.",
+            checkpoints.join(checkpoint).display()
+        ));
+    }
+    if names.iter().any(|n| n == OUTPUT_SETTINGS) {
+        return Some(
+            "It is an output folder of 3DGS without point_cloud/iteration_N/point_cloud.ply: train again, or copy that too.".into(),
+        );
+    }
+    let files: Vec<&String> = names.iter().filter(|n| ends(Path::new(n), SCENE_ENDINGS)).collect();
+    (!files.is_empty())
+        .then(|| format!("It holds scenes or points, but no cameras: give one of {}.", first_names(&files)))
 }
 
 /// Whether a name ends in one of these.

@@ -19,6 +19,9 @@ use std::path::{Component, Path, PathBuf};
 /// make them (Scaffold-GS).
 const NETWORKS: [&str; 4] = ["deformation.pth", "deform.pth", "opacity_mlp.pt", "checkpoints.pth"];
 
+/// Deformable 3DGS's folder of networks, next to that of results.
+const DEFORM: &str = "deform";
+
 /// Longest file that is inflated from an archive: bytes, and times its packed bytes. Gaussians shrink by less than 20:1.
 const MOST_SMALL: usize = 1 << 20;
 const MOST_RATIO: usize = 64;
@@ -41,14 +44,19 @@ pub(crate) fn open(folder: &Path, fps: f64) -> Result<Option<Source>> {
     if iteration.is_some() {
         source.warnings.say(format!("the newest iteration is read: {}", file.display()));
     }
-    let beside = file.parent().unwrap_or(Path::new("."));
-    if let Some(network) = NETWORKS.iter().find(|name| beside.join(name).is_file()) {
-        source.warnings.say(format!(
-            "{network} is next to the Gaussians: a network that splat4d does not read moves or generates them, so \
-             this is not the scene as trained. Export it as a sequence of .ply files"
-        ));
-    }
     Ok(Some(source))
+}
+
+/// A network's file that belongs to the Gaussians of a file, without which they are not the scene as trained.
+pub(crate) fn network_of(file: &Path) -> Option<PathBuf> {
+    let beside = file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let mut folders = vec![beside.to_path_buf()];
+    // Deformable 3DGS: point_cloud/iteration_N/point_cloud.ply, deform/iteration_N/deform.pth.
+    let full = std::path::absolute(file).ok()?;
+    if let (Some(iteration), Some(root)) = (full.parent().and_then(Path::file_name), full.ancestors().nth(3)) {
+        folders.push(root.join(DEFORM).join(iteration));
+    }
+    folders.iter().flat_map(|folder| NETWORKS.map(|name| folder.join(name))).find(|path| path.is_file())
 }
 
 /// Opens a file of a dialect, with the files next to it that a .gltf names.
@@ -200,9 +208,17 @@ mod tests {
         }
         let said = Source::open(at).unwrap().warnings;
         assert!(said.lines().iter().any(|w| w.contains("iteration_30000")), "{said:?}");
-        put(at, "point_cloud/iteration_30000/deformation.pth", b"");
-        let said = Source::open(at).unwrap().warnings;
-        assert!(said.lines().iter().any(|w| w.contains("deformation.pth")), "{said:?}");
+        for network in ["point_cloud/iteration_30000/deformation.pth", "deform/iteration_30000/deform.pth"] {
+            put(at, network, b"");
+            for path in [at.to_path_buf(), at.join("point_cloud/iteration_30000/point_cloud.ply")] {
+                let said = Source::open(&path).unwrap().warnings;
+                let name = Path::new(network).file_name().unwrap().to_str().unwrap();
+                assert!(said.lines().iter().any(|w| w.contains(name)), "{said:?}");
+            }
+            std::fs::remove_file(at.join(network)).unwrap();
+        }
+        let of_7000 = Source::open(&at.join("point_cloud/iteration_7000")).unwrap().warnings;
+        assert!(!of_7000.lines().iter().any(|w| w.contains("network")), "{of_7000:?}");
     }
 
     #[test]

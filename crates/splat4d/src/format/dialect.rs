@@ -94,6 +94,8 @@ pub struct PlyInfo {
     pub offset: [f64; 3],
     /// Whether the numbers were quantised (PlayCanvas' compressed layout).
     pub compressed: bool,
+    /// What was assumed or is not read, in sentences without a full stop.
+    pub assumed: Vec<String>,
     /// The header's comments.
     pub comments: Vec<String>,
     /// Properties of a Gaussian that were ignored; normals are not listed.

@@ -13,7 +13,7 @@ struct Foreign {
 }
 
 /// Known by their first bytes. Sources: the formats' specifications, or the programs' own readers.
-const FOREIGN: [Foreign; 10] = [
+const FOREIGN: [Foreign; 15] = [
     Foreign {
         is: |b| b.starts_with(b"SP4D"),
         what: "a .splat4d of the program splats4D, another format under a similar name",
@@ -58,14 +58,55 @@ const FOREIGN: [Foreign; 10] = [
         remedy: "`splat4d import` makes a capture of videos.",
     },
     Foreign {
-        is: |b| b.starts_with(b"<!DOCTYPE") || b.starts_with(b"<!doctype") || b.starts_with(b"<html"),
+        is: |b| b.starts_with(b"version https://git-lfs"),
+        what: "a pointer of Git LFS, not the file itself",
+        remedy: "Fetch the files of its repository with `git lfs pull`.",
+    },
+    Foreign {
+        is: |b| {
+            let ustar = b.get(257..262).is_some_and(|mark| mark == b"ustar");
+            ustar || PACKED.iter().any(|mark| b.starts_with(mark))
+        },
+        what: "an archive, not a scene",
+        remedy: "Unpack it and give the file of the scene.",
+    },
+    Foreign {
+        is: |b| b.starts_with(b"ASTM-E57"),
+        what: "a point cloud (.e57), not Gaussians",
+        remedy: "Points start a training: give them to a capture as .ply.",
+    },
+    Foreign {
+        is: |b| b.starts_with(b"solid ") || b.starts_with(b"Kaydara FBX"),
+        what: "a mesh, not Gaussians",
+        remedy: MESH,
+    },
+    Foreign {
+        is: |b| b.starts_with(b"\0\x05\x16\x07"),
+        what: "what macOS stores next to a file (its name begins with ._), not the file",
+        remedy: "Give the file without ._ in its name.",
+    },
+    Foreign {
+        is: |b| {
+            let text = b.trim_ascii_start().to_ascii_lowercase();
+            text.starts_with(b"<!doctype html") || text.starts_with(b"<html")
+        },
         what: "a web page, not a scene",
         remedy: "Where a download gave it, download the file itself again.",
     },
 ];
 
+/// How packed files begin: 7z, RAR, Zstandard, xz, bzip2. (.spz begins as gzip does.)
+const PACKED: [&[u8]; 5] = [b"7z\xbc\xaf\x27\x1c", b"Rar!\x1a\x07", b"\x28\xb5\x2f\xfd", b"\xfd7zXZ\0", b"BZh"];
+/// What to do with a mesh.
+const MESH: &str = "A mesh holds no Gaussians. Its points can start a training: give them to a capture as .ply.";
+
 /// Endings of formats without a mark.
-const ENDINGS: [(&str, &str, &str); 3] = [
+const ENDINGS: [(&str, &str, &str); 8] = [
+    (".obj", "a mesh, not Gaussians", MESH),
+    (".stl", "a mesh, not Gaussians", MESH),
+    (".psht", "a project of Postshot", "Export it there as .ply."),
+    (".lcc", "a scene of XGRIDS' LCC", "Export it as .ply with its program, or convert it with splat-transform."),
+    (".rad", "a .rad of Spark", "Give the .ply or .spz that it was made of."),
     (".ksplat", "a .ksplat of GaussianSplats3D", "Convert it to .ply first, for instance with splat-transform."),
     (
         ".splat4d",
@@ -119,6 +160,13 @@ mod tests {
             (b"", "a.s4d", "empty"),
             (b"\x93NUMPY\x01\0", "a.npy", "NumPy"),
             (b"\0\0\0\x18ftypisom", "a.mp4", "import"),
+            (b"version https://git-lfs.github.com/spec/v1\noid", "a.ply", "git lfs pull"),
+            (b"\n <!doctype HTML><title>Virus scan warning", "a.ply", "web page"),
+            (b"\x28\xb5\x2f\xfd\0", "a.ply.zst", "Unpack"),
+            (b"solid cube\n", "a.stl", "mesh"),
+            (b"# Blender\nv 1 2 3", "a.obj", "mesh"),
+            (b"\0\x05\x16\x07\0", "._a.ply", "macOS"),
+            (b"\x12\x34", "a.PSHT", "Postshot"),
         ] {
             let error = unread(name, bytes).map(|e| e.to_string()).unwrap_or_default();
             assert!(error.contains(says), "{name}: {error}");

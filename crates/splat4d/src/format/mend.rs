@@ -1,18 +1,16 @@
-//! Values at the edge of what files of Gaussians hold: infinities that mean something, and numbers that cannot be the
-//! logarithms and logits that a format has.
+//! Values at the edge of what files of Gaussians hold: infinities that mean something, and coordinates that single
+//! precision cannot hold.
 
 use super::warnings::Warnings;
-use crate::layers::Layer;
-use crate::math::se3::{norm, sub};
-use crate::math::{median, median_by};
+use crate::math::median_by;
 use crate::scene::params::{LOG_SCALE, OPACITY};
 use crate::scene::{GEOMETRY, Params};
 
 /// The logit of an opaque Gaussian (α = 1 − 10⁻⁷, one f32 step below 1), and with a minus sign of an invisible one: the
 /// true ones are infinite.
-const OPAQUE: f32 = 16.0;
+pub(super) const OPAQUE: f32 = 16.0;
 /// The logarithm of the thickness of a flat Gaussian: 2·10⁻⁹ scene units, whose square is still a normal f32.
-const FLAT: f32 = -20.0;
+pub(super) const FLAT: f32 = -20.0;
 
 /// How many Gaussians held an infinity that means something, and were given the nearest finite value.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -60,112 +58,6 @@ impl Mended {
     }
 }
 
-/// Values that a program stored as they are, where the format has logarithms and logits.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Linear {
-    /// Scales are lengths.
-    Scales,
-    /// Opacities are alphas from 0 to 1.
-    Opacities,
-}
-
-impl Linear {
-    /// Its name on the command line.
-    pub fn name(self) -> &'static str {
-        match self {
-            Linear::Scales => "scales",
-            Linear::Opacities => "opacities",
-        }
-    }
-}
-
-/// Fewer Gaussians are no evidence.
-const FEW: usize = 20;
-/// Of scenes of logarithms, hardly a Gaussian is as large as the inner half of the scene; of lengths read as logarithms,
-/// e^s ≥ 1, most are wherever the scene is not far larger than a unit.
-const MOST: f64 = 0.5;
-/// In larger scenes: lengths of which the largest (95 %) are this many times the smallest (5 %) ...
-const SPREAD: f32 = 10.0;
-/// ... while as logarithms they would all be within this factor of one unit. No trained scene has such sizes.
-const ONE_SIZE: f32 = std::f32::consts::E;
-
-/// What the values of a layer suggest is stored as it is. Evidence, not proof: nothing is converted.
-pub(super) fn doubts(params: &Params) -> Vec<(Linear, String)> {
-    let (table, n) = (&params[GEOMETRY], params.len());
-    let mut out = Vec::new();
-    if n < FEW {
-        return out;
-    }
-    let rows: Vec<usize> = (0..n).filter(|&r| table.read::<11>(r, 0).iter().all(|x| x.is_finite())).collect();
-    if rows.len() < FEW {
-        return out;
-    }
-    let radius = radius(params, &rows);
-    let largest = |r: usize| table.read::<3>(r, LOG_SCALE).into_iter().fold(f32::NEG_INFINITY, f32::max);
-    let positive = rows.iter().all(|&r| table.read::<3>(r, LOG_SCALE).iter().all(|s| *s >= 0.0));
-    let huge = rows.iter().filter(|&&r| f64::from(largest(r)).exp() > radius).count();
-    let fitting = rows.iter().filter(|&&r| f64::from(largest(r)) < radius).count();
-    let share = |count: usize| count as f64 / rows.len() as f64;
-    let mut sizes: Vec<f32> = rows.iter().flat_map(|&r| table.read::<3>(r, LOG_SCALE)).collect();
-    sizes.sort_by(f32::total_cmp);
-    let [low, high] = [sizes[sizes.len() / 20], sizes[sizes.len() - 1 - sizes.len() / 20]];
-    let one_size = high.exp() < ONE_SIZE && high > SPREAD * low;
-    if positive && share(fitting) > MOST && (share(huge) > MOST || one_size) {
-        let what = format!(
-            "scales are all above zero: as logarithms, {huge} of {} Gaussians would be larger than the scene and none smaller \
-             than a unit. They look like lengths",
-            rows.len()
-        );
-        out.push((Linear::Scales, what));
-    }
-    let opacity = |&r: &usize| table.get(r, OPACITY);
-    let (low, high) =
-        rows.iter().map(opacity).fold((f32::INFINITY, f32::NEG_INFINITY), |(l, h), o| (l.min(o), h.max(o)));
-    // Logits of trained scenes spread far to both sides of zero; a single value may be anything.
-    if low >= 0.0 && high <= 1.0 && low < high {
-        let what = format!("opacities lie between {low:.3} and {high:.3}: they look like alphas, not logits");
-        out.push((Linear::Opacities, what));
-    }
-    out
-}
-
-/// The median distance of the means from their median.
-fn radius(params: &Params, rows: &[usize]) -> f64 {
-    let table = &params[GEOMETRY];
-    let means: Vec<[f64; 3]> = rows.iter().map(|&r| table.read::<3>(r, 0).map(f64::from)).collect();
-    let of = |mut values: Vec<f64>| median(&mut values).expect("there are rows");
-    let middle = std::array::from_fn(|k| of(means.iter().map(|m| m[k]).collect()));
-    of(means.iter().map(|m| norm(sub(*m, middle))).collect())
-}
-
-/// Reads values that are stored as they are: lengths become logarithms, alphas logits. Says what was out of range.
-pub fn from_linear(layer: &mut Layer<f32>, what: Linear) -> Warnings {
-    let mut warnings = Warnings::default();
-    let (table, mut outside) = (&mut layer.params[GEOMETRY], 0);
-    let rows = table.rows();
-    for row in 0..rows {
-        match what {
-            Linear::Scales => {
-                let lengths = table.read::<3>(row, LOG_SCALE);
-                outside += usize::from(lengths.iter().any(|s| *s < 0.0));
-                table.write(row, LOG_SCALE, lengths.map(|s| s.max(0.0).ln().max(FLAT)));
-            }
-            Linear::Opacities => {
-                let alpha = table.get(row, OPACITY);
-                outside += usize::from(!(0.0..=1.0).contains(&alpha));
-                let alpha = alpha.clamp(0.0, 1.0);
-                table.set(row, OPACITY, (alpha / (1.0 - alpha)).ln().clamp(-OPAQUE, OPAQUE));
-            }
-        }
-    }
-    let range = match what {
-        Linear::Scales => "have a scale below 0, which is read as 0",
-        Linear::Opacities => "have an opacity outside 0 to 1, which is clamped",
-    };
-    warnings.counted(outside, rows, range);
-    warnings
-}
-
 /// Share of the median Gaussian's size above which an error of positions causes a warning: a tenth of σ is invisible.
 pub(super) const VISIBLE: f64 = 0.1;
 
@@ -195,7 +87,6 @@ pub(super) fn say_coarse(params: &Params, warnings: &mut Warnings) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::format::dialect::still;
     use crate::format::samples::gaussians;
 
     #[test]
@@ -214,32 +105,6 @@ mod tests {
         mended.say(5, &mut warnings);
         assert_eq!(warnings.lines().len(), 3);
         assert_eq!(Mended::of(&mut p), Mended::default());
-    }
-
-    #[test]
-    fn lengths_and_alphas_are_doubted_and_read_on_request() {
-        let logs = gaussians(200, 8);
-        assert!(doubts(&logs).is_empty(), "{:?}", doubts(&logs));
-        let mut linear = logs.clone();
-        for row in 0..200 {
-            let scale = logs[GEOMETRY].read::<3>(row, LOG_SCALE).map(f32::exp);
-            linear[GEOMETRY].write(row, LOG_SCALE, scale);
-            let alpha = 1.0 / (1.0 + (-logs[GEOMETRY].get(row, OPACITY)).exp());
-            linear[GEOMETRY].set(row, OPACITY, alpha);
-        }
-        let found: Vec<Linear> = doubts(&linear).into_iter().map(|d| d.0).collect();
-        assert_eq!(found, [Linear::Scales, Linear::Opacities]);
-        let mut layer = still(linear).layers.remove(0);
-        for what in found {
-            assert!(from_linear(&mut layer, what).lines().is_empty());
-        }
-        for row in 0..200 {
-            let (a, b) = (logs[GEOMETRY].read::<11>(row, 0), layer.params[GEOMETRY].read::<11>(row, 0));
-            assert!(a.iter().zip(b).all(|(a, b)| (a - b).abs() < 2e-3 * (1.0 + a.abs())), "{a:?} {b:?}");
-        }
-        assert!(doubts(&layer.params).is_empty());
-        layer.params[GEOMETRY].set(0, OPACITY, 1.5);
-        assert!(from_linear(&mut layer, Linear::Opacities).lines()[0].contains("outside 0 to 1"));
     }
 
     #[test]

@@ -15,6 +15,7 @@ mod freetime;
 pub mod gltf;
 mod half;
 mod kinematic;
+pub mod linear;
 pub mod mend;
 #[cfg(test)]
 mod mutate;
@@ -38,7 +39,8 @@ pub mod zip;
 
 pub(crate) use arrays::{params_to_arrays, tensors_to_loaded};
 pub use dialect::Dialect;
-pub use mend::{Linear, Mended};
+pub use linear::Linear;
+pub use mend::Mended;
 pub use warnings::Warnings;
 
 use crate::layers::Scene;

@@ -2,7 +2,8 @@
 
 use super::super::account::Severity;
 use super::super::account::{Account, Aspect, first_names};
-use super::super::{CaptureOptions, Unregistered, rig, sequence};
+use super::super::lookup::Twins;
+use super::super::{CaptureOptions, Unregistered, lookup, rig, sequence};
 use super::Shot;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -29,15 +30,27 @@ pub(super) fn settle(
     let folders: BTreeMap<PathBuf, String> =
         files.iter().zip(&names).map(|(file, name)| (of_file(file), of_name(name))).collect();
     let known: BTreeSet<&PathBuf> = files.iter().collect();
+    let stem = |file: &Path| {
+        let name = file.file_name().unwrap_or_default().to_string_lossy();
+        file.with_file_name(lookup::fold(lookup::without_ending(&name)))
+    };
+    let stems: BTreeMap<PathBuf, &PathBuf> = files.iter().map(|file| (stem(file), file)).collect();
     let mut others: Vec<(String, PathBuf)> = Vec::new();
+    // The model names the image that is meant, whatever size its twin has.
+    let mut twins = Twins::default();
     for (path, folder) in &folders {
         for file in rig::image_names(path) {
             let image = path.join(&file);
-            if !known.contains(&image) {
-                others.push((format!("{folder}{file}"), image));
+            if known.contains(&image) {
+                continue;
+            }
+            match stems.get(&stem(&image)) {
+                Some(read) => twins.named((*read).clone(), image),
+                None => others.push((format!("{folder}{file}"), image)),
             }
         }
     }
+    twins.report(base, account);
     if others.is_empty() {
         return;
     }

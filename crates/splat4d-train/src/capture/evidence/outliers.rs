@@ -108,7 +108,9 @@ pub(super) fn check(capture: &Capture, looks: Vec<SmallImage>, pixels: usize) ->
     let mut findings = Vec::new();
     let known: Vec<usize> = wrong.iter().map(|&k| looks[k].frame).collect();
     findings.extend(warning(&wrong, &measured, &told));
-    findings.extend(strange.filter(|s| !s.frames.iter().any(|f| known.contains(f))).map(|s| s.finding(capture)));
+    let strange = strange.filter(|s| !s.frames.iter().any(|f| known.contains(f)));
+    let named: Vec<usize> = strange.iter().flat_map(|s| s.frames.clone()).chain(known).collect();
+    findings.extend(strange.map(|s| s.finding(capture)));
     let good = |k: usize| measured.iter().any(|p| p.has(k) && p.share() >= FITS[0]);
     let open: Vec<String> = (0..looks.len())
         .filter(|&k| signs.get(&at[k]) == Some(&Sign::Identity) && !good(k) && !wrong.contains(&k))
@@ -127,6 +129,20 @@ pub(super) fn check(capture: &Capture, looks: Vec<SmallImage>, pixels: usize) ->
             open.len(),
             order.len(),
             first_names(&open)
+        )));
+    }
+    // Neither points nor matches show that these are right or wrong.
+    let silent: Vec<String> = (0..looks.len())
+        .filter(|&k| doubtful.contains(&at[k]) && !good(k) && !named.contains(&looks[k].frame))
+        .map(|k| told(k).0)
+        .filter(|name| !open.contains(name))
+        .collect();
+    if !silent.is_empty() {
+        findings.push(note(format!(
+            "The poses of {} of {} images: neither initial points nor matches with the images around them decide ({}).",
+            silent.len(),
+            order.len(),
+            first_names(&silent)
         )));
     }
     if compared < order.len() {

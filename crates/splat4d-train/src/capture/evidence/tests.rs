@@ -382,6 +382,12 @@ fn an_identity_pose_that_cannot_be_compared_is_not_checked() {
     let check = capture.check_poses();
     let said = |f: &Finding| f.aspect == Some(Aspect::NotChecked) && f.what.contains("identity is the pose of 1 of 2");
     assert!(check.more.iter().any(said), "{check:?}");
+    // Nor is any other pose of them.
+    capture.frames[1].source.cam_from_world = pose(5);
+    let check = capture.check_poses();
+    let said =
+        |f: &Finding| f.aspect == Some(Aspect::NotChecked) && f.what.contains("nor matches with the images around");
+    assert!(check.more.iter().any(said), "{check:?}");
 }
 
 #[test]

@@ -45,7 +45,8 @@ fn read(root: &Path, folder: &Path, options: &CaptureOptions) -> Result<RawCaptu
     let [images, cameras] = pair(folder).ok_or_else(|| {
         Error::input("it has no images with cameras").at(folder.display()).remedy("Export the raw data again.")
     })?;
-    let mut by_stem: BTreeMap<String, String> = rig::image_names(&images)
+    let (names, doubled) = super::images_of(&images)?;
+    let mut by_stem: BTreeMap<String, String> = names
         .into_iter()
         .map(|name| (name.rsplit_once('.').map_or(name.as_str(), |(stem, _)| stem).to_owned(), name))
         .collect();
@@ -60,7 +61,7 @@ fn read(root: &Path, folder: &Path, options: &CaptureOptions) -> Result<RawCaptu
         let depth = depth.is_file().then_some(DepthFile { path: depth, scale: DEPTH_UNIT, kind: DepthKind::Metric });
         shots.push(Shot { name: name.clone(), image: images.join(&name), source, time: None, depth });
     }
-    let (mut warnings, mut notes) = (Vec::new(), Vec::new());
+    let (mut warnings, mut notes) = (doubled.into_iter().collect(), Vec::new());
     super::without_pose(by_stem.len(), by_stem.len() + shots.len(), &mut warnings);
     if !images.ends_with(PAIRS[0][0]) {
         warnings.push("There are no corrected cameras: poses are those of the telephone, not optimised ones.".into());

@@ -43,7 +43,7 @@ fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<RawCaptu
     let folder = folder.ok_or_else(|| {
         Error::input("there are no images in rgb/").at(root.display()).remedy("Export again as EXR and RGB images.")
     })?;
-    let mut images = rig::image_names(&folder);
+    let (mut images, doubled) = super::images_of(&folder)?;
     images.sort_by_key(|n| (rig::trailing_number(n), n.clone()));
     let size = picture::header(&folder.join(&images[0]))?.upright();
     let fps = top.opt("fps").map_err(place)?.map_or(Ok(FPS), |n| n.number()).map_err(place)?;
@@ -92,7 +92,7 @@ fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<RawCaptu
         let source = Camera { cam_from_world, intrinsics, lens: Lens::Pinhole, width, height, near: Camera::NEAR };
         shots.push(Shot { name: name.clone(), image: folder.join(name), source, time: Some(time), depth });
     }
-    let (warnings, mut notes) = (Vec::new(), Vec::new());
+    let (warnings, mut notes) = (doubled.into_iter().collect(), Vec::new());
     let points = only_points(root, &mut notes)?;
     let said = Said {
         kind: CaptureKind::Record3d,

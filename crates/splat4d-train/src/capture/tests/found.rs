@@ -331,3 +331,23 @@ fn masks_under_other_names_and_of_other_shapes_are_named() {
     (0..6).for_each(|c| sample.save(&format!("masks/IMG {c}.png"), square.clone()));
     assert_has(&refuse(sample.root()), &["mask is 16x16", "24x16"]);
 }
+
+#[test]
+fn images_of_one_name_and_two_endings_are_read_once() {
+    for (sample, folder) in [(samples::n3dv(), "cam01/images"), (colmap(), "images")] {
+        let before = open(&sample);
+        let names: Vec<_> = std::fs::read_dir(sample.path(folder)).unwrap().map(|e| e.unwrap().path()).collect();
+        let twin = |path: &PathBuf| path.with_extension("jpg");
+        names.iter().for_each(|path| image::open(path).unwrap().into_rgb8().save(twin(path)).unwrap());
+        let after = open(&sample);
+        let read = |capture: &Capture| capture.frames.iter().map(|f| (f.image.clone(), f.index)).collect::<Vec<_>>();
+        assert_eq!(read(&after), read(&before));
+        let told: Vec<&str> = after.account.iter().map(|r| r.what.as_str()).filter(|w| w.contains("ending")).collect();
+        assert_eq!(told.len(), 1, "{:?}", after.account);
+        assert_has(told[0], &[&format!("{} images", names.len()), ".png is read"]);
+    }
+    // The size decides which is meant, and nothing here says it.
+    let sample = samples::n3dv();
+    image::RgbImage::new(6, 4).save(sample.path("cam01/images/0000.jpg")).unwrap();
+    assert_has(&refuse(sample.root()), &["0000.jpg", "another size (6x4, here 24x16)", "Remove"]);
+}

@@ -428,6 +428,12 @@ fn keys_of_lenses_are_used_or_refused() {
     ] {
         assert!(refuse(&with(keys.clone())).contains("Undistort"), "{keys}");
     }
+    // An angle of one side alone: pixels are square.
+    let by_height = with(json!({"camera_angle_y": 2.0 * (8.0f64 / 20.0).atan()}));
+    by_height
+        .edit("transforms.json", |v| ["fl_x", "fl_y"].iter().for_each(|k| drop(v.as_object_mut().unwrap().remove(*k))));
+    let focal = open(&by_height).frames[0].source.intrinsics;
+    assert!((focal.fx - 20.0).abs() < 1e-9 && (focal.fy - 20.0).abs() < 1e-9, "{focal:?}");
     let odd = open(&with(json!({"my_key": 3, "aabb_scale": 16, "rolling_shutter": [0, 0, 0, 1]})));
     assert_said(&odd, Aspect::NotRead, Severity::Note, &["2 keys", "my_key", "rolling_shutter"]);
 }

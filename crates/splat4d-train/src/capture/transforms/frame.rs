@@ -99,11 +99,13 @@ fn camera(file: &File<'_>, node: &Node<'_>, image: &Path) -> Result<(Camera, boo
         return Ok((Camera { cam_from_world, intrinsics, lens, width, height, near: Camera::NEAR }, false));
     }
     let fx = focal(top, node, ["fl_x", "camera_angle_x", "x_fov"], width)?;
-    let (fx, by_angle) = fx.ok_or_else(|| {
+    let fy = focal(top, node, ["fl_y", "camera_angle_y", "y_fov"], height)?;
+    // Where one is given, pixels are square.
+    let (fx, by_angle) = fx.or(fy).ok_or_else(|| {
         node.error("neither fl_x nor camera_angle_x is given")
             .remedy("Add one of them, to the frame or to the whole file.")
     })?;
-    let fy = focal(top, node, ["fl_y", "camera_angle_y", "y_fov"], height)?.map_or(fx, |(fy, _)| fy);
+    let fy = fy.map_or(fx, |(fy, _)| fy);
     let cx = number(top, node, "cx")?.unwrap_or(0.5 * width as f64);
     let cy = number(top, node, "cy")?.unwrap_or(0.5 * height as f64);
     let intrinsics = Intrinsics { fx, fy, cx, cy };

@@ -4,7 +4,7 @@ use super::container::{self, File};
 use super::{ELLIPSE, EXTENSION, SPZ, SRGB, TYPES, coefficient, component, damaged, unsupported};
 use crate::Result;
 use crate::format::dialect::{Opened, still};
-use crate::format::mend::{Linear, from_linear};
+use crate::format::linear::{Linear, from_linear};
 use crate::format::{Warnings, spz};
 use crate::layers::{Layer, Scene};
 use crate::math::{Sim3, quat};

@@ -5,9 +5,10 @@
 //! of (w, x, y, z), then the other three times 1/√2 plus ½); colour 8-8-8 and opacity 8. An optional element `sh`
 //! holds f_rest in bytes over [-4, 4]. Source: layout of PlayCanvas' splat-transform (MIT).
 
+use super::columns::f_rest_columns;
 use super::header::{Element, Header, broken};
 use super::pack::{BOUNDS, CHUNK, COLOR_BOUNDS, SH_RANGE, WORDS};
-use super::{PlyInfo, degree, f_rest_columns, is_compressed, non_finite, open, rows, write_compressed};
+use super::{PlyInfo, degree, is_compressed, non_finite, open, rows, surplus, write_compressed};
 use crate::format::bytes::{SH_C0, logit_of_byte};
 use crate::format::dialect::{Dialect, Writer, Y_DOWN};
 use crate::format::mend::Mended;
@@ -79,6 +80,8 @@ pub(super) fn read(header: &Header, bytes: &[u8]) -> Result<(Params, PlyInfo)> {
         let is_bad = |numbers: &[f32]| non_finite(numbers) != 0;
         non_finite_rows += usize::from(is_bad(&means) || is_bad(&log_scales) || is_bad(&dc));
     }
+    let last = sh.as_ref().filter(|_| header.elements.last().is_some_and(|e| e.name == "sh"));
+    let assumed = surplus(header, last.unwrap_or(&vertices));
     if let Some(sh) = sh {
         unpack_sh(table, &f_rest, &sh);
     }
@@ -90,6 +93,7 @@ pub(super) fn read(header: &Header, bytes: &[u8]) -> Result<(Params, PlyInfo)> {
         compressed: true,
         mended: Mended::default(),
         rgb: false,
+        assumed: assumed.into_iter().collect(),
         offset: [0.0; 3],
         comments: header.comments.clone(),
         extra_properties: extra.cloned().collect(),

@@ -45,7 +45,7 @@ fn is_ftgs(bytes: &[u8]) -> bool {
 }
 
 fn read_ftgs(bytes: &[u8]) -> Result<Opened> {
-    let (params, _) = super::read(bytes)?;
+    let (params, info) = super::read(bytes)?;
     let header = Header::read(bytes)?;
     let vertex = header.elements.iter().find(|e| e.name == "vertex").expect("it was read");
     let [found] = rows::find(&header, bytes, ["vertex"])?;
@@ -66,6 +66,7 @@ fn read_ftgs(bytes: &[u8]) -> Result<Opened> {
         },
     };
     let mut warnings = Warnings::default();
+    info.assumed.into_iter().for_each(|sentence| warnings.say(sentence));
     let own = header.comments.iter().find_map(|c| clock(c));
     let seconds = match own {
         Some(own) => span(own.clip),

@@ -3,9 +3,19 @@
 //! Source: Greg Turk, "The PLY Polygon File Format", 1994; the sized type names (`float32`) as later tools write them.
 
 use crate::{Error, ErrorKind, Result};
+use std::borrow::Cow;
 
 /// Longest header that is believed. The header of a degree-3 Gaussian file has 1.5 kB.
 const MAX_HEADER: usize = 1 << 20;
+/// UTF-8's byte-order mark, with which editors begin text files.
+const BOM: &[u8] = b"\xef\xbb\xbf";
+/// Lines that say nothing about the body.
+const COMMENTS: [&str; 2] = ["comment", "obj_info"];
+
+/// Whether bytes begin as a PLY file does.
+pub(super) fn is_ply(bytes: &[u8]) -> bool {
+    bytes.strip_prefix(BOM).unwrap_or(bytes).starts_with(b"ply")
+}
 
 /// How the body is written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -105,8 +115,9 @@ pub(super) struct Header {
 
 impl Header {
     pub(super) fn read(bytes: &[u8]) -> Result<Self> {
-        let mut lines = Lines { bytes: &bytes[..bytes.len().min(MAX_HEADER)], at: 0 };
-        if lines.next() != Some(Ok("ply")) {
+        let bom = if bytes.starts_with(BOM) { BOM.len() } else { 0 };
+        let mut lines = Lines { bytes: &bytes[..bytes.len().min(MAX_HEADER)], at: bom };
+        if lines.next() != Some(Ok("ply".into())) {
             return Err(broken("this is not a PLY file: it does not begin with a line `ply`"));
         }
         let mut header = Self { encoding: Encoding::Ascii, comments: Vec::new(), elements: Vec::new(), body: 0 };
@@ -117,6 +128,7 @@ impl Header {
                 Some(Err(())) => return Err(broken("the header is not text").at(format_args!("line {number}"))),
                 Some(Ok(line)) => line,
             };
+            let line = &*line;
             let at = |e: Error| e.at(format_args!("header line {number}"));
             let mut words = line.split_ascii_whitespace();
             match words.next() {
@@ -203,14 +215,22 @@ struct Lines<'a> {
 }
 
 impl<'a> Iterator for Lines<'a> {
-    type Item = Result<&'a str, ()>;
+    type Item = Result<Cow<'a, str>, ()>;
 
     fn next(&mut self) -> Option<Self::Item> {
         let rest = &self.bytes[self.at..];
         let end = rest.iter().position(|&b| b == b'\n')?;
         self.at += end + 1;
         let line = rest[..end].strip_suffix(b"\r").unwrap_or(&rest[..end]);
-        Some(std::str::from_utf8(line).map_err(|_| ()))
+        let text = match std::str::from_utf8(line) {
+            Ok(text) => Ok(text.into()),
+            // Comments hold paths and names in whatever encoding the system had.
+            Err(_) if COMMENTS.iter().any(|word| line.starts_with(word.as_bytes())) => {
+                Ok(String::from_utf8_lossy(line))
+            }
+            Err(_) => Err(()),
+        };
+        Some(text)
     }
 }
 

@@ -6,7 +6,9 @@
 //! **channel-major** (all coefficients of red first), while our tables are coefficient-major.
 //! Source: the files of Kerbl et al. 2023.
 
+mod columns;
 mod compressed;
+mod filter;
 mod ftgs;
 mod header;
 mod pack;
@@ -16,12 +18,14 @@ mod stg;
 use crate::format::bytes::SH_C0;
 pub use crate::format::dialect::PlyInfo;
 use crate::format::dialect::{Dialect, Opened, Writer, Y_DOWN};
-use crate::format::mend::{self, Mended};
+use crate::format::linear;
+use crate::format::mend::{FLAT, Mended};
 use crate::format::warnings::Warnings;
 use crate::scene::offset::offset_of;
-use crate::scene::params::{GEOMETRY, GEOMETRY_COLUMNS, Params, SH};
+use crate::scene::params::{GEOMETRY, GEOMETRY_COLUMNS, LOG_SCALE, Params, SH};
 use crate::scene::table::{BLOCK, Table};
-use crate::{Error, ErrorKind, Result};
+use crate::{Error, Result};
+use columns::{Columns, Thickness};
 use header::{Element, Header, broken};
 use rayon::prelude::*;
 use rows::Rows;
@@ -38,7 +42,7 @@ pub const DIALECT: Dialect = Dialect {
     ending: ".ply",
     up: Y_DOWN,
     moves: false,
-    mark: Some(|bytes| bytes.starts_with(b"ply")),
+    mark: Some(header::is_ply),
     read: open,
     writer: Writer::Moment(|params, options, mut out| {
         let offset = (options.offset, options.world);
@@ -92,7 +96,7 @@ pub fn read(bytes: &[u8]) -> Result<(Params, PlyInfo)> {
     if compressed::is_packed(vertex) {
         return compressed::read(&header, bytes);
     }
-    let (geometry, sh, rgb) = gaussian_columns(vertex)?;
+    let Columns { geometry, sh, rgb, thickness, filter } = columns::of(vertex)?;
     let [rows] = rows::find(&header, bytes, ["vertex"])?;
     let rows = rows.expect("the element was found above");
     let mut params = Params::new(rows.len(), sh.len() / 3, &[]);
@@ -106,12 +110,21 @@ pub fn read(bytes: &[u8]) -> Result<(Params, PlyInfo)> {
         (0..rows.len())
             .for_each(|row| (0..3).for_each(|c| table.set(row, c, (table.get(row, c) / white[c] - 0.5) / SH_C0)));
     }
+    if thickness == Thickness::None {
+        (0..rows.len()).for_each(|row| params[GEOMETRY].set(row, LOG_SCALE + 2, FLAT));
+    }
     let mended = Mended::of(&mut params);
+    if let Some(column) = filter {
+        filter::apply(&mut params[GEOMETRY], |row| rows.get(row, column));
+    }
     if mended != Mended::default() {
         count_bad(&params, &mut bad);
     }
-    let is_used = |i: &usize| geometry.contains(i) || sh.contains(i);
+    let is_used = |i: &usize| geometry.contains(i) || sh.contains(i) || filter == Some(*i);
     let extra = vertex.properties.iter().enumerate().filter(|(i, _)| !is_used(i)).map(|(_, p)| p.name.clone());
+    let extra: Vec<String> = extra.filter(|name| !NORMAL_NAMES.contains(&name.as_str())).collect();
+    let assumed =
+        columns::assumptions(rgb, thickness, filter.is_some(), &extra).into_iter().chain(surplus(&header, &rows));
     let info = PlyInfo {
         gaussians: rows.len(),
         sh_degree: degree(sh.len() / 3),
@@ -120,7 +133,8 @@ pub fn read(bytes: &[u8]) -> Result<(Params, PlyInfo)> {
         rgb,
         offset: offset.unwrap_or_default(),
         compressed: false,
-        extra_properties: extra.filter(|name| !NORMAL_NAMES.contains(&name.as_str())).collect(),
+        assumed: assumed.collect(),
+        extra_properties: extra,
         comments: header.comments,
     };
     Ok((params, info))
@@ -130,16 +144,30 @@ pub fn read(bytes: &[u8]) -> Result<(Params, PlyInfo)> {
 fn open(bytes: &[u8]) -> Result<Opened> {
     let (params, info) = read(bytes)?;
     let mut warnings = Warnings::default();
-    if info.rgb {
-        warnings.say("base colours are read from RGB (red, green, blue), as there are no f_dc_0..2");
-    }
-    for (what, evidence) in mend::doubts(&params) {
+    info.assumed.iter().for_each(|sentence| warnings.say(sentence));
+    for (what, evidence) in linear::doubts(&params) {
         warnings.say(format!("{evidence}. If so, convert the file with --linear {}", what.name()));
     }
     let offset = info.offset;
     let mut opened = Opened { ply: Some(info), ..Opened::from((params, warnings)) };
     opened.scene.offset = offset;
     Ok(opened)
+}
+
+/// What follows the rows of the last element, if it is not only space: rows that the header does not count, or bytes that a
+/// copy in text mode added. `rows` are those of the last element.
+fn surplus(header: &Header, rows: &Rows<'_>) -> Option<String> {
+    let element = header.elements.last().filter(|e| e.name == "vertex" || e.name == "sh")?;
+    let after = rows.after();
+    (!after.trim_ascii().is_empty()).then(|| {
+        format!(
+            "{} bytes follow the {} rows of the header's last element `{}` and are not read: the file holds more rows than its \
+             header states, or its line ends were changed on the way. Copy or export it again",
+            after.len(),
+            rows.len(),
+            element.name
+        )
+    })
 }
 
 /// Whether a .ply file has PlayCanvas' compressed layout. False for anything unreadable.
@@ -234,57 +262,6 @@ pub fn write_placed(params: &Params, (offset, world): ([f64; 3], bool), out: &mu
         write(&buffer)?;
     }
     Ok(())
-}
-
-/// The property of each column of the geometry and SH tables, and whether the base colour is RGB.
-fn gaussian_columns(vertex: &Element) -> Result<(Vec<usize>, Vec<usize>, bool)> {
-    let all = |names: [&str; 3]| names.iter().all(|n| vertex.find(n).is_some());
-    let rgb = [RGB_NAMES, SHORT_RGB_NAMES].into_iter().find(|names| !all(DC_NAMES) && all(*names));
-    let colors = rgb.unwrap_or(DC_NAMES);
-    let wanted: Vec<&str> = GEOMETRY_NAMES.into_iter().chain(colors).collect();
-    let missing: Vec<&str> = wanted.iter().copied().filter(|n| vertex.find(n).is_none()).collect();
-    let is_position = |n: &&str| ["x", "y", "z"].contains(n);
-    let without = GEOMETRY_NAMES.len() - 3 + if rgb.is_some() { 0 } else { DC_NAMES.len() };
-    if missing.len() == without && !missing.iter().any(is_position) {
-        let names: Vec<&str> = vertex.properties.iter().map(|p| p.name.as_str()).take(8).collect();
-        return Err(Error::input(format!(
-            "this is a point cloud without Gaussians: its points have {} only, no scale, rotation or opacity",
-            names.join(", ")
-        ))
-        .remedy("A point cloud can initialise training, but it cannot be rendered. Give a trained .ply"));
-    }
-    if !missing.is_empty() {
-        return Err(Error::input(format!("the element `vertex` lacks the properties {}", missing.join(", "))).remedy(
-            "A file of 3D Gaussians has x y z, f_dc_0..2 (or red green blue), opacity, scale_0..2 and rot_0..3",
-        ));
-    }
-    let index = |name: &str| vertex.find(name).expect("checked above");
-    let geometry = GEOMETRY_NAMES.map(index).to_vec();
-    let mut sh = colors.map(index).to_vec();
-    sh.extend(f_rest_columns(vertex)?);
-    Ok((geometry, sh, rgb.is_some()))
-}
-
-/// The f_rest properties of an element, in coefficient-major order.
-fn f_rest_columns(element: &Element) -> Result<Vec<usize>> {
-    let count = element.properties.iter().filter(|p| p.name.starts_with("f_rest_")).count();
-    if !F_REST_COUNTS.contains(&count) {
-        let what = format!("there are {count} f_rest properties; degree 0-3 has 0, 9, 24 or 45");
-        return Err(Error::new(ErrorKind::Unsupported, what)
-            .remedy("Export the file again with spherical harmonics of degree 3 or less"));
-    }
-    let rest = count / 3;
-    let mut out = Vec::with_capacity(count);
-    for k in 0..rest {
-        for c in 0..3 {
-            let name = format!("f_rest_{}", c * rest + k);
-            let Some(i) = element.find(&name) else {
-                return Err(broken(format!("there are {count} f_rest properties, but no `{name}` among them")));
-            };
-            out.push(i);
-        }
-    }
-    Ok(out)
 }
 
 /// SH degree of 1, 4, 9 or 16 coefficients.

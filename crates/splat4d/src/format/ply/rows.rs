@@ -7,6 +7,8 @@ use crate::Result;
 pub(super) struct Rows<'a> {
     count: usize,
     body: Body<'a>,
+    /// The rest of the file.
+    after: &'a [u8],
 }
 
 enum Body<'a> {
@@ -16,7 +18,12 @@ enum Body<'a> {
     Wide { values: Vec<f64>, width: usize },
 }
 
-impl Rows<'_> {
+impl<'a> Rows<'a> {
+    /// All bytes behind the rows.
+    pub(super) fn after(&self) -> &'a [u8] {
+        self.after
+    }
+
     /// Number of rows.
     pub(super) fn len(&self) -> usize {
         self.count
@@ -82,7 +89,7 @@ fn element_rows<'a>(element: &Element, encoding: Encoding, rest: &mut &'a [u8], 
     let count = element.count;
     if element.properties.is_empty() {
         // Rows of nothing have no bytes, in whatever number.
-        return Ok(Rows { count, body: Body::Wide { values: Vec::new(), width: 0 } });
+        return Ok(Rows { count, body: Body::Wide { values: Vec::new(), width: 0 }, after: *rest });
     }
     let mut fields = Vec::with_capacity(element.properties.len());
     let mut stride = 0;
@@ -106,7 +113,7 @@ fn element_rows<'a>(element: &Element, encoding: Encoding, rest: &mut &'a [u8], 
     if encoding != Encoding::Ascii && !has_lists {
         let (bytes, tail) = rest.split_at(count * stride);
         *rest = tail;
-        return Ok(Rows { count, body: Body::Binary { bytes, stride, big, fields } });
+        return Ok(Rows { count, body: Body::Binary { bytes, stride, big, fields }, after: tail });
     }
     let width = element.properties.len();
     let mut values = Vec::with_capacity(if keep { count * width } else { 0 });
@@ -135,7 +142,7 @@ fn element_rows<'a>(element: &Element, encoding: Encoding, rest: &mut &'a [u8], 
             }
         }
     }
-    Ok(Rows { count, body: Body::Wide { values, width } })
+    Ok(Rows { count, body: Body::Wide { values, width }, after: *rest })
 }
 
 /// The next number of a text body.

@@ -166,6 +166,76 @@ fn rgb_colours_are_base_colours() {
     assert!(read(&text(&cloud, &["1 2 3 0 0 0"])).unwrap_err().to_string().contains("point cloud"));
 }
 
+/// A text file of the properties of 3D Gaussians that `keep` leaves, and `more` of them; every row has these numbers.
+fn variant(keep: impl Fn(&str) -> bool, more: &[(&str, f32)], rows: usize) -> Vec<u8> {
+    let base = [("x", 1.0), ("y", 2.0), ("z", 3.0), ("f_dc_0", 0.1), ("f_dc_1", 0.2), ("f_dc_2", -0.3)];
+    let shape = SHAPE.map(|(_, n)| n).into_iter().zip([0.5, -4.0, -5.0, -6.0, 1.0, 0.0, 0.0, 0.0]);
+    let all: Vec<(&str, f32)> =
+        base.into_iter().chain(shape).filter(|(n, _)| keep(n)).chain(more.iter().copied()).collect();
+    let row = all.iter().map(|(_, x)| x.to_string()).collect::<Vec<_>>().join(" ");
+    text(&all.iter().map(|(n, _)| ("float", *n)).collect::<Vec<_>>(), &vec![row.as_str(); rows])
+}
+
+#[test]
+fn files_of_other_methods_are_read_or_named() {
+    let scales = |bytes: &[u8]| {
+        let opened = DIALECT.open(bytes).unwrap();
+        let g = &opened.scene.layers[0].params[GEOMETRY];
+        (g.read::<3>(0, LOG_SCALE), g.get(0, OPACITY), opened.warnings.lines().join(" | "))
+    };
+    let (plain, opacity, said) = scales(&variant(|_| true, &[], 1));
+    assert_eq!((plain, opacity, said.as_str()), ([-4.0, -5.0, -6.0], 0.5, ""));
+    let (flat, _, said) = scales(&variant(|n| n != "scale_2", &[], 1));
+    assert!(flat == [-4.0, -5.0, FLAT] && said.contains("2D Gaussian Splatting"), "{flat:?} {said}");
+    let (sphere, _, said) = scales(&variant(|n| !["scale_1", "scale_2"].contains(&n), &[], 1));
+    assert!(sphere == [-4.0; 3] && said.contains("spheres"), "{sphere:?} {said}");
+    // A filter of e^-4 doubles the variance of the first direction.
+    let filter = (-4.0f32).exp();
+    let (wide, faint, said) = scales(&variant(|_| true, &[("filter_3D", filter)], 1));
+    let sizes = [-4.0f64, -5.0, -6.0].map(|s: f64| ((2.0 * s).exp() + (-8.0f64).exp()).sqrt());
+    let share = (-15.0f64).exp() / sizes.iter().product::<f64>();
+    let alpha = share / (1.0 + (-0.5f64).exp());
+    assert!((0..3).all(|k| (f64::from(wide[k]) - sizes[k].ln()).abs() < 1e-5), "{wide:?} {sizes:?}");
+    assert!((f64::from(faint) - (alpha / (1.0 - alpha)).ln()).abs() < 1e-5 && said.contains("Mip-Splatting"), "{said}");
+    assert_eq!(scales(&variant(|_| true, &[("filter_3D", 0.0)], 1)).0, plain);
+    let (_, _, said) = scales(&variant(|_| true, &[("beta", 0.1)], 1));
+    assert!(said.contains("`beta` of Deformable Beta Splatting is not read"), "{said}");
+    let anchors = variant(|n| !n.starts_with("f_dc"), &[("f_anchor_feat_0", 0.1), ("f_offset_0", 0.1)], 1);
+    let refused = DIALECT.open(&anchors).unwrap_err().to_string();
+    assert!(refused.contains("anchors of Scaffold-GS"), "{refused}");
+}
+
+#[test]
+fn a_byte_order_mark_and_comments_of_any_encoding_are_no_damage() {
+    let plain = written(&random(3, 1));
+    let mark = b"element vertex";
+    let at = plain.windows(mark.len()).position(|w| w == mark).unwrap();
+    let comment = b"comment D:\\B\xfcro \xc2\xb7\xbe\xb6\r\n";
+    for prefix in [&b""[..], b"\xef\xbb\xbf"] {
+        let bytes = [prefix, &plain[..at], comment, &plain[at..]].concat();
+        assert_eq!(Dialect::of(&bytes), Some(DIALECT));
+        let (params, info) = read(&bytes).unwrap();
+        assert_eq!((params, info.comments.len()), (random(3, 1), 1));
+    }
+}
+
+#[test]
+fn rows_that_the_header_does_not_count_are_reported() {
+    let said = |bytes: &[u8]| DIALECT.open(bytes).unwrap().warnings.lines().join(" | ");
+    let mut binary = written(&gaussians(5, 1));
+    assert_eq!(said(&binary), "");
+    binary.extend([0; 68]);
+    assert!(said(&binary).contains("68 bytes follow the 5 rows"), "{}", said(&binary));
+    let rows = String::from_utf8(variant(|_| true, &[], 3)).unwrap();
+    assert_eq!(said(format!("{rows}\n \n").as_bytes()), "", "space is nothing");
+    let more = said(rows.replace("vertex 3", "vertex 2").as_bytes());
+    assert!(more.contains("bytes follow the 2 rows") && more.contains("more rows than its header states"), "{more}");
+    let (_, mut packed) = packed_sample();
+    assert_eq!(said(&packed), "");
+    packed.extend([1; 16]);
+    assert!(said(&packed).contains("16 bytes follow"), "{}", said(&packed));
+}
+
 #[test]
 fn infinities_that_mean_something_are_no_damage() {
     // No writer of ours writes infinities: they take the place of numbers that occur once.

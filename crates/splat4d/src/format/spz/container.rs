@@ -82,7 +82,8 @@ fn cursor_start(bytes: &[u8]) -> Result<&[u8; OLD_HEADER]> {
 fn old_header(bytes: &[u8; OLD_HEADER]) -> Result<Header> {
     let mut c = Cursor::new(bytes, "header");
     if c.take(4)? != MAGIC {
-        return Err(Error::input("this is a gzip file, but no .spz file is in it").remedy("Give an .spz file."));
+        return Err(Error::input("this is a gzip file without an .spz file in it")
+            .remedy("Unpack it (`gunzip FILE`) and give what is inside."));
     }
     let (version, count) = (c.u32()?, c.u32()? as usize);
     let (degree, fraction_bits, flags) = (usize::from(c.u8()?), c.u8()?, c.u8()?);

@@ -6,7 +6,7 @@ use super::{COEFFICIENTS, DEGREE, FIELD, OPACITIES, ORIENTATIONS, POSITIONS, SCA
 use crate::Result;
 use crate::format::Warnings;
 use crate::format::dialect::{Opened, Y_UP, still};
-use crate::format::mend::{Linear, from_linear};
+use crate::format::linear::{Linear, from_linear};
 use crate::layers::{ALPHA_MIN, Layer, Scene};
 use crate::math::quat;
 use crate::math::sh::MAX_DEGREE;
