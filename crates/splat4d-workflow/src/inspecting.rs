@@ -8,7 +8,7 @@ use crate::events::Listener;
 use crate::files::{self, grouped, human_bytes, human_seconds};
 use crate::run_folder::{Origin, Run};
 use crate::source::{Source, bundle, cloud, read_scene};
-use crate::status;
+use crate::{sequence, status};
 use serde_json::{Value, json};
 use splat4d::format::sog;
 use splat4d::layers::{Head, Scene};

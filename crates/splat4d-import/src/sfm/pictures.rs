@@ -87,8 +87,8 @@ pub struct CameraView {
 
 /// What features are taken from.
 #[derive(Clone, Copy, Debug, PartialEq)]
-    /// Times at which features are taken from dynamic regions.
 pub struct FeatureOptions {
+    /// Times at which features are taken from dynamic regions.
     pub moments: usize,
     /// Least contrast of a feature.
     pub contrast: f64,
