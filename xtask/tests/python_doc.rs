@@ -221,8 +221,8 @@ fn broken(shown: &str) -> String {
     format!("{}(\n    {}\n{}", &shown[..open], inside.trim_end_matches(", "), &shown[close..])
 }
 
-/// The page of scenes, which follow each other in the stub, and the first of them and the first after them.
-const SCENES: (&str, &str, &str) = ("docs/python-api-scenes.md", "\n## Camera\n", "\n## Frame\n");
+/// The page of scenes and captures, which follow each other in the stub, and the first of them and the first after them.
+const SCENES: (&str, &str, &str) = ("docs/python-api-scenes.md", "\n## Gaussians\n", "\n## View\n");
 
 /// The class that is written in Python: its words and how it is made.
 fn motion() -> String {
@@ -238,13 +238,17 @@ fn motion() -> String {
 fn pages() -> [(&'static str, String); 2] {
     let text = document();
     let (file, first, after) = SCENES;
-    let (start, rest) = text.split_once(first).expect("the stub has cameras");
-    let (scenes, end) = rest.split_once(after).expect("the stub has captures");
+    let (start, rest) = text.split_once(first).expect("the stub has Gaussians");
+    let (scenes, end) = rest.split_once(after).expect("the stub has views");
     let head = format!(
-        "# Python API: scenes\n\nCameras, Gaussians and scenes of the package `splat4d`. Functions, captures and runs: \
+        "# Python API: scenes and captures\n\nGaussians, scenes and captures of the package `splat4d`. Functions, cameras and runs: \
          [Python API](python-api.md).\n\nThis file is generated: `{AGAIN}`.\n"
     );
-    let start = start.replacen("\n## ", "\nCameras, Gaussians and scenes: [scenes](python-api-scenes.md).\n\n## ", 1);
+    let start = start.replacen(
+        "\n## ",
+        "\nGaussians, scenes and captures: [scenes and captures](python-api-scenes.md).\n\n## ",
+        1,
+    );
     [
         ("docs/python-api.md", format!("{start}{}{after}{end}", motion())),
         (file, format!("{head}{first}{}\n", scenes.trim_end())),
