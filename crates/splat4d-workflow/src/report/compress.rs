@@ -79,10 +79,35 @@ impl Compressed {
         self.unpruned.as_ref().unwrap_or(&self.before)
     }
 
+    /// How many times smaller than the plain file; `None` if that was not measured.
+    fn smaller_than_plain(&self) -> Option<f64> {
+        let plain = self.plain.as_ref().filter(|p| p.bytes > 0 && self.after.bytes > 0)?;
+        Some(plain.bytes as f64 / self.after.bytes as f64)
+    }
+
     /// How many times smaller than 32-bit floats; `None` where there is nothing.
     pub fn smaller(&self) -> Option<f64> {
         (self.after.bytes > 0).then(|| self.before.float_bytes as f64 / self.after.bytes as f64)
     }
+}
+
+/// The content of a compressed run's `compress.json`; `None` for other runs and other versions.
+pub(super) fn told(run: &Run) -> Option<Compressed> {
+    if run.compressed.is_null() { None } else { serde_json::from_value(run.compressed.clone()).ok() }
+}
+
+/// The result of a compression in a sentence.
+pub(super) fn verdict(told: &Compressed) -> String {
+    let mut out = format!("Compressed to {}", human_bytes(told.after.bytes));
+    match (told.smaller_than_plain(), told.smaller()) {
+        (Some(x), _) => _ = write!(out, ", {x:.1} times smaller than the plain file"),
+        (None, Some(x)) => _ = write!(out, ", {x:.1} times smaller than 32-bit floats"),
+        (None, None) => {}
+    }
+    if let Some((before, after)) = told.before.psnr.zip(told.after.psnr) {
+        let _ = write!(out, ". Held-out views: {after:.2} dB PSNR, {:+.2} dB against the source", after - before);
+    }
+    out + "."
 }
 
 /// Puts the section into the page of a compressed run; nothing into that of another.
@@ -90,7 +115,7 @@ pub(super) fn section(out: &mut String, run: &Run) {
     if run.compressed.is_null() {
         return;
     }
-    let Ok(told) = serde_json::from_value::<Compressed>(run.compressed.clone()) else {
+    let Some(told) = told(run) else {
         let _ = writeln!(out, "<div class=\"warn\">{FILE} was written by another version of splat4d.</div>");
         return;
     };
@@ -119,10 +144,11 @@ fn guard(out: &mut String, told: &Compressed) {
     if let Some(Guard { loss_db, limit_db, passed }) = told.guard {
         let verdict = if passed { "within" } else { "more than" };
         let class = if passed { "note" } else { "warn" };
+        let change = if loss_db < 0.0 { "gained" } else { "lost" };
         let _ = writeln!(
             out,
-            "<p class=\"{class}\">{loss_db:.2} dB lost on the training views, {verdict} the limit of {limit_db:.2} \
-             dB.</p>"
+            "<p class=\"{class}\">{:.2} dB {change} on the training views, {verdict} the limit of {limit_db:.2} dB.</p>",
+            loss_db.abs()
         );
     }
     for warning in &told.warnings {
@@ -157,7 +183,9 @@ fn sides(out: &mut String, told: &Compressed) {
         (
             "file",
             &|s| Some(human_bytes(s.bytes)),
-            told.smaller().map(|x| format!("{x:.1}x less than the source's 32-bit floats")),
+            told.smaller_than_plain()
+                .map(|x| format!("{x:.1}x less than the plain file"))
+                .or_else(|| told.smaller().map(|x| format!("{x:.1}x less than the source's 32-bit floats"))),
         ),
         ("Mbit/s", &|s| plain(1, s.mbit_per_s), None),
         ("PSNR, held-out views, dB", &|s| plain(2, s.psnr), gain(2, |s| s.psnr)),

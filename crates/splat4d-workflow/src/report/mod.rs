@@ -82,6 +82,13 @@ fn header(out: &mut String, run: &Run) {
 
 /// The result in a sentence, and what to do with it.
 fn verdict(run: &Run) -> String {
+    if let Some(told) = compress::told(run) {
+        let place = escape(&in_command(&run.path));
+        return format!(
+            "<p class=\"verdict\">{}</p><p>Play it: <code>splat4d view {place}</code>.</p>",
+            escape(&compress::verdict(&told))
+        );
+    }
     let Some(psnr) = run.score("PSNR") else { return String::new() };
     let mut out = format!("<p class=\"verdict\">Held-out views: {psnr:.2} dB PSNR");
     if let Some(dynamic) = run.score("PSNR-dynamic") {
@@ -113,6 +120,11 @@ fn cards(out: &mut String, run: &Run) {
             escape(name)
         );
     };
+    if let Some(told) = compress::told(run) {
+        let text = human_bytes(told.after.bytes);
+        let (value, unit) = text.split_once(' ').unwrap_or((&text, ""));
+        card("main", value.into(), unit, "compressed file scene.s4d");
+    }
     for (class, key, digits, unit, name) in [
         ("main", "PSNR", 2, "dB", "PSNR, held-out views"),
         ("", "PSNR-aligned", 2, "dB", "PSNR, held-out cameras aligned"),
@@ -415,7 +427,11 @@ fn costs(out: &mut String, run: &Run) {
 
 fn again(out: &mut String, run: &Run) {
     let mut lines = String::new();
-    if let Some(capture) = run.capture() {
+    if let Some(told) = compress::told(run) {
+        let level = told.level.map(|l| format!(" --level {l}")).unwrap_or_default();
+        let _ = writeln!(lines, "splat4d compress {}{level} -o NEW_RUN", in_command(&told.source));
+        lines += "# all settings: compress.toml\n";
+    } else if let Some(capture) = run.capture() {
         let _ = writeln!(
             lines,
             "splat4d train {} --recipe {} -o NEW_RUN",

@@ -83,6 +83,26 @@ fn the_section_shows_before_after_images_and_settings() {
     assert!(!html.contains("plain file") && !html.contains("flicker"), "what was not measured is not there");
     assert_eq!(html.matches("data:image/jpeg;base64,").count(), 3, "before, compressed, difference");
     assert!(!html.contains("NaN") && !html.contains("inf"));
+    let whole = std::fs::read_to_string(super::super::write(&Run::open(after.path()).unwrap()).unwrap()).unwrap();
+    for text in [
+        "Compressed to 390.6 KiB, 21.0 times smaller than 32-bit floats. Held-out views: 30.95 dB PSNR, -0.05 dB",
+        "<b>390.6<small>KiB</small></b><span>compressed file",
+        "splat4d compress ",
+    ] {
+        assert!(whole.contains(text), "{text} is missing in the page");
+    }
+    assert!(!whole.contains("splat4d train "), "the source's training does not reproduce it");
+}
+
+#[test]
+fn a_plain_file_is_what_a_compressed_one_is_compared_with() {
+    let mut told = told(Path::new("source"));
+    told.plain = Some(side(150_000, 1_000_000, 31.0, 40.0));
+    assert!(verdict(&told).contains("2.5 times smaller than the plain file"), "{}", verdict(&told));
+    told.guard = Some(Guard { loss_db: -0.22, limit_db: 0.5, passed: true });
+    let mut out = String::new();
+    guard(&mut out, &told);
+    assert!(out.contains("0.22 dB gained"), "{out}");
 }
 
 #[test]
