@@ -32,7 +32,7 @@
 //! | `path_text.rs`, `files.rs` | paths that are not UTF-8 as text; opens regular files only |
 //! | `keypoints/` | SIFT keypoints and the image filters that they need |
 //! | `capture/` | layouts read into one `Capture`, chosen by `layout.rs`; file lookup (`lookup.rs`), masks, findings (`account.rs`), pose conventions (`convention.rs`), depth, flow and tracks, photos or videos without times (`sequence.rs`), a model next to other poses (`beside.rs`), the image store with a byte budget, captures far from the origin (`offset.rs`), panoramas |
-//! | `capture/foreign/`, `capture/colmap/`, `capture/transforms/`, `capture/evidence/` | exports of Metashape, RealityScan, Polycam, Record3D; unregistered COLMAP images and 4DGaussians' multipleview; frames and times of `transforms*.json`; whether poses can be right |
+//! | `capture/foreign/`, `capture/colmap/`, `capture/transforms/`, `capture/evidence/`, `capture/lookup/` | exports of Metashape, RealityScan, Polycam, Record3D; unregistered COLMAP images and 4DGaussians' multipleview; frames and times of `transforms*.json`; whether poses can be right; images of one name with two endings |
 //! | `vision/` | computer vision on posed images: temporal medians (`view.rs`), matching along epipolar lines, triangulation, plane sweep, scale, dense flow |
 //! | `sampler.rs` | frames of a step, a pure function of seed, stage and step |
 //! | `optim/` | Adam, sparse over the active set, sixteen rows at a time; position noise of MCMC |

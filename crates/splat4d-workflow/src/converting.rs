@@ -61,7 +61,7 @@ pub struct Conversion {
     pub exact: bool,
     /// Positions in the capture's world, in double precision.
     pub world: bool,
-    /// Values of the input to read as they are, not as logarithms or logits.
+    /// Values of the input to read as they are, not as logarithms, logits or coefficients.
     pub linear: Vec<Linear>,
     /// Version of .spz to write.
     pub spz_version: u32,

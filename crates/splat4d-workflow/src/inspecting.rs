@@ -46,9 +46,12 @@ const MANY_LAYERS: usize = 8;
 /// Longest bar of a histogram, characters.
 const BAR: usize = 32;
 
-/// What readers say of values that cannot be right as they were read; all else that they say is a note.
-const DOUBTS: [&str; 6] = [
-    "--linear",
+/// What readers say of values that cannot be right as they were read; all else that they say is a note. Base colours that are all
+/// bright may be those of a bright scene.
+const DOUBTS: [&str; 8] = [
+    "--linear scales",
+    "--linear opacities",
+    "RGB from 0 to 255",
     "where single precision has steps",
     "more rows than its header states",
     "a network that splat4d does not read",
