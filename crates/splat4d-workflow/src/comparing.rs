@@ -45,6 +45,9 @@ impl Entry {
         if Run::is(path) {
             let run = Run::open(path)?;
             return Self::of_run(&run).ok_or_else(|| {
+                if !Run::is_finished(path) {
+                    return Run::unfinished(path, "this run is unfinished and was not measured");
+                }
                 Error::input("this run was not measured yet")
                     .at(path.display())
                     .remedy(format!("Measure it with: splat4d eval {}", splat4d_train::path_text::in_command(path)))

@@ -228,9 +228,7 @@ impl Work {
     pub fn begin(source: &Path, options: &CompressOptions, console: &dyn Listener) -> Result<Self> {
         let run = Run::open(source)?;
         if !Run::is_finished(source) {
-            return Err(Error::input("the run is unfinished")
-                .at(source.display())
-                .remedy(format!("Finish it first: splat4d train --resume {}", in_command(source))));
+            return Err(Run::unfinished(source, "the run is unfinished"));
         }
         let iterations = run.iteration().or_else(|| run.recipe().ok().map(|r| r.run.iterations)).unwrap_or(1);
         let order = CompressJob {

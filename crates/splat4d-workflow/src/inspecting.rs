@@ -6,7 +6,7 @@ mod playback;
 use crate::chunked;
 use crate::events::Listener;
 use crate::files::{self, grouped, human_bytes, human_seconds};
-use crate::run_folder::{Origin, Run};
+use crate::run_folder::{Origin, Run, check_written};
 use crate::source::{Source, bundle, cloud, read_scene};
 use crate::{sequence, status};
 use serde_json::{Value, json};
@@ -20,7 +20,7 @@ use splat4d::{Error, Result};
 use splat4d_import::shipped;
 use splat4d_train::capture::{self, Aspect, Capture, Finding, Frame, Reach, Severity, Timing};
 use splat4d_train::event::Event;
-use splat4d_train::output::check_apart;
+use splat4d_train::output::{Owner, check_apart};
 use splat4d_train::path_text::{in_command, to_text};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::chunks::ChunkEstimate;
@@ -122,6 +122,7 @@ pub fn inspect(path: &Path, options: &InspectOptions, console: &dyn Listener) ->
     if Run::is(path) {
         of_run(path)
     } else if is_capture {
+        check_written(path)?;
         of_capture(path, options, console)
     } else {
         of_file(path)
@@ -350,11 +351,19 @@ fn of_run(path: &Path) -> Result<Inspection> {
             );
         }
     }
-    let recipe = run.recipe()?;
-    let changed: Vec<String> = recipe.choices().iter().map(|(key, value)| format!("{key}={value}")).collect();
-    let recipe = recipe.run.motion;
-    let choices = if changed.is_empty() { "all defaults".to_owned() } else { changed.join(" ") };
-    line(&mut text, "recipe", &format!("{recipe}; {choices}"));
+    let name = in_command(path);
+    let owner = Owner::holder(path).map(|who| who.map_or_else(|| "another process".into(), |who| who.to_string()));
+    let mut changed: Vec<String> = Vec::new();
+    match run.recipe() {
+        Ok(recipe) => {
+            changed.extend(recipe.choices().iter().map(|(key, value)| format!("{key}={value}")));
+            let choices = if changed.is_empty() { "all defaults".to_owned() } else { changed.join(" ") };
+            line(&mut text, "recipe", &format!("{}; {choices}", recipe.run.motion));
+        }
+        // Its owner has taken the folder this very moment.
+        Err(_) if run.recipe.is_none() && owner.is_some() => line(&mut text, "recipe", "not written yet"),
+        Err(e) => return Err(e.into()),
+    }
     let total = run.number("iterations").or_else(|| run.recipe().ok().map(|r| r.run.iterations as f64));
     let status = status::of(path)?;
     let finished = status.finished;
@@ -362,10 +371,17 @@ fn of_run(path: &Path) -> Result<Inspection> {
     let (done, total) = if status.chunked { (status.steps(), None) } else { (run.iteration().unwrap_or(0), total) };
     let of = total.map(|n| format!(" of {}", grouped(n as usize))).unwrap_or_default();
     line(&mut text, "progress", &format!("{}, step {}{of}", status.progress(), grouped(done)));
+    match &owner {
+        Some(owner) => line(&mut text, "owner", owner),
+        // Each chunk has an owner of its own.
+        None if !finished && !status.chunked => line(&mut text, "owner", "none"),
+        None => {}
+    }
     if !finished {
-        troubles.push(match status.chunked {
-            true => format!("It is unfinished: splat4d status {} lists its parts.", in_command(path)),
-            false => format!("It is unfinished: splat4d train --resume {} continues it.", in_command(path)),
+        troubles.push(match (&owner, status.chunked) {
+            (Some(_), _) => format!("It is not finished: splat4d status {name} reports its progress."),
+            (None, true) => format!("It is unfinished: splat4d status {name} lists its parts."),
+            (None, false) => format!("It is unfinished: splat4d train --resume {name} continues it."),
         });
     }
     if let Some(seconds) = run.number("seconds").or(status.chunked.then(|| status.seconds())) {
@@ -385,7 +401,7 @@ fn of_run(path: &Path) -> Result<Inspection> {
         line(&mut text, "held-out scores", "not measured yet: splat4d eval RUN");
     }
     let mut json = json!({
-        "type": "run", "name": run.name(), "capture": run.capture().map(|c| to_text(&c)), "finished": finished, "iteration": done,
+        "type": "run", "name": run.name(), "capture": run.capture().map(|c| to_text(&c)), "finished": finished, "owner": owner, "iteration": done,
         "iterations": total, "changed_knobs": changed, "info": run.info, "results": run.all_results,
     });
     if let Ok(file) = run.scene_file() {

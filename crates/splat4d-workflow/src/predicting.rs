@@ -148,9 +148,7 @@ impl Work {
         let run = Run::open(&order.run)?;
         let place = order.run.display().to_string();
         if !Run::is_finished(&order.run) {
-            return Err(Error::input("the run is unfinished")
-                .at(&place)
-                .remedy(format!("Finish it first: splat4d train --resume {place}")));
+            return Err(Run::unfinished(&order.run, "the run is unfinished"));
         }
         let recipe = run.recipe()?;
         if recipe.capture.observe >= 1.0 {

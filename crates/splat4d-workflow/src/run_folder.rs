@@ -10,9 +10,10 @@ use splat4d::scene::{Camera, Intrinsics, Lens};
 use splat4d::{Error, Result};
 use splat4d_train::capture::{Capture, Split};
 use splat4d_train::event::Event;
-use splat4d_train::output::{FolderContent, Input, Mixes, OutputFolder, Owner, Request, STATE};
-use splat4d_train::path_text::of_text;
+use splat4d_train::output::{FolderContent, Input, Mixes, OutputFolder, Owner, Request, STATE, Standing};
+use splat4d_train::path_text::{in_command, of_text};
 use splat4d_train::recipe::Recipe;
+use splat4d_train::run::chunks::Chunked;
 use splat4d_train::run::{capture_options, checkpoint, recorded_elsewhere};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -23,6 +24,8 @@ const MARKERS: [&str; 4] = ["recipe.toml", "run.json", "scene.safetensors", "che
 pub const COMPRESS: &str = "compress.json";
 /// File that holds the settings `compress` was asked for.
 pub const ORDER: &str = "compress.toml";
+/// Start of the commands that train, in the record of who has a folder.
+const TRAIN: &str = "train";
 /// Files and folders of a run that no output of another command may replace; what is baked, rendered or reported is made again.
 const KEPT: [&str; 9] = [
     "recipe.toml",
@@ -82,13 +85,15 @@ pub struct Run {
     pub views: Vec<ViewScore>,
     /// `compress.json`, where the run was made by compressing another.
     pub compressed: Value,
+    /// What was asked for, of a run without checkpoints.
+    asked: Option<RunRequest>,
     iteration: Option<usize>,
 }
 
 impl Run {
-    /// Whether this folder is a run.
+    /// Whether this folder is a run, also one that training has just begun.
     pub fn is(path: &Path) -> bool {
-        path.is_dir() && MARKERS.iter().any(|m| path.join(m).exists())
+        path.is_dir() && (MARKERS.iter().any(|m| path.join(m).exists()) || is_starting(path))
     }
 
     /// Whether a file is one that a run cannot do without.
@@ -117,7 +122,7 @@ impl Run {
                 .at(path.display())
                 .remedy("Give the folder that `splat4d train` wrote, for instance runs/knight."));
         }
-        let mut run = Self { path: path.to_owned(), ..Self::default() };
+        let mut run = Self { path: path.to_owned(), asked: RunRequest::unbegun(path), ..Self::default() };
         let text = |name: &str| {
             let file = path.join(name);
             if file.is_file() { read_text(&file).map(Some) } else { Ok(None) }
@@ -186,12 +191,13 @@ impl Run {
     /// The recipe.
     pub fn recipe(&self) -> Result<Recipe> {
         let path = self.path.join("recipe.toml");
-        let text = self.recipe.as_deref().ok_or_else(|| {
-            Error::input("the run has no recipe.toml")
+        match (&self.recipe, &self.asked) {
+            (Some(text), _) => Recipe::from_toml(text).map_err(|e| e.at(path.display())),
+            (None, Some(asked)) => asked.recipe(),
+            (None, None) => Err(Error::input("the run has no recipe.toml")
                 .at(path.display())
-                .remedy("Train again: the file is written at the start.")
-        })?;
-        Recipe::from_toml(text).map_err(|e| e.at(path.display()))
+                .remedy("Train again: the file is written at the start.")),
+        }
     }
 
     /// Steps taken, where recorded.
@@ -212,7 +218,8 @@ impl Run {
 
     /// The capture it was trained on.
     pub fn capture(&self) -> Option<PathBuf> {
-        self.info.get("capture").and_then(Value::as_str).map(of_text)
+        let recorded = self.info.get("capture").and_then(Value::as_str).map(of_text);
+        recorded.or_else(|| self.asked.as_ref().map(|asked| asked.capture.clone()))
     }
 
     /// What it was trained on.
@@ -260,11 +267,25 @@ impl Run {
         if scene.is_file() {
             return Ok(scene);
         }
-        checkpoint::list(&self.path).pop().ok_or_else(|| {
-            Error::input("the run has no scene and no checkpoint yet")
-                .at(self.path.display())
-                .remedy("Wait for the first checkpoint, or continue it with `splat4d train --resume`.")
-        })
+        checkpoint::list(&self.path)
+            .pop()
+            .ok_or_else(|| Self::unfinished(&self.path, "the run has no scene and no checkpoint yet"))
+    }
+
+    /// Error: a run that is not finished lacks what a command needs. Who works on it decides what to do about that.
+    pub fn unfinished(path: &Path, what: &str) -> Error {
+        let name = in_command(path);
+        let (state, remedy) = match Owner::other(path) {
+            Some(who) => (
+                format!("; {} works on it", who.map_or_else(|| "another process".into(), |who| who.to_string())),
+                format!("Wait for it: splat4d status {name} reports its progress."),
+            ),
+            None if Chunked::is(path) => {
+                (String::new(), format!("Finish its chunks first: splat4d status {name} lists them."))
+            }
+            None => (String::new(), format!("No process works on it. Continue it: splat4d train --resume {name}")),
+        };
+        Error::input(format!("{what}{state}")).at(path.display()).remedy(remedy)
     }
 
     /// Opens the capture again, as the run saw it.
@@ -285,6 +306,31 @@ impl Run {
         }
         Ok(views_of(&self.open_capture()?.0))
     }
+}
+
+/// Whether training has taken a folder and written none of a run's files yet.
+fn is_starting(path: &Path) -> bool {
+    let trains = |who: Option<Standing>| who.is_some_and(|who| who.command.starts_with(TRAIN));
+    path.join(STATE).is_dir() && (RunRequest::unbegun(path).is_some() || Owner::holder(path).is_some_and(trains))
+}
+
+/// Refuses a folder that a command has taken as its output and not written to yet. Errors: who has it.
+pub fn check_written(folder: &Path) -> Result<()> {
+    let mut there = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    if !folder.join(STATE).is_dir() || there.any(|entry| entry.file_name() != STATE) {
+        return Ok(());
+    }
+    let (what, remedy) = match Owner::other(folder) {
+        Some(who) => {
+            let who = who.map_or_else(|| "another process".into(), |who| who.to_string());
+            (format!("is the output folder of {who}, which has written nothing yet"), "Wait for it.")
+        }
+        None => (
+            "is the output folder of a command that ended before it wrote anything".into(),
+            "Run that command again, or give another folder.",
+        ),
+    };
+    Err(Error::input(what).at(folder.display()).remedy(remedy))
 }
 
 /// The cameras in a file such as `cameras.json`; `None`: it is JSON of another kind.
@@ -528,6 +574,44 @@ pub fn view_scores(entry: &Value) -> Vec<ViewScore> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_run_that_has_no_files_yet_is_named_with_its_owner() {
+        let folder = tempfile::tempdir().unwrap();
+        let (capture, run) = (folder.path().join("capture"), folder.path().join("run"));
+        std::fs::create_dir(&capture).unwrap();
+        let request = RunRequest::new(&capture, &Recipe::default(), None, false);
+        let asked = serde_json::to_string(&request).unwrap();
+        std::fs::create_dir_all(run.join(STATE)).unwrap();
+        std::fs::write(run.join(STATE).join("asked"), asked).unwrap();
+        std::fs::write(run.join(STATE).join("lock"), "").unwrap();
+        // Killed.
+        assert!(Run::is(&run));
+        let opened = Run::open(&run).unwrap();
+        assert_eq!((opened.capture(), opened.recipe().is_ok()), (Some(request.capture), true));
+        let resume = "splat4d train --resume";
+        let said = opened.scene_file().unwrap_err().to_string();
+        assert!(said.contains("No process") && said.contains(resume), "{said}");
+        assert!(crate::status::of(&run).unwrap().text().contains(resume));
+        // Of a process on another machine.
+        let owner =
+            r#"{"command": "train", "process": 7, "host": "elsewhere", "since": "2026", "machine": "m", "beat": "1"}"#;
+        std::fs::write(run.join(STATE).join("owner.json"), owner).unwrap();
+        let said = opened.scene_file().unwrap_err().to_string();
+        assert!(said.contains("process 7 on elsewhere") && !said.contains(resume), "{said}");
+        let said = crate::status::of(&run).unwrap().text();
+        assert!(said.contains("process 7 on elsewhere") && !said.contains(resume), "{said}");
+    }
+
+    #[test]
+    fn an_output_folder_without_output_is_no_capture() {
+        let folder = tempfile::tempdir().unwrap();
+        assert!(check_written(folder.path()).is_ok());
+        std::fs::create_dir(folder.path().join(STATE)).unwrap();
+        assert!(check_written(folder.path()).unwrap_err().to_string().contains("ended before"));
+        std::fs::write(folder.path().join("capture.json"), "{}").unwrap();
+        assert!(check_written(folder.path()).is_ok());
+    }
 
     #[test]
     fn taken_folders_get_a_number() {

@@ -5,7 +5,7 @@ pub mod bundle;
 
 use crate::files::{self, either};
 use crate::paths::{Stage, View};
-use crate::run_folder::Run;
+use crate::run_folder::{Run, check_written};
 use crate::sequence;
 use splat4d::format::playback::{self, Index, Provenance};
 use splat4d::format::ply::PlyInfo;
@@ -56,12 +56,13 @@ pub fn keep(path: &Path, run: Option<&Run>, output: &Path, others: &[&Path]) -> 
     inputs.extend(origin.inputs());
     inputs.extend(others.iter().map(|file| Input::new(file, "what is read,")));
     check_file(output, &inputs)?;
+    check_free(output)?;
     if Run::needs(output) {
         return Err(Error::input("the output would replace a file that its run needs")
             .at(output.display())
             .remedy("Choose another name."));
     }
-    check_free(output)
+    Ok(())
 }
 
 impl Source {
@@ -76,6 +77,7 @@ impl Source {
             return open_sequence(path, fps);
         }
         if path.is_dir() && !Run::is(path) {
+            check_written(path)?;
             if path.join(sog::META).is_file() {
                 return bundle::open_sog(path);
             }

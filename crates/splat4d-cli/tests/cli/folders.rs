@@ -66,6 +66,14 @@ fn a_folder_in_use_is_refused_and_read() {
         let said = splat4d(&["train", str(&capture), "-o", str(&run)]).args(&TINY).args(force).run().failed();
         assert!(said.contains(&told) && said.contains("since 20"), "{said}");
     }
+    // It is a run already, though it has no files yet.
+    let said = splat4d(&["info", str(&run)]).run().ok();
+    assert!(said.contains("owner            `splat4d train`, process") && said.contains("splat4d status"), "{said}");
+    assert!(splat4d(&["status", str(&run)]).run().ok().contains("step 0, `splat4d train`, process"));
+    for words in [&["view", "--no-open"][..], &["render", "-o", "x.png"]] {
+        let said = splat4d(&[words[0], str(&run)]).args(&words[1..]).run_in(work.path()).refused();
+        assert!(said.contains("no checkpoint yet; `splat4d train`") && said.contains("splat4d status"), "{said}");
+    }
     // One file in it is as much a write as a whole run.
     let file = work.path().join("a.ply");
     write_ply(&file, 0.0);

@@ -60,6 +60,11 @@ impl Standing {
         }
     }
 
+    /// Whether it is this process.
+    fn is_own(&self) -> bool {
+        self.process == std::process::id() && self.machine == machine()
+    }
+
     fn read(path: &Path) -> Option<Self> {
         serde_json::from_slice(&crate::files::read(path).ok()?).ok()
     }
@@ -196,6 +201,11 @@ impl Owner {
         let other = Standing::read(&record).filter(|s| s.machine != machine())?;
         age(&record, SystemTime::now()).is_some_and(|age| age <= DEAD).then_some(Some(other))
     }
+
+    /// The same, if it is not this process.
+    pub fn other(folder: &Path) -> Option<Option<Standing>> {
+        Self::holder(folder).filter(|who| !who.as_ref().is_some_and(Standing::is_own))
+    }
 }
 
 impl Drop for Owner {
@@ -214,11 +224,7 @@ fn discard(state: &Path) {
 /// Refuses to write a file into a folder that another process owns. Errors: who that is.
 pub fn check_free(file: &Path) -> Result<()> {
     let folder = file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let own = |who: &Standing| who.process == std::process::id() && who.machine == machine();
-    match Owner::holder(folder) {
-        Some(who) if !who.as_ref().is_some_and(own) => Err(in_use(folder, who.as_ref())),
-        _ => Ok(()),
-    }
+    Owner::other(folder).map_or(Ok(()), |who| Err(in_use(folder, who.as_ref())))
 }
 
 pub(super) fn in_use(folder: &Path, who: Option<&Standing>) -> Error {

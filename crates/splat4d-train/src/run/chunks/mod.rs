@@ -138,6 +138,11 @@ impl Chunked {
     /// A run that was begun. Errors: it is none, or damaged.
     pub fn open(run: &Path) -> Result<Self> {
         let path = run.join(FOLDER).join(PLAN);
+        if run.is_dir() && !path.exists() {
+            return Err(Error::input(format!("contains no chunks: there is no {FOLDER}/{PLAN}"))
+                .at(run.display())
+                .remedy("Only runs of long captures have chunks: `splat4d status` reports what a run has"));
+        }
         let plan: ChunkPlan = serde_json::from_str(&read_text(&path)?)
             .map_err(|e| Error::input(format!("invalid plan of chunks: {e}")).at(path.display()))?;
         plan.check().map_err(|e| e.at(path.display()))?;
