@@ -51,7 +51,8 @@ Examples:
   splat4d info my-take --check    exit code 2 if it does not look healthy, for scripts
   splat4d info my-take --doctor   problems per camera and remedies (writes ./doctor/doctor.html)
   splat4d info runs/knight        recipe, progress, scores
-  splat4d info scene.ply --json   Gaussians, SH degree, bounds, opacity and scales, damage";
+  splat4d info scene.ply --json   Gaussians, SH degree, bounds, opacity and scales, damage
+  splat4d info scene.s4d --strict every deviation from the format's specification, for writers of the format";
 
 /// Print what a capture, run or file contains, and whether it looks healthy
 #[derive(Debug, clap::Args)]
@@ -81,6 +82,9 @@ pub(crate) struct Args {
     /// Fail with exit code 2 if it does not look healthy
     #[arg(long)]
     check: bool,
+    /// Check a .s4d against the whole specification of the format; fail with exit code 2 if it deviates
+    #[arg(long, conflicts_with = "doctor")]
+    strict: bool,
     /// Folder of --doctor's output
     #[arg(short, long, value_name = "FOLDER", default_value = "doctor", requires = "doctor")]
     output: PathBuf,
@@ -106,6 +110,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             .at(path.display())
             .remedy("Give a capture, a run or a scene file.")
             .into());
+    }
+    if args.strict {
+        return playback::conform(path, console);
     }
     let marker = capture::is_metadata(path);
     let sog = path.join(sog::META).is_file() || path.file_name().is_some_and(|name| name == sog::META);

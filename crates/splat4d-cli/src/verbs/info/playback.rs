@@ -1,10 +1,14 @@
 //! What the index of a playback file says: sections, sizes, and how much has to arrive before there is something to see.
 
 use super::line;
+use crate::console::Console;
 use serde_json::{Value, json};
-use splat4d::format::playback::{Codec, Entry, HEADER_BYTES, Index, Kind};
+use splat4d::Error;
+use splat4d::format::playback::{Codec, Entry, HEADER_BYTES, Index, Kind, MAGIC, strict};
+use splat4d::text::in_line;
 use splat4d_workflow::files::{grouped, human_bytes};
 use std::fmt::Write;
+use std::path::Path;
 
 /// Sections that are listed; `--json` has them all.
 const LISTED: usize = 24;
@@ -81,6 +85,36 @@ pub(super) fn of_index(index: &Index) -> IndexSummary {
             "bytes": m.bytes})).collect::<Vec<_>>(),
     });
     IndexSummary { text, json }
+}
+
+/// Prints how a playback file deviates from its specification.
+///
+/// Errors: it cannot be read, it is no playback file, readers refuse it, it deviates.
+pub(super) fn conform(path: &Path, console: &Console) -> anyhow::Result<()> {
+    let bytes = std::fs::read(path).map_err(|e| Error::io("cannot be read", e).at(path.display()))?;
+    if !bytes.starts_with(&MAGIC) {
+        return Err(Error::input("--strict checks .s4d files only")
+            .at(path.display())
+            .remedy("Give a .s4d file, or leave --strict out.")
+            .into());
+    }
+    let found = strict(&bytes).map_err(|e| e.at(path.display()))?;
+    let [major, minor] = Index::parse(&bytes, Some(bytes.len() as u64))?.version;
+    let conforms = found.is_empty();
+    let json = json!({"type": "playback", "version": [major, minor], "conforms": conforms, "deviations": found});
+    let mut text: String = found.iter().map(|what| format!("! {}\n", in_line(what))).collect();
+    let verdict = if conforms { "conforms" } else { "does not conform" };
+    let _ = write!(text, "{verdict} to the format, version {major}.{minor}");
+    if console.json() {
+        console.emit(&json);
+    } else {
+        console.report(&text, conforms);
+    }
+    if conforms {
+        return Ok(());
+    }
+    let remedy = "The deviations are listed above. Readers accept the file; its writer should be corrected.";
+    Err(Error::input("deviates from the format's specification").at(path.display()).remedy(remedy).into())
 }
 
 fn section(e: &Entry) -> Value {
