@@ -38,7 +38,7 @@ const PAGE_LINES: usize = 250;
 const README_LINES: usize = 150;
 
 /// Folders of the repository that a path in a document begins with.
-const ROOTS: [&str; 6] = ["crates/", "docs/", "examples/", "studies/", "xtask/", ".ci/"];
+const ROOTS: [&str; 7] = ["clients/", "crates/", "docs/", "examples/", "studies/", "xtask/", ".ci/"];
 
 /// Named in a document, and made by hand at release. Drop a line once its file is there.
 const PENDING: [&str; 0] = [];

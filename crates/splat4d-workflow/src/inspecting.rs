@@ -3,6 +3,8 @@
 mod doctor;
 mod playback;
 
+pub use playback::{Conformance, conformance};
+
 use crate::chunked;
 use crate::events::Listener;
 use crate::files::{self, grouped, human_bytes, human_seconds};
@@ -94,7 +96,7 @@ impl Inspection {
 /// Errors: no such file or folder; it cannot be read.
 ///
 /// ```no_run
-/// ///
+/// use splat4d_workflow::inspecting::{InspectOptions, inspect};
 /// # fn main() -> splat4d::Result<()> {
 /// let found = inspect("scene.ply".as_ref(), &InspectOptions::default(), &splat4d_workflow::events::ignore)?;
 /// println!("{} Gaussians, healthy: {}", found.json["gaussians"], found.is_healthy());

@@ -3,8 +3,10 @@
 use super::line;
 use crate::files::{grouped, human_bytes};
 use serde_json::{Value, json};
-use splat4d::format::playback::{Codec, Entry, HEADER_BYTES, Index, Kind};
+use splat4d::format::playback::{Codec, Entry, HEADER_BYTES, Index, Kind, MAGIC, strict};
+use splat4d::{Error, Result};
 use std::fmt::Write;
+use std::path::Path;
 
 /// Sections that are listed; `--json` has them all.
 const LISTED: usize = 24;
@@ -81,6 +83,29 @@ pub(super) fn of_index(index: &Index) -> IndexSummary {
             "bytes": m.bytes})).collect::<Vec<_>>(),
     });
     IndexSummary { text, json }
+}
+
+/// How a playback file deviates from its specification.
+#[derive(Clone, Debug)]
+pub struct Conformance {
+    /// Version of the format that the file states: major, minor.
+    pub version: [u16; 2],
+    /// Each deviation, in words; none if the file conforms.
+    pub deviations: Vec<String>,
+}
+
+/// Checks a playback file against the whole specification of its format.
+///
+/// Errors: it cannot be read, it is no playback file, readers refuse it.
+pub fn conformance(path: &Path) -> Result<Conformance> {
+    let bytes = std::fs::read(path).map_err(|e| Error::io("cannot be read", e).at(path.display()))?;
+    if !bytes.starts_with(&MAGIC) {
+        return Err(Error::input("only .s4d files have this specification")
+            .at(path.display())
+            .remedy("Give a .s4d file, or inspect without --strict."));
+    }
+    let deviations = strict(&bytes).map_err(|e| e.at(path.display()))?;
+    Ok(Conformance { version: Index::parse(&bytes, Some(bytes.len() as u64))?.version, deviations })
 }
 
 fn section(e: &Entry) -> Value {

@@ -5,8 +5,8 @@ use serde_json::json;
 use splat4d::Error;
 use splat4d::text::in_line;
 use splat4d_train::recipe::Recipe;
-use splat4d_workflow::inspecting::{InspectOptions, inspect};
-use std::path::PathBuf;
+use splat4d_workflow::inspecting::{Conformance, InspectOptions, conformance, inspect};
+use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -14,7 +14,8 @@ Examples:
   splat4d info my-take --check    exit code 2 if it does not look healthy, for scripts
   splat4d info my-take --doctor   problems per camera and remedies (writes ./doctor/doctor.html)
   splat4d info runs/knight        recipe, progress, scores
-  splat4d info scene.ply --json   Gaussians, SH degree, bounds, opacity and scales, damage";
+  splat4d info scene.ply --json   Gaussians, SH degree, bounds, opacity and scales, damage
+  splat4d info scene.s4d --strict every deviation from the format's specification, for writers of the format";
 
 /// Print what a capture, run or file contains, and whether it looks healthy
 #[derive(Debug, clap::Args)]
@@ -44,12 +45,18 @@ pub(crate) struct Args {
     /// Fail with exit code 2 if it does not look healthy
     #[arg(long)]
     check: bool,
+    /// Check a .s4d against the whole specification of the format; fail with exit code 2 if it deviates
+    #[arg(long, conflicts_with = "doctor")]
+    strict: bool,
     /// Folder of --doctor's output
     #[arg(short, long, value_name = "FOLDER", default_value = "doctor", requires = "doctor")]
     output: PathBuf,
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
+    if args.strict {
+        return strict(&args.path, console);
+    }
     let options = InspectOptions { recipe: recipe(args)?, doctor: args.doctor.then(|| args.output.clone()) };
     let mut found = inspect(&args.path, &options, console)?;
     let healthy = found.is_healthy();
@@ -66,6 +73,27 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let verdict = if healthy { "looks healthy" } else { "does not look healthy, see above" };
     console.report(&format!("{}{verdict}", found.text), healthy);
     args.verdict(healthy)
+}
+
+/// Prints how a playback file deviates from its specification.
+fn strict(path: &Path, console: &Console) -> anyhow::Result<()> {
+    let Conformance { version, deviations } = conformance(path)?;
+    let conforms = deviations.is_empty();
+    let mut text: String = deviations.iter().map(|what| format!("! {}\n", in_line(what))).collect();
+    let verdict = if conforms { "conforms" } else { "does not conform" };
+    text += &format!("{verdict} to the format, version {}.{}", version[0], version[1]);
+    if console.json() {
+        console.emit(&json!({
+            "type": "playback", "version": version, "conforms": conforms, "deviations": deviations,
+        }));
+    } else {
+        console.report(&text, conforms);
+    }
+    if conforms {
+        return Ok(());
+    }
+    let remedy = "The deviations are listed above. Readers accept the file; its writer should be corrected.";
+    Err(Error::input("deviates from the format's specification").at(path.display()).remedy(remedy).into())
 }
 
 /// How a capture is read.

@@ -580,6 +580,14 @@ fn read_u32(bytes: &[u8], at: usize) -> Option<u32> {
     Some(u32::from_le_bytes(bytes.get(at..at + 4)?.try_into().ok()?))
 }
 
+/// The bytes of entry `i` in a file that was parsed; none: the file has no such entry.
+pub(super) fn raw_entry(file: &[u8], i: usize) -> Option<&[u8]> {
+    let place = Index::place(file).ok()?;
+    let index = file.get(place.start as usize..place.end as usize)?;
+    let first = 8 + read_u32(index, 0)? as usize + ENTRY_BYTES * i;
+    index.get(first..first + ENTRY_BYTES)
+}
+
 fn short() -> Error {
     broken("its index is shorter than stated".into())
 }

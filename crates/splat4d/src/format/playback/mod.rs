@@ -22,6 +22,7 @@ mod pages;
 mod palette;
 mod provenance;
 mod read;
+mod strict;
 #[cfg(test)]
 mod tests;
 mod write;
@@ -41,6 +42,7 @@ pub use pages::{Pages, PagesDraft, read_pages, write_pages};
 pub use palette::{Palette, decode_palette};
 pub use provenance::{Provenance, provenance, with_provenance};
 pub use read::read;
+pub use strict::strict;
 pub use write::{ErrorStat, Errors, Summary, WriteConfig, write};
 
 /// Extension of playback files.

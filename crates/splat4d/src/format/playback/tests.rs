@@ -1,6 +1,7 @@
 //! Round trips, error bounds, partial and hostile files.
 
 mod coder;
+mod conformance;
 mod features;
 mod grow;
 mod hostile;
