@@ -63,6 +63,7 @@ const STYLE = `
  background:#ffb224;box-shadow:0 0 0 .15em var(--surface);cursor:ew-resize;touch-action:none;padding:0;z-index:1}
 .editkey.ease{border-radius:50%}
 @container (max-width:760px){.panel.edit{max-height:44cqh;gap:.7em}.edit.setting .choose{display:none}.edit .acts .soft{padding:.65em .2em}}
+@container (max-width:420px){.bar:has(.opener) .time .of{display:none}}
 `;
 
 const number = (label, value, onchange, props = {}) => {
@@ -167,7 +168,7 @@ export class Editing {
 
   #build() {
     const { ui } = this;
-    this.opener = tool('edit', 'Edit (X)', () => this.toggle(), { 'aria-expanded': 'false' });
+    this.opener = tool('edit', 'Edit (X)', () => this.toggle(), { class: 'tool opener', 'aria-expanded': 'false' });
     ui.openers.view.after(this.opener);
     this.undoTool = tool('undo', 'Undo (Ctrl+Z)', () => this.undo());
     this.redoTool = tool('redo', 'Redo (Ctrl+Y)', () => this.redo());
