@@ -379,7 +379,7 @@ fn images_of_one_time_need_no_time_offsets() {
         std::fs::copy(bundled().join(format!("images/{name}/0004.jpg")), films.join(name).join("0004.jpg")).unwrap();
     }
     let told = splat4d(&["import", str(&films), "-o", str(&take), "--no-doctor"]).run().ok();
-    assert!(told.contains("do not matter") && !told.contains("are unknown"), "{told}");
+    assert!(told.contains("have no effect") && !told.contains("are unknown"), "{told}");
     assert_eq!(Capture::open(&take, &CaptureOptions::default()).unwrap().frames.len(), CAMERAS.len());
 }
 

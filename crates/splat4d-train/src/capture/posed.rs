@@ -110,7 +110,7 @@ mod tests {
         write(vec![frame("a/0.jpg", 1.0), frame("a/1.jpg", 1.0), frame("b/0.jpg", 2.0)]);
         assert_eq!(transforms_cameras(&path).unwrap().len(), 2);
         write(vec![frame("a/0.jpg", 1.0), frame("a/1.jpg", 1.5), frame("b/0.jpg", 2.0)]);
-        assert!(transforms_cameras(&path).unwrap_err().to_string().contains("several places"));
+        assert!(transforms_cameras(&path).unwrap_err().to_string().contains("several positions"));
         let top = json!({"fl_x": 500.0, "frames": [frame("a.jpg", 1.0)]});
         std::fs::write(&path, top.to_string()).unwrap();
         let lost = transforms_cameras(&path).unwrap_err().to_string();

@@ -161,7 +161,7 @@ fn one_of_several_layouts_is_read_and_said() {
     let sample = samples::dnerf();
     sample.write("transforms.json", b"{}");
     let capture = open(&sample);
-    assert!(capture.warnings.is_empty() && says(&capture.notes, &["transforms_train.json is read", "held out"]));
+    assert!(capture.warnings.is_empty() && says(&capture.notes, &["transforms_train.json is read", "held-out images"]));
     let sample = samples::photos(9, cam, Some(&Sim3::default()));
     for path in ["sparse", "sparse/0"] {
         let capture = Capture::open(&sample.path(path), &CaptureOptions::default()).unwrap();

@@ -341,7 +341,7 @@ fn times_are_read_as_what_they_count() {
         // A clock from a date has no more digits.
         assert!((last - first - length).abs() < 1e-6, "{times:?} at {fps:?}: {} s", last - first);
         assert!(first.abs() < 1e3, "{first}");
-        assert_said(&capture, Aspect::Assumed, severity, &["Times are read as", word, "9 instants"]);
+        assert_said(&capture, Aspect::Assumed, severity, &["Times are read as", word, "9 times"]);
     }
     let rate = with(&steps(1.0 / 25.0), None, &lettered).fps;
     assert_eq!(rate, 25.0, "steps of a known rate tell it");

@@ -100,8 +100,8 @@ fn camera(file: &File<'_>, node: &Node<'_>, image: &Path) -> Result<(Camera, boo
     }
     let fx = focal(top, node, ["fl_x", "camera_angle_x", "x_fov"], width)?;
     let fy = focal(top, node, ["fl_y", "camera_angle_y", "y_fov"], height)?;
-    // Where one is given, pixels are square.
-    let (fx, by_angle) = fx.or(fy).ok_or_else(|| {
+    // A single angle of view is a choice of its writer, and pixels are then square; fl_y alone has lost its fl_x.
+    let (fx, by_angle) = fx.or(fy.filter(|(_, by_angle)| *by_angle)).ok_or_else(|| {
         node.error("neither fl_x nor camera_angle_x is given")
             .remedy("Add one of them, to the frame or to the whole file.")
     })?;
