@@ -1,0 +1,45 @@
+export interface FramesOptions {
+  /** Pages came: what `at` returns changes. */
+  onchange?: () => void;
+  /** Bytes of pages that stay in memory. */
+  budget?: number;
+}
+
+/** What is visible at a time, in the file's axes. The arrays are those of the next call too. */
+export interface FrameArrays {
+  count: number;
+  /** 3 per Gaussian, scene units. */
+  position: Float32Array;
+  /** x y z w. */
+  rotation: Float32Array;
+  /** 3 standard deviations, scene units. */
+  scale: Float32Array;
+  /** 0 to 1. */
+  opacity: Float32Array;
+  /** 3 display values, at least 0. */
+  color: Float32Array;
+}
+
+/** The Gaussians of a playback file at any time as arrays, for engines that render them by themselves. */
+export class Frames {
+  constructor(source: string | URL | File | Blob | ArrayBuffer, options?: FramesOptions);
+  readonly meta: { clip: [number, number]; fps: number; up: [number, number, number]; title?: string } | null;
+  readonly ready: Promise<void>;
+  /** Most Gaussians at any time. */
+  readonly capacity: number;
+  /** The clock, s. Set it, or `play()` and call `tick()` each frame. */
+  time: number;
+  play(): void;
+  pause(): void;
+  readonly paused: boolean;
+  loop: boolean;
+  /** 0.1 to 4. */
+  speed: number;
+  readonly duration: number;
+  tick(now?: number): void;
+  /** Sets the clock and resolves when the pages of that time are there. */
+  load(time: number): Promise<void>;
+  /** `eye`: colours are those seen from there; `forward`: what is nearer than the capture's cameras could see is left out. */
+  at(time: number, eye?: ArrayLike<number> | null, forward?: ArrayLike<number> | null): FrameArrays;
+  dispose(): void;
+}
