@@ -20,7 +20,7 @@ use std::time::{Duration, Instant};
 
 /// How often a waiting program looks whether Ctrl-C was pressed.
 const LOOK: Duration = Duration::from_millis(50);
-/// A new image of the scene in training about so often: sooner than anybody would reload, later than they could follow.
+/// A new image of the scene in training about so often: shorter than a user waits before reloading, longer than a page needs to update.
 const SNAPSHOT_INTERVAL: Duration = Duration::from_secs(3);
 /// Time for the last news to reach pages before the server ends.
 const FAREWELL: Duration = Duration::from_millis(250);

@@ -15,7 +15,7 @@ const MAX_FILES: f64 = 100_000.0;
 /// Most digits of a padded number in a pattern.
 const MAX_DIGITS: usize = 9;
 /// Programs save their Gaussians every so many steps (or a multiple of it; some count from 0): Brush every 5,000, 3DGS after 7,000
-/// and 30,000, OpenSplat and gsplat as told. No film has so few of its frames.
+/// and 30,000, OpenSplat and gsplat as documented. No film has so few of its frames.
 const SNAPSHOTS: u64 = 500;
 /// Gaps of a sequence that are named.
 const NAMED_GAPS: usize = 8;

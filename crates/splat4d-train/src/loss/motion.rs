@@ -56,12 +56,12 @@ pub(super) fn terms<F: Real>(
     let mut g: Vec<Vec<[F; 3]>> = x.iter().map(|x| vec![[F::ZERO; 3]; x.len()]).collect();
     let Scale { unit, clip } = scale;
     if w.least_motion > 0.0 {
-        let [before, now, ..] = &mut g[..] else { unreachable!("two instants are always asked for") };
+        let [before, now, ..] = &mut g[..] else { unreachable!("two times are always requested") };
         loss += least([&x[1], &x[0]], w.least_motion * unit, [now, before]);
     }
     if w.rigid > 0.0 || w.rot > 0.0 || w.velocity > 0.0 {
         let rotations = arap::rotations(graph, &x[1], &x[0]);
-        let [before, now, ..] = &mut g[..] else { unreachable!("two instants are always asked for") };
+        let [before, now, ..] = &mut g[..] else { unreachable!("two times are always requested") };
         if w.rigid > 0.0 {
             let way = [&x[1][..], &x[0][..]];
             loss += rigidity(graph, &rotations, way, w.rigid * unit, [now, before]);
@@ -83,7 +83,7 @@ pub(super) fn terms<F: Real>(
     }
     if is_wide(w) {
         // In the order of time: before, at, after, after that.
-        let [at, after, before, last, ..] = &mut g[..] else { unreachable!("four instants were asked for") };
+        let [at, after, before, last, ..] = &mut g[..] else { unreachable!("four times were requested") };
         let x = [&x[2][..], &x[0][..], &x[1][..], &x[3][..]];
         if w.jerk > 0.0 {
             loss += jerk(x, w.jerk * unit, [before, at, after, last]);
@@ -97,7 +97,7 @@ pub(super) fn terms<F: Real>(
         }
     }
     if is_far(w) {
-        let (far, others) = g.split_last_mut().expect("instants were asked for");
+        let (far, others) = g.split_last_mut().expect("times were requested");
         let pair = [&x[0][..], &x[x.len() - 1][..]];
         if w.iso > 0.0 {
             loss += isometry(graph, pair, w.iso * unit, [&mut others[0], far]);
