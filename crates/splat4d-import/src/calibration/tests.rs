@@ -426,7 +426,7 @@ fn transforms_captures_and_colmap_are_read_without_images() {
     same(&found, &truth);
     assert_eq!(found.dialects, ["COLMAP"]);
     refused(&[("cameras.txt", first.replace("FULL_OPENCV", "SPLINED")), ("images.txt", second.clone())], "SPLINED");
-    refused(&[("cameras.txt", first), ("images.txt", second.replace("right.png", "left.png"))], "several places");
+    refused(&[("cameras.txt", first), ("images.txt", second.replace("right.png", "left.png"))], "several positions");
     let dir = tempfile::tempdir().unwrap();
     let [first, second] = colmap_binary(&truth);
     std::fs::write(dir.path().join("cameras.bin"), &first).unwrap();

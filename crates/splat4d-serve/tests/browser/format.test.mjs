@@ -236,7 +236,7 @@ test('hostile and foreign files are refused in words', async () => {
     ['no valid "fps"', layout({ ...base, fps: 0 }, [])],
     ['no valid "up"', layout({ ...base, up: [0, 0, 0] }, [])],
     ['no valid "background"', layout({ ...base, background: 'red' }, [])],
-    ['not know', layout(base, [{ kind: 'NEWS', data: Buffer.alloc(4), flags: 1 }])],
+    ['does not support', layout(base, [{ kind: 'NEWS', data: Buffer.alloc(4), flags: 1 }])],
     ['outside', layout(base, [PAGE({ patch: patch(8, 1n << 62n, 8) })])],
     ['outside', layout(base, [PAGE({ patch: patch(8, 63n, 8) })])],
     ['overlap', layout(base, [PAGE({ patch: patch(8, 64n, 8) })])],
