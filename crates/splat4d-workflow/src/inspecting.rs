@@ -364,7 +364,7 @@ fn of_run(path: &Path) -> Result<Inspection> {
         }
         // Its owner has taken the folder this very moment.
         Err(_) if run.recipe.is_none() && owner.is_some() => line(&mut text, "recipe", "not written yet"),
-        Err(e) => return Err(e.into()),
+        Err(e) => return Err(e),
     }
     let total = run.number("iterations").or_else(|| run.recipe().ok().map(|r| r.run.iterations as f64));
     let status = status::of(path)?;

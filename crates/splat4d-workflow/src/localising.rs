@@ -17,7 +17,7 @@ use std::path::{Path, PathBuf};
 /// Largest difference of the shapes (width over height) of an image and a start's.
 const SHAPE: f64 = 0.02;
 
-/// Options of [`localise`].
+/// Options of [`localise()`].
 #[derive(Clone, Debug, Default)]
 pub struct LocaliseOptions {
     /// Start from this camera (a camera file), or these (a `cameras.json`); none: from the run's cameras.

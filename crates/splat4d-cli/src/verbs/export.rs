@@ -136,10 +136,11 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let scene = &source.scene;
     let frames = Frames { fps: args.fps, from: args.from, to: args.to };
     if let Some(out) = &args.tracks {
-        return Ok(match &args.points {
+        match &args.points {
             Some(points) => exporting::points(&source, points, &frames, out, console)?,
             None => exporting::tracks(scene, &tracks(args, frames)?, out, console)?,
-        });
+        }
+        return Ok(());
     }
     if let Some(folder) = &args.sequence {
         exporting::frames(path, &source, folder, &frames, [args.world, args.force], console)?;

@@ -89,7 +89,7 @@ fn element_rows<'a>(element: &Element, encoding: Encoding, rest: &mut &'a [u8], 
     let count = element.count;
     if element.properties.is_empty() {
         // Rows of nothing have no bytes, in whatever number.
-        return Ok(Rows { count, body: Body::Wide { values: Vec::new(), width: 0 }, after: *rest });
+        return Ok(Rows { count, body: Body::Wide { values: Vec::new(), width: 0 }, after: rest });
     }
     let mut fields = Vec::with_capacity(element.properties.len());
     let mut stride = 0;
@@ -142,7 +142,7 @@ fn element_rows<'a>(element: &Element, encoding: Encoding, rest: &mut &'a [u8], 
             }
         }
     }
-    Ok(Rows { count, body: Body::Wide { values, width }, after: *rest })
+    Ok(Rows { count, body: Body::Wide { values, width }, after: rest })
 }
 
 /// The next number of a text body.
