@@ -70,6 +70,7 @@ const REFERENCE = [
   ['Formats', [
     ['docs/format', 'Playback file .s4d'],
     ['docs/formats', 'Formats of other programs'],
+    ['docs/readers', 'Readers of .s4d'],
   ]],
   ['docs/channels', 'Channels'],
   ['docs/metrics', 'Metrics'],
