@@ -102,7 +102,7 @@ pub fn conformance(path: &Path) -> Result<Conformance> {
     if !bytes.starts_with(&MAGIC) {
         return Err(Error::input("only .s4d files have this specification")
             .at(path.display())
-            .remedy("Give a .s4d file, or inspect without --strict."));
+            .remedy("Give a .s4d file, or leave option `strict` out."));
     }
     let deviations = strict(&bytes).map_err(|e| e.at(path.display()))?;
     Ok(Conformance { version: Index::parse(&bytes, Some(bytes.len() as u64))?.version, deviations })
