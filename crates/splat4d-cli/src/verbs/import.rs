@@ -5,6 +5,7 @@ use crate::interrupt;
 use serde_json::json;
 use splat4d::{Error, ErrorKind};
 use splat4d_import::board::Board;
+use splat4d_import::calibration;
 use splat4d_import::corrections;
 use splat4d_import::doctor::{Grade, Report as Looked};
 use splat4d_import::recording::{self, CameraReport, Report, Request, Rig};
@@ -166,6 +167,8 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     // A capture may lie next to the videos, in the folder of their calibration.
     let calibration = args.calibration.iter().map(|c| Input { may_hold: true, ..Input::new(c, "the calibration") });
     check_apart(folder, &read.chain(calibration).collect::<Vec<_>>())?;
+    // Before videos are read, which takes a while.
+    args.calibration.iter().try_for_each(|c| calibration::read(c).map(drop))?;
     let _owned = OutputFolder::amend(folder, "import")?;
     let request = Request {
         inputs: args.videos.clone(),
