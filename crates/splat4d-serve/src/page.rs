@@ -93,8 +93,9 @@ impl Page<'_> {
             SceneIn::Linked(address) => Some(address),
             SceneIn::Inside(_) => None,
         };
-        let about =
-            json!({ "title": self.title, "scene": linked, "start": entries }).to_string().replace('<', "\\u003c");
+        // As in <title>: what reorders text or controls a terminal is spelt out.
+        let title = splat4d::text::in_line(self.title);
+        let about = json!({ "title": title, "scene": linked, "start": entries }).to_string().replace('<', "\\u003c");
         write!(
             out,
             "<script type=\"application/json\" id=\"splat4d-modules\">\n[{}]\n</script>\n\
@@ -248,13 +249,14 @@ mod tests {
     #[test]
     fn nothing_in_a_page_ends_a_script_early_and_all_comes_back() {
         let scene: Vec<u8> = (0..2 * LINE + 5).map(|i| (i * 7) as u8).collect();
-        let page = Page { title: "a </title><script>\"'& TITLE", scene: SceneIn::Inside(&scene) };
+        let page = Page { title: "a </title><script>\"'& \u{202e}\u{9b}TITLE", scene: SceneIn::Inside(&scene) };
         let html = page.assemble(SAMPLE, &sample()).unwrap();
         assert_eq!(html.matches("<script").count(), 4, "scene, modules, page, start; the page's own is gone");
         assert_eq!(html.matches("</script>").count(), 4);
         assert!(!html.contains("modulepreload") && html.contains("href=\"data:,\"") && html.contains("[\"a.js\"]"));
         let about: serde_json::Value = serde_json::from_str(text_of(&html, "splat4d-page")).unwrap();
-        assert_eq!((&about["title"], &about["scene"]), (&json!(page.title), &json!(null)));
+        assert_eq!((&about["title"], &about["scene"]), (&json!(splat4d::text::in_line(page.title)), &json!(null)));
+        assert!(!html.contains(['\u{202e}', '\u{9b}']), "the title is spelt out wherever it stands");
         let modules: Vec<(String, String)> = serde_json::from_str(text_of(&html, "splat4d-modules")).unwrap();
         let back: BTreeMap<&str, &str> = modules.iter().map(|(n, t)| (&**n, &**t)).collect();
         assert_eq!(back, sample());
@@ -262,7 +264,7 @@ mod tests {
         assert_eq!(lines.len(), 3);
         let length: usize = lines.iter().map(|l| l.len() / 4 * 3 - l.matches('=').count()).sum();
         assert_eq!(length, scene.len());
-        assert!(html.contains("<title>a &lt;/title&gt;&lt;script&gt;&quot;'&amp; TITLE</title>"));
+        assert!(html.contains("<title>a &lt;/title&gt;&lt;script&gt;&quot;'&amp; \\u{202e}\\u{9b}TITLE</title>"));
         assert!(!html.contains("http://") && !html.contains("https://"));
     }
 

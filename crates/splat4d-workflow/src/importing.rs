@@ -4,6 +4,7 @@ use crate::events::Listener;
 use crate::report::doctor;
 use serde_json::{Value, json};
 use splat4d::{Error, ErrorKind, Result};
+use splat4d_import::calibration;
 use splat4d_import::corrections;
 use splat4d_import::doctor::{Grade, Report as Checked};
 use splat4d_import::recording::{self, CameraReport, Report, Request};
@@ -57,6 +58,8 @@ pub fn import(request: &Request, check: bool, stop: &AtomicBool, console: &dyn L
     // A capture may lie next to the videos, in the folder of their calibration.
     let calibration = request.calibration.iter().map(|c| Input { may_hold: true, ..Input::new(c, "the calibration") });
     check_apart(folder, &read.chain(calibration).collect::<Vec<_>>())?;
+    // Before videos are read, which takes a while.
+    request.calibration.iter().try_for_each(|c| calibration::read(c).map(drop))?;
     let _owned = OutputFolder::amend(folder, "import")?;
     console.stop_not_polled("stored results are kept, and the same command continues from there");
     let mut listen = |event: &Event| console.event(event);

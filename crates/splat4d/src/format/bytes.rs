@@ -63,6 +63,12 @@ pub(super) fn to_byte(x: f32, clipped: &mut bool) -> u8 {
     x.round() as u8
 }
 
+/// A scale of its logarithm; one that f32 cannot hold becomes the largest, so that no file has infinity in it.
+#[inline]
+pub(super) fn scale_of_log(log: f32) -> f32 {
+    log.exp().min(f32::MAX)
+}
+
 /// The logit of an opacity of `byte`/255. The ends stand for half an interval, whose middle is taken: their own logits
 /// are infinite.
 #[inline]

@@ -239,7 +239,8 @@ mod tests {
     use crate::format::kinematic::tests::moving as moving_scene;
     use crate::format::samples::gaussians;
     use crate::format::{checkpoint, dynamic3d, ply, splat, splatv, spz, usd};
-    use crate::scene::GEOMETRY;
+    use crate::scene::params::LOG_SCALE;
+    use crate::scene::{GEOMETRY, SH};
 
     /// A scene that every dialect can hold.
     fn sample(moves: bool) -> Scene<f32> {
@@ -297,6 +298,22 @@ mod tests {
                     "{dialect:?}: {told}"
                 );
             }
+        }
+    }
+
+    #[test]
+    fn finite_numbers_stay_finite_however_large() {
+        for dialect in DIALECTS.iter().filter(|d| d.is_written()) {
+            let (mut scene, mut bytes) = (sample(dialect.moves), Vec::new());
+            // Finite as a logarithm, infinite as a length; and colours whose sums swallow all others.
+            let params = &mut scene.layers[0].params;
+            params[GEOMETRY].set(7, LOG_SCALE, 1000.0);
+            (0..2).for_each(|k| params[SH].set(3 + k, 0, [3e38, -3e38][k]));
+            if dialect.write(&scene, &WriteOptions::default(), &mut bytes).is_err() {
+                continue;
+            }
+            let opened = dialect.open(&bytes).unwrap_or_else(|e| panic!("{dialect:?}: {e}"));
+            opened.scene.check_finite().unwrap_or_else(|e| panic!("{dialect:?}: {e}"));
         }
     }
 

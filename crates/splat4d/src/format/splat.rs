@@ -3,7 +3,7 @@
 //! position 3×f32, **linear** scale 3×f32, colour rgb u8 (½ + C0·f_dc, no view dependence), opacity u8, quaternion wxyz
 //! 4×u8 with (b − 128)/128. World axes as in .ply: y down. Source: antimatter15/splat (MIT).
 
-use super::bytes::{byte_of_dc, byte_of_logit, dc_of_byte, f32_at, logit_of_byte, sound_rows};
+use super::bytes::{byte_of_dc, byte_of_logit, dc_of_byte, f32_at, logit_of_byte, scale_of_log, sound_rows};
 use super::dialect::{Dialect, Opened, Writer, Y_DOWN};
 use super::warnings::Warnings;
 use crate::math::quat;
@@ -66,7 +66,7 @@ pub fn write(params: &Params, out: &mut impl Write) -> Result<Warnings> {
     let mut bytes = Vec::with_capacity(params.len() * ROW);
     let rows = sound_rows(params, &mut warnings);
     for &row in &rows {
-        let scale = geometry.read::<3>(row, LOG_SCALE).map(|s| s.exp().min(f32::MAX));
+        let scale = geometry.read::<3>(row, LOG_SCALE).map(scale_of_log);
         for x in geometry.read::<3>(row, 0).into_iter().chain(scale) {
             bytes.extend_from_slice(&x.to_le_bytes());
         }

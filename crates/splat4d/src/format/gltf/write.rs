@@ -2,7 +2,7 @@
 
 use super::container::File;
 use super::{ELLIPSE, EXTENSION, SPZ, SRGB, TYPES, coefficient, component};
-use crate::format::bytes::{SH_C0, sound_rows};
+use crate::format::bytes::{SH_C0, scale_of_log, sound_rows};
 use crate::format::dialect::Y_DOWN;
 use crate::format::{Warnings, spz};
 use crate::math::quat;
@@ -108,7 +108,7 @@ pub(super) fn plain(params: &Params) -> Result<(File<'static>, Warnings)> {
     mesh.add("COLOR_0", begin, 4, component::UNSIGNED_BYTE);
     mesh.accessors.last_mut().expect("it was added")["normalized"] = json!(true);
     mesh.floats(&format!("{EXTENSION}:ROTATION"), of().map(|row| rotation(params, row)));
-    mesh.floats(&format!("{EXTENSION}:SCALE"), of().map(|row| geometry.read::<3>(row, LOG_SCALE).map(f32::exp)));
+    mesh.floats(&format!("{EXTENSION}:SCALE"), of().map(|row| geometry.read::<3>(row, LOG_SCALE).map(scale_of_log)));
     mesh.floats(&format!("{EXTENSION}:OPACITY"), of().map(|row| [alpha(row)]));
     let mut first = 0;
     for degree in 0..(sh.width() / 3).isqrt() {

@@ -175,7 +175,8 @@ fn cells(sorted: &[f32]) -> Vec<f32> {
         let (_, cell) = all.swap_remove(widest);
         let middle = mean(&cell) as f32;
         let cut = cell.start + sorted[cell.clone()].partition_point(|x| *x <= middle);
-        match cut == cell.end {
+        // Nor is a cell cut whose mean, rounded, lies below all of its numbers: an empty cell has no mean.
+        match cut == cell.start || cut == cell.end {
             true => whole.push(cell),
             false => all.extend([cell.start..cut, cut..cell.end].map(|part| (spread(&part), part))),
         }

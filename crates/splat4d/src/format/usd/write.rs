@@ -2,6 +2,7 @@
 
 use super::{COEFFICIENTS, DEGREE, FIELD, OPACITIES, ORIENTATIONS, POSITIONS, SCALES};
 use crate::format::Warnings;
+use crate::format::bytes::scale_of_log;
 use crate::format::dialect::WriteOptions;
 use crate::layers::{Constant, HIDDEN, Scene};
 use crate::math::quat;
@@ -121,7 +122,7 @@ fn orientation(p: &Params, row: usize) -> [f32; 4] {
 }
 
 fn scales(p: &Params, row: usize) -> [f32; 3] {
-    p[GEOMETRY].read::<3>(row, LOG_SCALE).map(f32::exp)
+    p[GEOMETRY].read::<3>(row, LOG_SCALE).map(scale_of_log)
 }
 
 fn opacity(p: &Params, row: usize) -> f32 {
