@@ -461,6 +461,8 @@ fn options_are_checked_before_any_work() {
     let run = work.path().join("run");
     let recipe = work.path().join("mine.toml");
     std::fs::write(&recipe, "iteratons = 3\n").unwrap();
+    let empty = work.path().join("empty.toml");
+    std::fs::write(&empty, "").unwrap();
     let damaged = work.path().join("damaged.ply");
     std::fs::write(
         &damaged,
@@ -472,6 +474,7 @@ fn options_are_checked_before_any_work() {
         (&["train", capture, "--set", "iterations=many"], "integer"),
         (&["train", capture, "--set", "densify_untl_iter=3"], "`densify_until_iter`"),
         (&["train", capture, "--recipe", str(&recipe)], "`iterations`"),
+        (&["train", capture, "--recipe", str(&empty)], "is empty"),
         (&["train", capture, "--motion", "spacetim"], "`spacetime`"),
         (&["train", capture, "--hold-out", "camera=9"], "9"),
         (&["train", capture, "--hold-out", "cams=1"], "every=N"),

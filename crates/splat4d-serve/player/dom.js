@@ -2,6 +2,12 @@
 
 import { icon } from './icons.js';
 
+/** Characters that act instead of being shown: control characters but line breaks and tabs, directions of text (UAX #9). */
+const ACTING = /[^\P{Cc}\n\t]|[\u061C\u200E\u200F\u2028-\u202E\u2066-\u2069]/gu;
+
+/** Text of a foreign file with such characters spelt out (`\u{202e}`), as the command prints it. */
+export const shown = text => String(text).replace(ACTING, c => `\\u{${c.codePointAt(0).toString(16)}}`);
+
 /** An element with properties ('on…' are listeners, others attributes) and children. */
 export function h(tag, props = {}, ...children) {
   const node = document.createElement(tag);
@@ -10,7 +16,7 @@ export function h(tag, props = {}, ...children) {
     else if (value === true) node.setAttribute(key, '');
     else if (value !== false && value != null) node.setAttribute(key, value);
   }
-  node.append(...children.filter(c => c != null));
+  node.append(...children.filter(c => c != null).map(c => (typeof c === 'string' ? shown(c) : c)));
   return node;
 }
 

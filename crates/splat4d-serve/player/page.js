@@ -1,6 +1,7 @@
 // The page around the element: reads what to show, from the page itself or from the server next to it.
 
 import './element.js';
+import { shown } from './dom.js';
 
 async function config() {
   if (globalThis.SPLAT4D_CONFIG) return globalThis.SPLAT4D_CONFIG;
@@ -37,7 +38,7 @@ if (cameras) element.face.capture = { cameras, photos: photos ? './photo' : null
 if (autoplay && !token && !frusta && !matchMedia('(prefers-reduced-motion: reduce)').matches) element.setAttribute('autoplay', '');
 if (title) {
   element.setAttribute('heading', title);
-  document.title = `${title} · splat4d`;
+  document.title = `${shown(title)} · splat4d`;
 }
 if (live) {
   // A run that has just begun has no snapshot; the first one is announced.

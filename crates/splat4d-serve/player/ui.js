@@ -2,7 +2,7 @@
 
 import { CHANNELS, SPEED_RANGE } from './player.js';
 import { CHANNEL_NAMES, SPEEDS, cameraPanel, figuresCard, helpPage, readPath, viewPanel } from './panels.js';
-import { button, bytes, choice, clock, h, pick, retool, save, segments, tool } from './dom.js';
+import { button, bytes, choice, clock, h, pick, retool, save, segments, shown, tool } from './dom.js';
 import { clamp } from './camera.js';
 import { icon } from './icons.js';
 
@@ -288,8 +288,9 @@ export class Interface {
     } else this.posterBox.classList.remove('on');
   }
 
-  setTitle(text) {
-    this.title.textContent = text || '';
+  setTitle(given) {
+    const text = shown(given || '');
+    this.title.textContent = text;
     this.title.hidden = !text || this.embed;
     this.stage.setAttribute('aria-label', text ? `Scene: ${text}` : 'Scene');
   }

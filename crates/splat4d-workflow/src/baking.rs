@@ -286,6 +286,9 @@ pub fn bake_into(source: &Source, title: &str, out: &Path, baking: &Baking, cons
         "likeness": likeness, "needs": needs, "quantisation": quantised,
     });
     say(report, likeness.as_ref(), summary.bytes, seconds, console);
+    if report.primitives == 0 {
+        console.warn("no Gaussian of the scene is visible at any time of the clip: the file renders as background.");
+    }
     if let (Some(needs), Some(l)) = (needs, &likeness) {
         console.say(&needs.in_words(l.psnr, summary.bytes));
     }

@@ -229,7 +229,11 @@ fn recipe(args: &Args) -> anyhow::Result<Recipe> {
     let mut recipe = match &args.recipe {
         // What the capture is, is seen better than guessed: the library's default is one model.
         None => Recipe::default().with(|r| r.run.motion = MotionName::AUTO),
-        Some(path) => Recipe::from_toml(&files::read_text(path)?).map_err(|e| e.at(path.display()))?,
+        Some(path) => {
+            // An empty one, or one of the kernel that claims to be, would be the defaults without a word.
+            files::open(path)?;
+            Recipe::from_toml(&files::read_text(path)?).map_err(|e| e.at(path.display()))?
+        }
     };
     if let Some(quality) = args.quality {
         recipe = recipe.of_quality(quality);

@@ -257,7 +257,7 @@ test('the element works in a bare page: attributes, events, methods', options, a
       addEventListener('DOMContentLoaded', () => document.querySelector('splat-4d')
         .addEventListener(n, e => heard.push([n, e.detail])));</script>
     <splat-4d src="scene.s4d" time="2" speed="2" channel="alpha" backend="webgl2" background="#ff8000"
-      camera="0,1,6 0,1,0 30" heading="Bare" style="width:600px"></splat-4d>`;
+      camera="0,1,6 0,1,0 30" heading="Bare&#x202e;gpj" style="width:600px"></splat-4d>`;
   const { page, ask, done } = await open('bare');
   const drawn = await ask(e => ({ ...e.player.backend.drawn, bg: e.player.drawing(10, 10).background, t: e.currentTime,
     speed: e.player.speed, camera: e.camera, backend: e.player.backend.name, paused: e.paused,
@@ -266,6 +266,8 @@ test('the element works in a bare page: attributes, events, methods', options, a
   assert.deepEqual(drawn.camera.position, [0, 1, 6]);
   assert.equal(drawn.camera.fov, 30);
   near(drawn.height, 337.5, 0.6);
+  // Characters that would turn the text's direction are spelt out.
+  assert.equal(await ask(e => e.face.title.textContent), String.raw`Bare\u{202e}gpj`);
   drawn.bg.forEach((x, i) => near(x, [1, 128 / 255, 0][i]));
   const names = () => page.evaluate(() => window.heard.map(h => h[0]));
   assert.ok((await names()).includes('load'));

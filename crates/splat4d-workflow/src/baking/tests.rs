@@ -121,3 +121,23 @@ fn a_slow_model_is_baked_in_time() {
     let late = cooked(&slow, &Baking { deadline: none, ..Baking::default() });
     assert!(late.likeness.is_none() && playback::read(&late.packed.bytes).is_ok());
 }
+
+/// An edit may hide everything.
+#[test]
+fn a_file_without_a_visible_gaussian_is_written_with_a_warning() {
+    let mut hidden = source(&Leaps::default());
+    let geometry = &mut hidden.scene.layers[0].params[GEOMETRY];
+    (0..GAUSSIANS).for_each(|i| geometry.set(i, OPACITY, -20.0));
+    let folder = tempfile::tempdir().unwrap();
+    let (out, warned) = (folder.path().join("hidden.s4d"), std::cell::RefCell::new(String::new()));
+    let listen = |event: &crate::events::Event<'_>| {
+        if let crate::events::Event::Warning(text) = event {
+            warned.borrow_mut().push_str(text);
+        }
+    };
+    let baking = Baking { poster: false, ..Baking::default() };
+    let report = bake_into(&hidden, "hidden", &out, &baking, &listen).unwrap();
+    assert!(warned.borrow().contains("no Gaussian of the scene is visible"), "{}", warned.borrow());
+    assert_eq!(report["baking"]["primitives"], 0);
+    assert!(playback::read(&std::fs::read(&out).unwrap()).is_ok());
+}
