@@ -40,6 +40,8 @@ settings! {
         position_final: f64 = 0.0 => any().unit("extents");
         /// Share to which rates without a final value (colour, opacity, scale, rotation, lifespan) decay.
         decay: f64 = 1.0 => positive();
+        /// Share of the steps at the end over which all rates fall to a tenth; 0: they do not.
+        settle: f64 = 0.15 => share();
         /// Rate of base colour; higher SH degrees learn 20 times more slowly.
         feature: f64 = 6e-3 => positive();
         /// Rate of opacity logits.

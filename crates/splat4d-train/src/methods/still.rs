@@ -1,7 +1,7 @@
 //! `still`: one stage, every group of static 3DGS. Also the base that other programs add to.
 
 use super::auto::CaptureStats;
-use super::{CommonSettings, Group, Method, Rate, Stage, TrainContext};
+use super::{CommonSettings, Group, Method, Rate, Settling, Stage, TrainContext};
 use crate::capture::Agreement;
 use crate::loss::motion;
 use crate::loss::neighbourhood::Neighbourhood;
@@ -110,6 +110,7 @@ pub fn stage(name: &str, plan: &TrainContext) -> Stage {
     Stage {
         batch: plan.batch_size,
         groups: groups(c, plan.extent),
+        settling: Settling::last(c.rates.settle),
         probes,
         params,
         maintenance: c.maintenance(),
@@ -124,6 +125,18 @@ pub fn stage(name: &str, plan: &TrainContext) -> Stage {
 mod tests {
     use super::*;
     use crate::recipe::Recipe;
+
+    #[test]
+    fn rates_fall_over_the_last_part_of_a_run_and_of_its_stages() {
+        let of = |words: &[&str]| stage("still", &Recipe::of(words).unwrap().plan());
+        let near = |s: &Settling, at: &[(f64, f64)]| at.iter().all(|&(p, x)| (s.at(p) - x).abs() < 1e-12);
+        let whole = of(&["iterations=1000", "rates.settle=0.2"]);
+        assert!(near(&whole.settling, &[(0.0, 1.0), (0.8, 1.0), (0.9, 0.55), (1.0, 0.1)]));
+        assert!(near(&of(&["rates.settle=0"]).settling, &[(0.5, 1.0), (1.0, 1.0)]));
+        assert!(near(&whole.part(0, 500).settling, &[(0.0, 1.0), (1.0, 1.0)]), "before it begins");
+        let last = of(&["iterations=1000", "rates.settle=0.2"]).part(500, 1000);
+        assert!(near(&last.settling, &[(0.6, 1.0), (0.8, 0.55), (1.0, 0.1)]));
+    }
 
     #[test]
     fn many_gaussians_take_smaller_steps_unless_set() {
