@@ -31,7 +31,6 @@ use crate::train_state::RefineSettings;
 pub use chunks::ChunkSettings;
 pub use quality::Quality;
 pub use run::{MotionName, RunSettings};
-pub use text::UnusedSetting;
 
 macro_rules! recipe {
     ($($table:ident: $settings:ty,)*) => {

@@ -70,7 +70,8 @@ pub mod render;
 pub mod scene;
 pub mod simd;
 pub mod text;
-pub mod wgsl;
+#[cfg(any(test, feature = "gpu"))]
+mod wgsl;
 
 pub use error::{Error, ErrorKind, Result};
 pub use format::open;

@@ -8,8 +8,10 @@ mod masks;
 mod pictures;
 
 pub use capture::{Placed, Poses, Recording, capture};
-pub use masks::{Begin, Masks, masks};
-pub use pictures::{Clip, Format, Pictures, Shot, camera_names, pictures};
+pub use masks::Masks;
+pub(crate) use masks::{Begin, masks};
+pub(crate) use pictures::{Clip, camera_names, pictures};
+pub use pictures::{Format, Pictures, Shot};
 
 #[cfg(test)]
 mod tests;

@@ -58,8 +58,7 @@ pub(crate) use flow::{FlowFile, to_picture as flow_picture};
 pub use lens::Distortion;
 pub use n3dv::{about_rows, rows_of};
 pub use options::{
-    Borders, CaptureOptions, CaptureSettings, Exif, FlowSource, HoldOut, Lenses, MAX_POINTS, Sequence, Text, Times,
-    Unregistered,
+    Borders, CaptureOptions, CaptureSettings, Exif, FlowSource, HoldOut, Lenses, Sequence, Text, Times, Unregistered,
 };
 pub use points::PointCloud;
 pub use posed::{PosedCamera, check_intrinsics, colmap_cameras, is_colmap, rigid, transforms_cameras};
