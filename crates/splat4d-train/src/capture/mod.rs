@@ -78,6 +78,30 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+/// A reader: the capture's folder and the marker file that was found, to what the files say.
+type Reader = fn(&Path, &Path, &CaptureOptions) -> Result<RawCapture>;
+
+/// The list of layouts: a reader is its file, its name in [`CaptureKind`] and an entry here. Marker files (or folders) in the
+/// order in which they are looked for, with their readers.
+const READERS: &[(&str, Reader)] = &[
+    ("capture.json", own::read),
+    (transforms::TRAIN, transforms::read),
+    ("train_meta.json", panoptic::read),
+    (transforms::ALL, transforms::read),
+    (nerfies::MARKER, nerfies::read),
+    (layout::BOUNDS, layout::read_bounds),
+    (colmap::SPARSE, colmap::read),
+    (colmap::NESTED, colmap::read),
+    (colmap::MULTIVIEW, colmap::read),
+    ("cameras.bin", colmap::read),
+    ("cameras.txt", colmap::read),
+    (colmap::COLMAP, colmap::read),
+    (colmap::WORKSPACES[0], colmap::read),
+    (colmap::WORKSPACES[1], colmap::read),
+    (colmap::WORKSPACES[2], colmap::read),
+    (colmap::WORKSPACES[3], colmap::read),
+];
+
 /// Which layout a capture was read from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
