@@ -5,9 +5,10 @@ use crate::errors::{OrRaise, bad_input};
 use numpy::PyUntypedArrayMethods;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use splat4d::backward::sh_grads;
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::sh::MAX_COEFFS;
-use splat4d::render::{Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Shot, sh_grads};
+use splat4d::render::{Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Shot};
 use splat4d::scene::{Camera, Grads, Params, Planes, SH, Time};
 use std::sync::{Arc, Mutex};
 

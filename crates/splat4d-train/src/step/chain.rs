@@ -10,9 +10,10 @@ pub(crate) use crate::loss::image::{ImageTerm, View};
 pub(crate) use crate::loss::terms::{ParamLoss, Probe, ProbeLoss, StepInfo};
 pub(crate) use crate::train_state::Observation;
 use crate::train_state::StepGrads;
+use splat4d::backward::sh_grads;
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::Real;
-use splat4d::render::{Backend, Image, RenderGrads, Shot, Target, sh_grads};
+use splat4d::render::{Backend, Image, RenderGrads, Shot, Target};
 use splat4d::scene::{Grads, Rows, Space, Table, Time};
 use std::time::{Duration, Instant as Clock};
 

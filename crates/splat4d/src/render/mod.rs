@@ -27,7 +27,6 @@ pub mod project;
 pub mod rasterize;
 mod resident;
 pub mod roofline;
-mod scene_grads;
 pub mod shade;
 #[cfg(test)]
 mod tests;
@@ -43,7 +42,6 @@ pub use resident::{
     KEPT, Moves, Resident, ResidentCameras, ResidentLayer, ResidentNoise, ResidentNumbers, ResidentRule, ResidentStep,
     ResidentStepped, ResidentTable, ResidentTies, ResidentView, RowWeights,
 };
-pub use scene_grads::sh_grads;
 
 use crate::math::Real;
 use crate::scene::{HeadGrads, Planes, Table};

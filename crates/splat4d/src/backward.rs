@@ -1,9 +1,9 @@
 //! From the gradients to splats to those of a scene's tables: the last part of a differentiable render, for training and for
-//! whoever has a loss of their own.
+//! losses from outside.
 
-use super::RenderGrads;
 use crate::layers::{Evaluation, Scene};
 use crate::math::Real;
+use crate::render::RenderGrads;
 use crate::scene::{Color, Grads, Part, SH, Space, Splats, Table, Time};
 
 /// By part, the gradient of the layer's own SH table, where that table is the colour: what a renderer's VJP adds to directly.
