@@ -41,7 +41,7 @@ pub enum Moves {
 
 impl Moves {
     /// Blocks of spherical harmonics in the layer's SH table.
-    pub(crate) fn blocks(&self) -> usize {
+    pub fn blocks(&self) -> usize {
         if let Self::Sliced { harmonics, .. } = self { harmonics + 1 } else { 1 }
     }
 }
