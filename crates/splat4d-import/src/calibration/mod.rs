@@ -1,7 +1,7 @@
 //! Calibrations of other programs: lenses and poses.
 //!
 //! A dialect is a file here and a line in the list; the content of a file identifies its dialect. Names of cameras are
-//! matched with names of videos ([`assign`]). The result is `cam_from_world` in OpenCV axes, and pixels whose first
+//! matched with names of videos (`assign`). The result is `cam_from_world` in OpenCV axes, and pixels whose first
 //! centre is at 0.5.
 
 mod capture;

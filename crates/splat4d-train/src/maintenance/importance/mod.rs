@@ -1,4 +1,4 @@
-//! Importance of Gaussians: which to keep ([`score()`], `prune`) and which to render when (`key_masks`).
+//! Importance of Gaussians: which to keep (`score()`, `prune`) and which to render when (`key_masks`).
 //!
 //! After 4DGS-1K (Yuan et al. 2025), for layers of any motion model: the importance of a Gaussian is its effect on the
 //! training images, combined with its lifespan. Nothing is learned here; a scene recovers by further training.

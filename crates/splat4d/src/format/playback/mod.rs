@@ -1,7 +1,7 @@
 //! The playback file `.s4d`: a dynamic scene, small, readable in parts, checked. docs/format.md is its specification.
 //!
 //! [`write()`] takes a [`Draft`] (floats, sorted into time spans by the baker), orders, quantises and packs it.
-//! [`Index::parse`] reads the start of a file, `decode_page` and [`decode_palette`] any section by itself, and
+//! [`Index::parse`] reads the start of a file, `decode_page` and `decode_palette` any section by itself, and
 //! [`read()`] a whole file as a scene of one layer per page.
 
 mod block;
