@@ -7,6 +7,9 @@ mod imports;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
+#[path = "tidy/surface.rs"]
+mod surface;
+
 #[path = "tidy/words.rs"]
 mod words;
 

@@ -119,7 +119,7 @@ impl Camera {
     }
 
     /// Notes an offset that was found; the user's stays.
-    pub fn found_offset(&mut self, offset: &Offset) {
+    pub(crate) fn found_offset(&mut self, offset: &Offset) {
         if self.keep_offset {
             return;
         }
@@ -129,7 +129,7 @@ impl Camera {
     }
 
     /// Notes a lens that was found; the user's stays.
-    pub fn found_lens(&mut self, intrinsics: &Intrinsics, lens: &Lens) {
+    pub(crate) fn found_lens(&mut self, intrinsics: &Intrinsics, lens: &Lens) {
         if self.keep_lens {
             return;
         }
@@ -152,7 +152,7 @@ impl Camera {
     }
 
     /// The lens that the user gives.
-    pub fn given_lens(&self) -> Option<(Intrinsics, Lens)> {
+    pub(crate) fn given_lens(&self) -> Option<(Intrinsics, Lens)> {
         self.lens.as_ref().filter(|_| self.keep_lens).map(Intrinsic::lens)
     }
 
@@ -251,7 +251,7 @@ impl Corrections {
     }
 
     /// Writes the file into a capture's folder.
-    pub fn write(&self, folder: &Path) -> Result<()> {
+    pub(crate) fn write(&self, folder: &Path) -> Result<()> {
         let body = toml::to_string(self).expect("corrections are plain data");
         write_atomically(&folder.join(FILE), format!("{HEAD}{body}").as_bytes())
     }

@@ -16,7 +16,7 @@ const VIDEOS: [&str; 5] = ["mp4", "mov", "mkv", "avi", "webm"];
 /// Pixels of the shorter side that frames have at most. Sides are divided by a whole number, so that intrinsics scale
 /// exactly: Neural 3D Video's 2704x2028 become the 1352x1014 that its papers train on.
 const SIDE: usize = 1080;
-/// Folder of the notes that [`write::pictures`] keeps of what it stored.
+/// Folder of the notes that `write::pictures` keeps of what it stored.
 const NOTES: &str = "import";
 
 /// What was extracted.

@@ -5,10 +5,11 @@ use crate::errors::{OrRaise, bad_input};
 use numpy::PyUntypedArrayMethods;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use splat4d::backward::sh_grads;
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::sh::MAX_COEFFS;
 use splat4d::render::{Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Shot};
-use splat4d::scene::{Camera, Color, Grads, Params, Planes, SH, Table, Time};
+use splat4d::scene::{Camera, Grads, Params, Planes, SH, Time};
 use std::sync::{Arc, Mutex};
 
 /// Rows and numbers of the arrays of parameters that hold no coefficients of spherical harmonics.
@@ -182,31 +183,13 @@ impl Rendering {
                 let splats = scene.splats(seen);
                 let shot = Shot { depth: true, ..Shot::new(&splats, &self.camera, self.background) };
                 let pixels = ImageGrads { color: &color, alpha: alpha.as_ref(), depth: depth.as_ref(), extra: None };
-                let own = splats.parts.iter().map(|p| matches!(p.color, Color::Sh { base: true, .. }));
-                let mut d_sh: Vec<Option<&mut Table<f32>>> = grads
-                    .iter_mut()
-                    .zip(own)
-                    .map(|(g, own)| {
-                        own.then(|| {
-                            let [t] = g.of([SH]);
-                            t
-                        })
-                    })
-                    .collect();
+                let mut d_sh = sh_grads(&splats, &mut grads);
                 renderer.backward(&shot, &pixels, &mut d_sh, &mut d);
-            }
-            if let (Some((layer, keys)), Some(head)) = (scene.head_keys(), &d.head) {
-                let [first, second] = grads[layer].of([keys.first, keys.second]);
-                first.data_mut().iter_mut().zip(&head.first).for_each(|(d, x)| *d += *x);
-                second.data_mut().iter_mut().zip(&head.second).for_each(|(d, x)| *d += *x);
             }
             // The same answers take another gradient when this is called again.
             scene.at(self.time, seen);
             seen.activate(&mut grads);
-            for (layer, part) in d.parts.iter_mut().enumerate() {
-                let i = seen.find(layer, splat4d::scene::Space::Gaussians, self.time).expect("every layer was asked");
-                seen.add_gradient(i, &mut part.out, &mut part.color, &mut part.weights);
-            }
+            d.add_to(scene, self.time, seen, &mut grads);
             seen.backward(&scene.layers, &mut grads);
             (grads, seen.d_time(self.time), d)
         });

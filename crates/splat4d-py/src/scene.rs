@@ -279,7 +279,7 @@ impl Scene {
         let Some(kind) = Channel::named(channel) else {
             return Err(bad_input(
                 format!("there is no channel `{channel}`"),
-                "Give color, alpha, depth, flow, velocity, normal, label, feature, life or uncertainty",
+                &format!("Give one of: {}", Channel::ALL.map(Channel::name).join(", ")),
             ));
         };
         let device = named(device)?;

@@ -4,7 +4,7 @@ use serde::{Deserialize, Deserializer, Serializer};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
-/// Begins the text of a path that is not UTF-8; what follows has its bytes as [`escaped`] does.
+/// Begins the text of a path that is not UTF-8; what follows has its bytes as `escaped` does.
 const BYTES: &str = "%bytes:";
 
 /// The path as text from which [`of_text`] makes the path again: itself where it is UTF-8.
@@ -44,7 +44,7 @@ pub fn lossy<S: Serializer>(path: &Path, to: S) -> Result<S::Ok, S::Error> {
 }
 
 /// A path in printable ASCII: other bytes, and `%`, as `%XX`. `None`: the system has no bytes of it.
-pub fn escaped(path: &Path) -> Option<String> {
+pub(crate) fn escaped(path: &Path) -> Option<String> {
     #[cfg(unix)]
     let bytes = std::os::unix::ffi::OsStrExt::as_bytes(path.as_os_str());
     #[cfg(not(unix))]
@@ -61,8 +61,8 @@ pub fn escaped(path: &Path) -> Option<String> {
     Some(line)
 }
 
-/// The path of a text that [`escaped`] made; `None`: it did not.
-pub fn of_escaped(line: &str) -> Option<PathBuf> {
+/// The path of a text that `escaped` made; `None`: it did not.
+pub(crate) fn of_escaped(line: &str) -> Option<PathBuf> {
     let mut bytes = Vec::with_capacity(line.len());
     let mut rest = line.as_bytes();
     while let Some((&b, after)) = rest.split_first() {

@@ -20,10 +20,7 @@ mod text;
 use crate::capture::CaptureSettings;
 use crate::init::InitSettings;
 use crate::loss::{LossSettings, TransportSettings};
-use crate::maintenance::{
-    AdcSettings, DensifySettings, FloaterSettings, GuidedSettings, LEAST, McmcSettings, MergeSettings,
-    OpacityResetSettings, PruneSettings, RelocateSettings, SplitSettings,
-};
+use crate::maintenance::{DensifySettings, LEAST, RelocateSettings, operations};
 use crate::methods::{AppearanceSettings, LifeSettings, RateSettings, methods, still};
 use crate::settings::Table;
 use crate::step::replans::ScheduleChanges;
@@ -31,7 +28,6 @@ use crate::train_state::RefineSettings;
 pub use chunks::ChunkSettings;
 pub use quality::Quality;
 pub use run::{MotionName, RunSettings};
-pub use text::UnusedSetting;
 
 macro_rules! recipe {
     ($($table:ident: $settings:ty,)*) => {
@@ -56,7 +52,12 @@ macro_rules! recipe {
     };
 }
 
-methods! { tables recipe {
+// The tables of motion models and of maintenance are listed where these are; here they get their place.
+macro_rules! with_maintenance {
+    ($($tables:tt)*) => { operations! { tables recipe { $($tables)* } { chunks: ChunkSettings, } } };
+}
+
+methods! { tables with_maintenance {
     run: RunSettings,
     capture: CaptureSettings,
     init: InitSettings,
@@ -67,17 +68,6 @@ methods! { tables recipe {
 } {
     transport: TransportSettings,
     loss: LossSettings,
-    densify: DensifySettings,
-    adc: AdcSettings,
-    opacity_reset: OpacityResetSettings,
-    mcmc: McmcSettings,
-    relocate: RelocateSettings,
-    guided: GuidedSettings,
-    floaters: FloaterSettings,
-    prune: PruneSettings,
-    merge: MergeSettings,
-    split: SplitSettings,
-    chunks: ChunkSettings,
 } }
 
 impl Recipe {

@@ -7,7 +7,8 @@ mod value;
 mod when;
 
 pub(crate) use value::{Choice, Value, among};
-pub use when::{When, is_off};
+pub use when::When;
+pub(crate) use when::is_off;
 
 /// One setting, for help, documents and checks.
 #[derive(Clone, Debug)]

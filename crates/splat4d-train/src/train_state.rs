@@ -7,7 +7,8 @@
 mod corrections;
 mod exposure;
 
-pub use corrections::{Corrections, RefineSettings, Scale};
+pub(crate) use corrections::Scale;
+pub use corrections::{Corrections, RefineSettings};
 pub(crate) use corrections::{Origin, SearchDue, StepGrads, moved, zoomed};
 pub(crate) use exposure::Exposure;
 
@@ -36,7 +37,7 @@ const STATS_COLUMNS: [(&str, usize); 3] = [("gradient_sum", 1), ("gradient_count
 
 /// Statistics of every Gaussian since the last densification.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Stats {
+pub(crate) struct Stats {
     /// One a layer, [N, 3]: sum of |dL/dmean2d| (NDC units), number of views that drew it, largest radius (pixels).
     pub tables: Vec<Table<f32>>,
 }
@@ -61,7 +62,7 @@ impl Stats {
     }
 
     /// Mean gradient of a row, 0 where never drawn.
-    pub fn gradient(&self, layer: usize, row: usize) -> f32 {
+    pub(crate) fn gradient(&self, layer: usize, row: usize) -> f32 {
         let [sum, count] = self.tables[layer].read::<2>(row, 0);
         if count > 0.0 { sum / count } else { 0.0 }
     }
@@ -159,7 +160,7 @@ impl TrainState {
     }
 
     /// Statistics of Gaussians since the last densification.
-    pub fn stats(&self) -> &Stats {
+    pub(crate) fn stats(&self) -> &Stats {
         &self.stats
     }
 

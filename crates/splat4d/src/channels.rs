@@ -12,7 +12,7 @@ use crate::scene::{Camera, Table, Time, features, labels};
 /// The least gap between the two smallest variances, as a share of the largest, at which the shortest axis is one.
 const LEAST_GAP: f64 = 1e-3;
 /// Standard deviation of a pixel's error that [`uncertainties`] takes for granted: images of 26 dB.
-pub const PIXEL_NOISE: f64 = 0.05;
+pub(crate) const PIXEL_NOISE: f64 = 0.05;
 
 /// Unit normals, the shortest axes of the splats turned towards the camera, in camera axes (x right, y down, z forward):
 /// [splats, 4], x, y, z and 1; zeros where no axis is the shortest.
@@ -128,7 +128,7 @@ pub struct Witness<'a> {
 
 /// The standard deviation of each Gaussian's place that its images leave open, scene units, by layer and row:
 /// √(tr (Σ_views H/σ² + I/ρ²)⁻¹ / 3), H the mean's 3x3 block of the Fisher information of an image
-/// ([`Sensitivity::fisher`](crate::render::Sensitivity::fisher)), σ [`PIXEL_NOISE`] and ρ `reach`, how far a Gaussian may be
+/// ([`Sensitivity::fisher`](crate::render::Sensitivity::fisher)), σ `PIXEL_NOISE` and ρ `reach`, how far a Gaussian may be
 /// from where it is when no image shows it. Each witness stands for `share` images. Other Gaussians are taken for
 /// known,
 /// so that it says too little where several could explain a pixel.

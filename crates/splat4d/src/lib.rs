@@ -39,6 +39,7 @@
 //! | `motion/deform/`, `motion/control/`, `motion/skin/`, `motion/ssm/`, `motion/native4d/`, `motion/filtered/`, `motion/edited/` | parts of the larger models |
 //! | `layers/` | `Layer` (model, then lifespan, then frame), `Scene` (sum of layers), `Evaluation` (the scene at several times: queries, results and backward pass); position in the world (`frame.rs`), cross-fades, one time as plain Gaussians (`freeze.rs`), `native4d` to `spacetime` (`convert.rs`), other axes (`rotate.rs`) |
 //! | `render/` | project, shade, bin, rasterize, each with its VJP; records of a bin (`gather.rs`), blending forward and backward (`blend.rs`); traits of renderers (`backend.rs`) and of devices that keep a scene's tables (`resident.rs`); pixel networks (`head.rs`); contribution, removal and sensitivity of each splat in one pass (`importance.rs`); the slow f64 definition (`oracle.rs`); lower bounds (`roofline.rs`) and pair counts (`count.rs`) |
+//! | `backward.rs` | from the gradients of splats to those of a scene's tables: the end of a differentiable render |
 //! | `gpu/` | the same stages in WGSL (feature `gpu`), backward pass in `back.rs`, loss in `compare.rs` on images that `pictures.rs` keeps, kernel constants of a sweep in `tuning.rs`, lower bounds in `roofline.rs`; each kernel is tested against its CPU twin |
 //! | `gpu/resident/` | whole steps on tables that stay on the GPU: kernel parameters, ties of poses, camera colours, steps in flight and their repetition, films |
 //! | `device.rs`, `device/` | selects the rendering device and reports why; routes unsupported work to the CPU and falls back to it when the GPU fails; which layers a device keeps |
@@ -52,6 +53,7 @@
 //! | `play.rs`, `play/` | plays a scene or file on the CPU: active set, pages within a memory budget |
 //! | `edit/` | a list of steps: selections as text (`select.rs`), their evaluation over time (`look.rs`), effects on layers (`act.rs`), time windows and clocks (`clock.rs`), dragging (`drag.rs`) |
 
+pub mod backward;
 pub mod bake;
 pub mod channels;
 pub mod device;
@@ -70,7 +72,8 @@ pub mod render;
 pub mod scene;
 pub mod simd;
 pub mod text;
-pub mod wgsl;
+#[cfg(any(test, feature = "gpu"))]
+mod wgsl;
 
 pub use error::{Error, ErrorKind, Result};
 pub use format::open;

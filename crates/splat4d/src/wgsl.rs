@@ -4,80 +4,78 @@
 //! names its twin in Rust, its buffers and what a thread owns.
 
 /// `struct View`, `Cov`, `Ellipse`; `covariance`, `project`: twin of `render::project`. No bindings.
-pub const PROJECT: &str = include_str!("render/project.wgsl");
-/// `BlockHeader`, `Gaussian`; `life_at`, `gaussian`: a playback file's words at time t (docs/format.md). No bindings.
-pub const RESIDENT: &str = include_str!("format/playback/resident.wgsl");
+pub(crate) const PROJECT: &str = include_str!("render/project.wgsl");
 /// `sh_basis`: twin of `math::sh::basis`. No bindings.
-pub const SHADE: &str = include_str!("render/shade.wgsl");
+pub(crate) const SHADE: &str = include_str!("render/shade.wgsl");
 /// One stable pass of a radix sort over (key, value) pairs: `histogram`, `scan`, `scatter`. Bindings in its header.
-pub const SORT: &str = include_str!("gpu/sort.wgsl");
-/// The last dispatch of such a pass with subgroups: `scatter_subgroup`. After [`SORT`].
-pub const SORT_SUBGROUP: &str = include_str!("gpu/sort_subgroup.wgsl");
-/// A row of a scene's tables → shape, colour, mark. After [`PROJECT`] and [`SHADE`].
-pub const SPLATS: &str = include_str!("gpu/splats.wgsl");
+pub(crate) const SORT: &str = include_str!("gpu/sort.wgsl");
+/// The last dispatch of such a pass with subgroups: `scatter_subgroup`. After `SORT`.
+pub(crate) const SORT_SUBGROUP: &str = include_str!("gpu/sort_subgroup.wgsl");
+/// A row of a scene's tables → shape, colour, mark. After `PROJECT` and `SHADE`.
+pub(crate) const SPLATS: &str = include_str!("gpu/splats.wgsl");
 /// Exclusive sums, and the sizes of later dispatches.
-pub const SCAN: &str = include_str!("gpu/scan.wgsl");
+pub(crate) const SCAN: &str = include_str!("gpu/scan.wgsl");
 /// Visible splats as (depth, number) pairs.
-pub const COMPACT: &str = include_str!("gpu/compact.wgsl");
-/// `project_back`: twin of `render::project`'s VJP. After [`PROJECT`]. No bindings.
-pub const PROJECT_BACK: &str = include_str!("render/project_back.wgsl");
-/// (tile, splat) pairs: `count`, `emit`. After [`PROJECT`].
-pub const TILES: &str = include_str!("gpu/tiles.wgsl");
+pub(crate) const COMPACT: &str = include_str!("gpu/compact.wgsl");
+/// `project_back`: twin of `render::project`'s VJP. After `PROJECT`. No bindings.
+pub(crate) const PROJECT_BACK: &str = include_str!("render/project_back.wgsl");
+/// (tile, splat) pairs: `count`, `emit`. After `PROJECT`.
+pub(crate) const TILES: &str = include_str!("gpu/tiles.wgsl");
 /// Start and end of each tile's list.
-pub const RANGES: &str = include_str!("gpu/ranges.wgsl");
-/// Blends to colour, alpha and depth. After [`PROJECT`].
-pub const RASTERIZE: &str = include_str!("gpu/rasterize.wgsl");
-/// Planes → 8 bits a channel. After [`PROJECT`].
-pub const BYTES: &str = include_str!("gpu/bytes.wgsl");
-/// What both ways back of the blend share. After [`PROJECT`].
-pub const BLEND_BACK: &str = include_str!("gpu/blend_back.wgsl");
-/// Sums over subgroups. After [`BLEND_BACK`].
-pub const SUBGROUP_SUMS: &str = include_str!("gpu/subgroup_sums.wgsl");
-/// The blend's backward pass with subgroups. After [`SUBGROUP_SUMS`].
-pub const RASTERIZE_BACK_SUBGROUP: &str = include_str!("gpu/rasterize_back_subgroup.wgsl");
-/// The same with pixels in vectors. After [`SUBGROUP_SUMS`].
-pub const RASTERIZE_BACK_VECTOR: &str = include_str!("gpu/rasterize_back_vector.wgsl");
-/// The blend's backward pass: a record a (tile, splat) pair. After [`BLEND_BACK`].
-pub const RASTERIZE_BACK: &str = include_str!("gpu/rasterize_back.wgsl");
+pub(crate) const RANGES: &str = include_str!("gpu/ranges.wgsl");
+/// Blends to colour, alpha and depth. After `PROJECT`.
+pub(crate) const RASTERIZE: &str = include_str!("gpu/rasterize.wgsl");
+/// Planes → 8 bits a channel. After `PROJECT`.
+pub(crate) const BYTES: &str = include_str!("gpu/bytes.wgsl");
+/// What both ways back of the blend share. After `PROJECT`.
+pub(crate) const BLEND_BACK: &str = include_str!("gpu/blend_back.wgsl");
+/// Sums over subgroups. After `BLEND_BACK`.
+pub(crate) const SUBGROUP_SUMS: &str = include_str!("gpu/subgroup_sums.wgsl");
+/// The blend's backward pass with subgroups. After `SUBGROUP_SUMS`.
+pub(crate) const RASTERIZE_BACK_SUBGROUP: &str = include_str!("gpu/rasterize_back_subgroup.wgsl");
+/// The same with pixels in vectors. After `SUBGROUP_SUMS`.
+pub(crate) const RASTERIZE_BACK_VECTOR: &str = include_str!("gpu/rasterize_back_vector.wgsl");
+/// The blend's backward pass: a record a (tile, splat) pair. After `BLEND_BACK`.
+pub(crate) const RASTERIZE_BACK: &str = include_str!("gpu/rasterize_back.wgsl");
 /// An image compared with its truth: L1, D-SSIM and their gradient: `moments`, `gradient`.
-pub const LOSS: &str = include_str!("gpu/loss.wgsl");
+pub(crate) const LOSS: &str = include_str!("gpu/loss.wgsl");
 /// Learnable rows at time t, and their lives. Reads `params`, which the including shader binds.
-pub const LEARNT: &str = include_str!("gpu/learnt.wgsl");
-/// Writes a row's gradients. After [`LEARNT`].
-pub const PUT: &str = include_str!("gpu/put.wgsl");
+pub(crate) const LEARNT: &str = include_str!("gpu/learnt.wgsl");
+/// Writes a row's gradients. After `LEARNT`.
+pub(crate) const PUT: &str = include_str!("gpu/put.wgsl");
 /// Cosines, logarithms, random numbers. No bindings.
-pub const NUMBERS: &str = include_str!("gpu/numbers.wgsl");
-/// A Gaussian of space and time, sliced. After [`LEARNT`] and [`NUMBERS`].
-pub const SLICE: &str = include_str!("gpu/slice.wgsl");
-/// Rows of such Gaussians → splats. After [`SLICE`].
-pub const SLICE_ANSWER: &str = include_str!("gpu/slice_answer.wgsl");
-/// Gradients of splats → those of such rows. After [`SLICE`] and [`PUT`].
-pub const SLICE_BACK: &str = include_str!("gpu/slice_back.wgsl");
-/// Losses on rows: `count_rows`, `row_losses`. After [`LEARNT`] and [`NUMBERS`].
-pub const ROW_LOSSES: &str = include_str!("gpu/row_losses.wgsl");
-/// What holds the poses of a tracked frame: `turns_of`, `hold`. After [`LEARNT`].
-pub const TIES: &str = include_str!("gpu/ties.wgsl");
-/// Noise on positions. After [`LEARNT`] and [`NUMBERS`].
-pub const SHAKE: &str = include_str!("gpu/shake.wgsl");
-/// Rows that stay on the GPU → splats. After [`LEARNT`].
-pub const ANSWER: &str = include_str!("gpu/answer.wgsl");
-/// Gradients of splats → those of rows. After [`LEARNT`] and [`PUT`].
-pub const ANSWER_BACK: &str = include_str!("gpu/answer_back.wgsl");
-/// Gradients of colours → those of SH and means, and statistics. After [`PROJECT`], [`SHADE`] and [`LEARNT`].
-pub const COLORS_BACK: &str = include_str!("gpu/colors_back.wgsl");
+pub(crate) const NUMBERS: &str = include_str!("gpu/numbers.wgsl");
+/// A Gaussian of space and time, sliced. After `LEARNT` and `NUMBERS`.
+pub(crate) const SLICE: &str = include_str!("gpu/slice.wgsl");
+/// Rows of such Gaussians → splats. After `SLICE`.
+pub(crate) const SLICE_ANSWER: &str = include_str!("gpu/slice_answer.wgsl");
+/// Gradients of splats → those of such rows. After `SLICE` and `PUT`.
+pub(crate) const SLICE_BACK: &str = include_str!("gpu/slice_back.wgsl");
+/// Losses on rows: `count_rows`, `row_losses`. After `LEARNT` and `NUMBERS`.
+pub(crate) const ROW_LOSSES: &str = include_str!("gpu/row_losses.wgsl");
+/// What holds the poses of a tracked frame: `turns_of`, `hold`. After `LEARNT`.
+pub(crate) const TIES: &str = include_str!("gpu/ties.wgsl");
+/// Noise on positions. After `LEARNT` and `NUMBERS`.
+pub(crate) const SHAKE: &str = include_str!("gpu/shake.wgsl");
+/// Rows that stay on the GPU → splats. After `LEARNT`.
+pub(crate) const ANSWER: &str = include_str!("gpu/answer.wgsl");
+/// Gradients of splats → those of rows. After `LEARNT` and `PUT`.
+pub(crate) const ANSWER_BACK: &str = include_str!("gpu/answer_back.wgsl");
+/// Gradients of colours → those of SH and means, and statistics. After `PROJECT`, `SHADE` and `LEARNT`.
+pub(crate) const COLORS_BACK: &str = include_str!("gpu/colors_back.wgsl");
 /// What a step leaves of itself: `view_sums`, `cameras`, `record`.
-pub const RECORD: &str = include_str!("gpu/record.wgsl");
+pub(crate) const RECORD: &str = include_str!("gpu/record.wgsl");
 /// A step of Adam on one table.
-pub const ADAM: &str = include_str!("gpu/adam.wgsl");
+pub(crate) const ADAM: &str = include_str!("gpu/adam.wgsl");
 /// A splat's records added up.
-pub const GATHER: &str = include_str!("gpu/gather.wgsl");
-/// Those sums → gradients of Gaussians and pose. After [`PROJECT`] and [`PROJECT_BACK`].
-pub const SPLATS_BACK: &str = include_str!("gpu/splats_back.wgsl");
+pub(crate) const GATHER: &str = include_str!("gpu/gather.wgsl");
+/// Those sums → gradients of Gaussians and pose. After `PROJECT` and `PROJECT_BACK`.
+pub(crate) const SPLATS_BACK: &str = include_str!("gpu/splats_back.wgsl");
 
 /// The blend's arithmetic alone, to measure.
-pub const ROOFLINE: &str = include_str!("gpu/roofline.wgsl");
+pub(crate) const ROOFLINE: &str = include_str!("gpu/roofline.wgsl");
 /// A copy, to measure.
-pub const COPY: &str = include_str!("gpu/copy.wgsl");
+pub(crate) const COPY: &str = include_str!("gpu/copy.wgsl");
 
 #[cfg(test)]
 mod tests {

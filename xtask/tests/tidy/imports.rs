@@ -9,8 +9,8 @@ const ORDER: [(&str, &[&str]); 9] = [
     (
         "crates/splat4d",
         &[
-            "error", "text", "wgsl", "simd", "math", "scene", "nn", "motion", "layers", "render", "gpu", "device",
-            "flow", "channels", "format", "bake", "play", "edit",
+            "error", "text", "wgsl", "simd", "math", "scene", "nn", "motion", "layers", "render", "backward", "gpu",
+            "device", "flow", "channels", "format", "bake", "play", "edit",
         ],
     ),
     (

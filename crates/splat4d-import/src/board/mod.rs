@@ -90,7 +90,7 @@ impl FromStr for Board {
 
 /// A tag in an image.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Tag {
+pub(crate) struct Tag {
     /// Its number in its family.
     pub id: usize,
     /// Pixels of the dark square's corners: from the first bit's on, as the hands of a clock go when the tag is looked at.
@@ -98,7 +98,7 @@ pub struct Tag {
 }
 
 /// The tags of a family in a grey image, by number; those that are there twice are left out.
-pub fn tags(picture: &Planes<f32>, family: &Family) -> Vec<Tag> {
+pub(crate) fn tags(picture: &Planes<f32>, family: &Family) -> Vec<Tag> {
     let codes = family.codes();
     let mut found: Vec<Tag> =
         quads::quads(picture).iter().filter_map(|corners| family.read(picture, corners, &codes)).collect();

@@ -5,7 +5,7 @@ use splat4d::{Error, Result};
 
 /// A video that a camera is looked for.
 #[derive(Clone, Copy, Debug)]
-pub struct Video<'a> {
+pub(crate) struct Video<'a> {
     /// Its name.
     pub name: &'a str,
     /// Pixels across and down of its upright images.
@@ -18,7 +18,7 @@ pub struct Video<'a> {
 /// number in the video's name. Never by order alone.
 ///
 /// Errors: a video without a camera; names that fit several.
-pub fn assign(calibration: &Calibration, videos: &[Video<'_>]) -> Result<(Vec<usize>, Vec<String>)> {
+pub(crate) fn assign(calibration: &Calibration, videos: &[Video<'_>]) -> Result<(Vec<usize>, Vec<String>)> {
     let cameras = &calibration.cameras;
     let exact: Vec<Vec<usize>> = videos.iter().map(|v| named(cameras, &|name| same_name(name, v.name))).collect();
     if let Some(found) = sure(&exact) {

@@ -1,7 +1,7 @@
 //! Calibrations of other programs: lenses and poses.
 //!
 //! A dialect is a file here and a line in the list; the content of a file identifies its dialect. Names of cameras are
-//! matched with names of videos ([`assign`]). The result is `cam_from_world` in OpenCV axes, and pixels whose first
+//! matched with names of videos (`assign`). The result is `cam_from_world` in OpenCV axes, and pixels whose first
 //! centre is at 0.5.
 
 mod capture;
@@ -15,8 +15,9 @@ mod tests;
 mod transforms;
 mod tree;
 
-pub use matching::{Video, assign};
-pub use shape::{Shape, bars, fitted, shape};
+pub(crate) use matching::{Video, assign};
+pub use shape::Shape;
+pub(crate) use shape::{bars, fitted, shape};
 
 use splat4d::math::Se3;
 use splat4d::math::se3::{norm, sub};
@@ -293,12 +294,12 @@ fn alike(cameras: &[Calibrated]) -> Result<()> {
 
 impl Calibration {
     /// Whether it says where the cameras stand.
-    pub fn posed(&self) -> bool {
+    pub(crate) fn posed(&self) -> bool {
         self.cameras.iter().all(|c| c.pose.is_some())
     }
 
     /// What its unit of length is, a sentence.
-    pub fn about_lengths(&self) -> String {
+    pub(crate) fn about_lengths(&self) -> String {
         /// Cameras farther apart than this are measured in millimetres: rigs of more metres are rare, of fewer millimetres too.
         const MILLIMETRES: f64 = 200.0;
         let centers: Vec<[f64; 3]> =

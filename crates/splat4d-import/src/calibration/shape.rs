@@ -29,7 +29,7 @@ pub enum Shape {
 /// How a video can have come of the calibrated images.
 ///
 /// Errors: it is of another shape.
-pub fn shape(camera: &Calibrated, video: [usize; 2]) -> Result<Shape> {
+pub(crate) fn shape(camera: &Calibrated, video: [usize; 2]) -> Result<Shape> {
     let size = camera.size.unwrap_or(video);
     let [w, h] = size.map(|v| v as f64);
     let [vw, vh] = video.map(|v| v as f64);
@@ -67,7 +67,7 @@ fn sizes(size: [usize; 2], video: [usize; 2]) -> String {
 /// Errors: the video is of another shape than the images it was calibrated with, and neither bars nor padding explain
 /// why; the
 /// principal point lies outside.
-pub fn fitted(
+pub(crate) fn fitted(
     camera: &Calibrated,
     video: [usize; 2],
     stored: [usize; 2],
@@ -116,7 +116,7 @@ pub fn fitted(
 }
 
 /// Pixels of black bars at the left, above, at the right and below, that all these grey images of one size have.
-pub fn bars(pictures: &[Planes<f32>]) -> [f64; 4] {
+pub(crate) fn bars(pictures: &[Planes<f32>]) -> [f64; 4] {
     /// In [0, 1]: what is brighter in the mean of a line, or anywhere in it, is no bar. Codecs make black noisy.
     const MEAN: f32 = 0.1;
     const ANY: f32 = 0.25;

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 /// A camera that was found: its file or folder, or the chapters of its recording in their order.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Input {
+pub(crate) struct Input {
     /// One, or several chapters.
     pub files: Vec<PathBuf>,
     /// The camera's name, where it is not that of its file.
@@ -27,7 +27,7 @@ const VIDEOS: [&str; 14] =
 /// folder of those is all of them, by name. A folder with folders of videos has a camera in each.
 ///
 /// Errors: a path that is not there, a folder with neither, nothing at all.
-pub fn find(paths: &[PathBuf]) -> Result<Vec<Input>> {
+pub(crate) fn find(paths: &[PathBuf]) -> Result<Vec<Input>> {
     let mut out: Vec<Input> = Vec::new();
     let mut alone = Vec::new();
     for path in paths {

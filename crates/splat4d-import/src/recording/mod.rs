@@ -18,7 +18,7 @@ mod tags;
 mod way;
 mod world;
 
-pub use inputs::{Input, find};
+pub(crate) use inputs::{Input, find};
 pub use report::{CameraReport, Report};
 pub use spacing::Gap;
 
@@ -74,7 +74,7 @@ pub struct Request {
     pub calibration: Option<PathBuf>,
     /// Whether the COLMAP program finds lenses and places.
     pub colmap: bool,
-    /// A folder of masks; see [`write::masks`].
+    /// A folder of masks; see `write::masks`.
     pub masks: Option<PathBuf>,
     /// Whether one clock drives all cameras, so that their files' times are taken.
     pub synchronous: bool,

@@ -18,7 +18,7 @@ pub struct Gap {
 
 impl Gap {
     /// What to do about it; none: they are near enough.
-    pub fn advice(&self) -> Option<String> {
+    pub(crate) fn advice(&self) -> Option<String> {
         let more = (self.degrees / FAR).ceil() as usize - 1;
         let [a, b] = &self.cameras;
         let cameras = if more == 1 { "a camera".to_owned() } else { format!("{more} cameras") };

@@ -17,7 +17,7 @@ use splat4d::math::se3::{cross, mat_mul, mat_vec};
 
 /// A camera among others.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct View {
+pub(crate) struct View {
     /// Takes world points into the camera's axes.
     pub pose: Se3,
     /// Which of [`Bundle::lenses`]; several views may share one.
@@ -28,7 +28,7 @@ pub struct View {
 
 /// A point that a camera sees.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Sighting {
+pub(crate) struct Sighting {
     /// Which of [`Bundle::views`].
     pub view: usize,
     /// Which of [`Bundle::points`].
@@ -41,7 +41,7 @@ pub struct Sighting {
 
 /// Cameras, points, and who sees what where.
 #[derive(Clone, Debug, Default)]
-pub struct Bundle {
+pub(crate) struct Bundle {
     /// The cameras.
     pub views: Vec<View>,
     /// Their lenses.
@@ -54,7 +54,7 @@ pub struct Bundle {
 
 /// What is adjusted in addition to points.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Free {
+pub(crate) struct Free {
     /// Poses.
     pub pose: bool,
     /// Focal lengths.
@@ -69,7 +69,7 @@ pub struct Free {
 
 /// Standard deviations of what is known beforehand; infinite: nothing is.
 #[derive(Clone, Debug)]
-pub struct Priors {
+pub(crate) struct Priors {
     /// Where each lens is expected.
     pub lenses: Vec<Lens>,
     /// Of log f.
@@ -86,7 +86,8 @@ pub struct Priors {
 
 impl Priors {
     /// Nothing is known.
-    pub fn none(lenses: &[Lens]) -> Self {
+    #[cfg(test)]
+    pub(crate) fn none(lenses: &[Lens]) -> Self {
         let free = f64::INFINITY;
         Self { lenses: lenses.to_vec(), focal: free, k1: free, center: free, family: free, tau: free }
     }
@@ -94,7 +95,7 @@ impl Priors {
 
 /// How it is adjusted.
 #[derive(Clone, Debug)]
-pub struct Settings {
+pub(crate) struct Settings {
     /// Distance beyond which a sighting hardly counts (Cauchy's loss), pixels; infinite: plain squares.
     pub scale: f64,
     /// What is adjusted.
@@ -111,7 +112,7 @@ pub struct Settings {
 
 /// What came of it.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Report {
+pub(crate) struct Report {
     /// The loss before: Σ of half the robust squares, with priors.
     pub before: f64,
     /// And after.
@@ -161,7 +162,7 @@ pub(crate) fn residual(view: &View, lens: &Lens, x: [f64; 3], s: &Sighting) -> O
 
 impl Bundle {
     /// Distance in pixels of a sighting from where its point is seen; infinite behind the camera.
-    pub fn distance(&self, s: &Sighting) -> f64 {
+    pub(crate) fn distance(&self, s: &Sighting) -> f64 {
         let view = &self.views[s.view];
         let place = view.pose.apply(self.points[s.point]);
         let off = |p: [f64; 2]| {
@@ -478,7 +479,7 @@ fn moved(bundle: &Bundle, cameras: &[f64], points: &[[f64; 3]], held: &[bool]) -
 /// Adjusts a bundle in place.
 ///
 /// The first view's pose stays, and one number of another's translation: they fix place, direction and size of the world.
-pub fn adjust(bundle: &mut Bundle, settings: &Settings) -> Report {
+pub(crate) fn adjust(bundle: &mut Bundle, settings: &Settings) -> Report {
     assert!(bundle.sightings.is_sorted_by_key(|s| s.point), "sightings come in the order of their points");
     assert_eq!(settings.priors.lenses.len(), bundle.lenses.len(), "every lens has its prior");
     /// Marquardt's λ: where it starts, how it grows and shrinks, and where nothing helps any more.

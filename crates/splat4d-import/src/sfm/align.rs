@@ -6,14 +6,14 @@ use splat4d::math::se3::{cross, dot, mat_mul, mat_vec, norm, normalize, sub};
 use splat4d::math::{Se3, median};
 
 /// The direction that most cameras hold upwards: the mean of their −y axes.
-pub fn up_of(poses: &[Se3]) -> [f64; 3] {
+pub(crate) fn up_of(poses: &[Se3]) -> [f64; 3] {
     let sum = poses.iter().fold([0.0; 3], |s, p| std::array::from_fn(|k| s[k] - p.rotation[1][k]));
     normalize(sum)
 }
 
 /// The median distance of the cameras from what they look at: of each, the median distance of the points that it sees. With it
 /// as the unit, a scene is of a size that is known, where no length is.
-pub fn median_distance(distances: &mut [Vec<f64>]) -> Option<f64> {
+pub(crate) fn median_distance(distances: &mut [Vec<f64>]) -> Option<f64> {
     let mut each: Vec<f64> = distances.iter_mut().filter_map(|d| median(d)).collect();
     median(&mut each)
 }
@@ -182,7 +182,7 @@ fn entropy(points: &[[f64; 3]], frame: &Mat3, bin: f64) -> f64 {
 /// How high a floor lies along `up`: the lowest height at which many points lie, with hardly any below.
 ///
 /// None: no such height.
-pub fn floor(points: &[[f64; 3]], up: [f64; 3]) -> Option<f64> {
+pub(crate) fn floor(points: &[[f64; 3]], up: [f64; 3]) -> Option<f64> {
     /// Of all points, what lies on a floor at least, and below it at most (wrong points).
     const ON: f64 = 0.08;
     const BELOW: f64 = 0.05;

@@ -158,7 +158,7 @@ fn errors(sights: &[CameraView], links: &[Link]) -> Vec<Option<f64>> {
 }
 
 /// Pixels of a camera's files for one of an image 1920 across, but no less than half a pixel.
-pub fn pixel_unit([width, height]: [usize; 2]) -> f64 {
+pub(crate) fn pixel_unit([width, height]: [usize; 2]) -> f64 {
     unit(width.max(height) as f64)
 }
 

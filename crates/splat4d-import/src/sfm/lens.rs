@@ -39,12 +39,12 @@ pub(crate) struct LensProjection {
 
 impl Lens {
     /// Without distortion, the principal point in the middle.
-    pub fn plain(focal: f64, width: usize, height: usize) -> Self {
+    pub(crate) fn plain(focal: f64, width: usize, height: usize) -> Self {
         Self { focal, k1: 0.0, center: [0.5 * width as f64, 0.5 * height as f64] }
     }
 
     /// Where a place in the camera's axes is seen; nothing at or behind the camera.
-    pub fn project(&self, p: [f64; 3]) -> Option<[f64; 2]> {
+    pub(crate) fn project(&self, p: [f64; 3]) -> Option<[f64; 2]> {
         if p[2] <= 0.0 || p[2].is_nan() {
             return None;
         }
@@ -53,7 +53,7 @@ impl Lens {
         Some([s * x + self.center[0], s * y + self.center[1]])
     }
 
-    /// As [`Lens::project`], with derivatives.
+    /// As `Lens::project`, with derivatives.
     pub(crate) fn project_by(&self, p: [f64; 3]) -> Option<LensProjection> {
         let pixel = self.project(p)?;
         let (f, k, z) = (self.focal, self.k1, p[2]);
@@ -69,7 +69,7 @@ impl Lens {
     }
 
     /// The direction seen at a pixel, depth 1 (camera axes).
-    pub fn ray(&self, pixel: [f64; 2]) -> [f64; 3] {
+    pub(crate) fn ray(&self, pixel: [f64; 2]) -> [f64; 3] {
         /// Newton's method on the radius: far fewer are needed within an image.
         const STEPS: usize = 20;
         let bent = [(pixel[0] - self.center[0]) / self.focal, (pixel[1] - self.center[1]) / self.focal];
@@ -107,14 +107,14 @@ impl Lens {
     }
 
     /// A posed camera with this lens.
-    pub fn camera(&self, pose: Se3, width: usize, height: usize) -> Camera {
+    pub(crate) fn camera(&self, pose: Se3, width: usize, height: usize) -> Camera {
         let k = [self.k1, 0.0, 0.0, 0.0, 0.0, 0.0];
         let lens = if self.k1 == 0.0 { SceneLens::Pinhole } else { SceneLens::Brown { k, p: [0.0; 2], s: [0.0; 4] } };
         Camera { lens, ..self.pinhole(pose, width, height) }
     }
 
     /// For images `factor` times as large.
-    pub fn scaled(&self, factor: f64) -> Self {
+    pub(crate) fn scaled(&self, factor: f64) -> Self {
         Self { focal: self.focal * factor, k1: self.k1, center: self.center.map(|c| c * factor) }
     }
 }

@@ -48,7 +48,7 @@ impl Default for Mapping {
 
 /// Focal lengths that are tried where nothing is known, of the image's larger side: from wide phones to short
 /// telephoto lenses.
-pub const FOCALS: [f64; 12] = [0.6, 0.66, 0.72, 0.79, 0.86, 0.94, 1.03, 1.12, 1.22, 1.33, 1.45, 1.6];
+pub(crate) const FOCALS: [f64; 12] = [0.6, 0.66, 0.72, 0.79, 0.86, 0.94, 1.03, 1.12, 1.22, 1.33, 1.45, 1.6];
 /// Median angle of a pair to start with, degrees.
 const START_ANGLE: f64 = 8.0;
 /// Links, those of most matches, among which it is looked for.
@@ -695,7 +695,7 @@ impl Map<'_> {
 
 /// A placed camera.
 #[derive(Clone, Copy, Debug)]
-pub struct Stand {
+pub(crate) struct Stand {
     /// Takes world points into the camera's axes.
     pub pose: Se3,
     /// Of images of the sight's size.
@@ -710,7 +710,7 @@ pub struct Stand {
 
 /// A point.
 #[derive(Clone, Debug)]
-pub struct MapPoint {
+pub(crate) struct MapPoint {
     /// In the world.
     pub place: [f64; 3],
     /// sRGB.
@@ -725,7 +725,7 @@ pub struct MapPoint {
 
 /// Cameras (or why they could not be placed) and points.
 #[derive(Clone, Debug)]
-pub struct Mapped {
+pub(crate) struct Mapped {
     /// One for each sight.
     pub cameras: Vec<Result<Stand, String>>,
     /// In the order of tracks.
@@ -739,7 +739,7 @@ pub struct Mapped {
 }
 
 /// Places cameras: from several starts, the best of which is kept. `None`: no two images fit together.
-pub fn map(
+pub(crate) fn map(
     sights: &[CameraView],
     tracks: &[Track],
     links: &[Link],

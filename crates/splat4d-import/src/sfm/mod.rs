@@ -2,7 +2,7 @@
 //!
 //! A fixed camera is one image: the features of its median background, and the features of moving objects at some
 //! shared times. Moving objects are evidence where walls look alike. Each of their features has a velocity, so time
-//! offsets are found together with poses ([`adjust`]). Each frame of a moving camera is an image.
+//! offsets are found together with poses (`adjust`). Each frame of a moving camera is an image.
 
 pub mod adjust;
 pub(crate) mod algebra;

@@ -222,7 +222,11 @@ fn frame_length(pictures: &dyn Pictures, camera: usize) -> f64 {
 /// Cameras that do not move, one sight each.
 ///
 /// Errors: a camera without frames, images that cannot be read or change their size.
-pub fn fixed(pictures: &dyn Pictures, look: &FeatureOptions, progress: &mut Progress<'_>) -> Result<Vec<CameraView>> {
+pub(crate) fn fixed(
+    pictures: &dyn Pictures,
+    look: &FeatureOptions,
+    progress: &mut Progress<'_>,
+) -> Result<Vec<CameraView>> {
     let count = pictures.cameras();
     for camera in 0..count {
         if pictures.frames(camera) == 0 {
@@ -413,8 +417,8 @@ fn moving(
 /// Frames of moving cameras, one sight each: at most `most`, evenly chosen. Motion in them contradicts the static
 /// background and is left out where images are compared.
 ///
-/// Errors: as [`fixed`].
-pub fn walking(
+/// Errors: as `fixed`.
+pub(crate) fn walking(
     pictures: &dyn Pictures,
     look: &FeatureOptions,
     most: usize,

@@ -11,7 +11,7 @@ use splat4d::math::{Rng, Se3, mat3};
 /// 1994, "Review and analysis of solutions of the three point perspective pose estimation problem".
 ///
 /// `points` in the world, `rays` in the camera's axes, of any length.
-pub fn three(points: &[[f64; 3]; 3], rays: &[[f64; 3]; 3]) -> Vec<Se3> {
+pub(crate) fn three(points: &[[f64; 3]; 3], rays: &[[f64; 3]; 3]) -> Vec<Se3> {
     let j = rays.map(normalize);
     let square = |a: [f64; 3], b: [f64; 3]| dot(sub(a, b), sub(a, b));
     let (a2, b2, c2) = (square(points[1], points[2]), square(points[0], points[2]), square(points[0], points[1]));

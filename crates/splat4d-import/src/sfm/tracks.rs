@@ -44,7 +44,7 @@ pub struct Track {
 
 /// Which images are compared.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Pairing {
+pub(crate) enum Pairing {
     /// All with all.
     All,
     /// Frames of a walk: with so many that follow, and every one of these many with all others of them.
@@ -152,7 +152,7 @@ fn mutual(a: &Rows, b: &Rows, from: &[Feature], to: &[Feature]) -> Vec<([usize; 
 }
 
 /// Compares images and keeps what agrees with one motion between them, in the order of pairs.
-pub fn links(sights: &[CameraView], pairing: Pairing, seed: u64, progress: &mut Progress<'_>) -> Vec<Link> {
+pub(crate) fn links(sights: &[CameraView], pairing: Pairing, seed: u64, progress: &mut Progress<'_>) -> Vec<Link> {
     let all: Vec<Vec<Rows>> = sights.par_iter().map(|s| rows(&s.features)).collect();
     let pairs = pairing.pairs(sights.len());
     let mut out = Vec::new();
@@ -359,7 +359,7 @@ pub fn join(sights: &[CameraView], links: &[Link]) -> Vec<Track> {
 /// The focal lengths, in units of the images' larger side, that all cameras may share, the likeliest first: each
 /// link votes for
 /// those with which its fundamental matrix is an essential one.
-pub fn focal_votes(sights: &[CameraView], links: &[Link], candidates: &[f64]) -> Vec<f64> {
+pub(crate) fn focal_votes(sights: &[CameraView], links: &[Link], candidates: &[f64]) -> Vec<f64> {
     /// What a matrix of noisy matches misses, at the right focal length: the vote falls to 1/e.
     const OFF: f64 = 0.05;
     let vote = |focal: f64| -> f64 {

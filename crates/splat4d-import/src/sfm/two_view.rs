@@ -241,12 +241,12 @@ pub fn five(sample: &[Pair; 5]) -> Vec<Mat3> {
 }
 
 /// The product `[t]× R` of the motion from the first camera's axes to the second's.
-pub fn essential_of(motion: &Se3) -> Mat3 {
+pub(crate) fn essential_of(motion: &Se3) -> Mat3 {
     mat_mul(&skew(motion.translation), &motion.rotation)
 }
 
 /// The four motions of an essential matrix, with translations of length one.
-pub fn motions(e: &Mat3) -> [Se3; 4] {
+pub(crate) fn motions(e: &Mat3) -> [Se3; 4] {
     let (u, _, v) = svd(e);
     let turn = |sign: f64| {
         let w = [[0.0, -sign, 0.0], [sign, 0.0, 0.0], [0.0, 0.0, 1.0]];
@@ -304,7 +304,7 @@ impl Data for Calibrated<'_> {
 
 /// The motion of least squares of the first-order distances of pairs of rays, near a given one: Gauss-Newton on the rotation
 /// and on the direction of the translation.
-pub fn polish_motion(start: &Se3, rays: &[Pair]) -> Se3 {
+pub(crate) fn polish_motion(start: &Se3, rays: &[Pair]) -> Se3 {
     /// From a good start the steps shrink as fast as rounding allows.
     const STEPS: usize = 10;
     let mut motion = *start;

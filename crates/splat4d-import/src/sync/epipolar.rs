@@ -44,7 +44,7 @@ const RESOLUTION: f64 = 1e-3;
 
 /// A lag that the geometry demands.
 #[derive(Clone, Debug, PartialEq)]
-pub struct EpipolarLag {
+pub(crate) struct EpipolarLag {
     /// Seconds that the second camera is late.
     pub seconds: f64,
     /// Its standard deviation, seconds, from the bend of the cost.
@@ -67,7 +67,7 @@ pub struct Range {
 /// How much later camera b notes what camera a notes, by tracks in undistorted pixels and the fundamental matrix
 /// (`x_bᵀ F x_a = 0`). `matches` are pairs of tracks that may show the same point, some of them wrongly; without them all
 /// pairs are tried.
-pub fn lag(
+pub(crate) fn lag(
     f: &[[f64; 3]; 3],
     [a, b]: [&[Track]; 2],
     matches: Option<&[[usize; 2]]>,
@@ -120,7 +120,7 @@ pub fn lag(
 }
 
 /// The fundamental matrix of two cameras (pinhole): `x_bᵀ F x_a = 0`.
-pub fn fundamental(a: &Camera, b: &Camera) -> [[f64; 3]; 3] {
+pub(crate) fn fundamental(a: &Camera, b: &Camera) -> [[f64; 3]; 3] {
     let rotation = mat_mul(&b.cam_from_world.rotation, &transpose(&a.cam_from_world.rotation));
     let t = sub(b.cam_from_world.translation, mat_vec(&rotation, a.cam_from_world.translation));
     let cross = [[0.0, -t[2], t[1]], [t[2], 0.0, -t[0]], [-t[1], t[0], 0.0]];
@@ -347,7 +347,7 @@ fn back(f: &[[f64; 3]; 3], [x, y]: [f64; 2]) -> f64 {
 }
 
 /// The distance of two pixels from fitting each other, to first order, with its sign (Sampson 1982).
-pub fn sampson(f: &[[f64; 3]; 3], x: [f64; 2], y: [f64; 2]) -> f64 {
+pub(crate) fn sampson(f: &[[f64; 3]; 3], x: [f64; 2], y: [f64; 2]) -> f64 {
     let l = line(f, x);
     let size = l[0] * l[0] + l[1] * l[1] + back(f, y);
     if size > 0.0 { (y[0] * l[0] + y[1] * l[1] + l[2]) / size.sqrt() } else { 0.0 }

@@ -30,7 +30,7 @@ pub enum Kind {
 
 impl Kind {
     /// Its name in reports and in the file of corrections.
-    pub fn name(self) -> &'static str {
+    pub(crate) fn name(self) -> &'static str {
         match self {
             Self::Given => "told",
             Self::Geometry => "geometry",
@@ -72,14 +72,14 @@ pub struct Offset {
 
 impl Offset {
     /// The camera's time on the clock of all.
-    pub fn global(&self, time: f64) -> f64 {
+    pub(crate) fn global(&self, time: f64) -> f64 {
         time * (1.0 + self.rate) + self.seconds
     }
 }
 
 /// Evidence that was not used.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Refused {
+pub(crate) struct Refused {
     /// Its number.
     pub evidence: usize,
     /// By how many seconds it contradicts what was used; None: it was not needed, or leads to no known camera.
@@ -88,7 +88,7 @@ pub struct Refused {
 
 /// The clock of all.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Solution {
+pub(crate) struct Solution {
     /// Per camera; None: nothing connects it with camera 0 or one whose offset is given.
     pub offsets: Vec<Option<Offset>>,
     /// What was left out.
@@ -97,7 +97,7 @@ pub struct Solution {
 
 /// Offsets of so many cameras, camera 0's being 0 unless `given` says otherwise; where it gives an offset, it is kept. Lags
 /// that are off by more than `tolerance` seconds (half a frame) and more than four standard deviations contradict.
-pub fn solve(cameras: usize, evidence: &[Evidence], given: &[Option<f64>], tolerance: f64) -> Solution {
+pub(crate) fn solve(cameras: usize, evidence: &[Evidence], given: &[Option<f64>], tolerance: f64) -> Solution {
     let mut known: Vec<Option<f64>> = (0..cameras).map(|c| given.get(c).copied().flatten()).collect();
     let told: Vec<bool> = known.iter().map(Option::is_some).collect();
     if known.iter().all(Option::is_none) && cameras > 0 {

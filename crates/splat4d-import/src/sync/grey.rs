@@ -5,7 +5,7 @@ use splat4d_train::capture::Rgb8;
 
 /// A grey image, values from 0 to 1, rows from the top.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Grey {
+pub(crate) struct Grey {
     /// Pixels across.
     pub width: usize,
     /// Pixels down.
@@ -16,7 +16,7 @@ pub struct Grey {
 
 impl Grey {
     /// The luma of an image (BT.601's weights).
-    pub fn of(picture: &Rgb8) -> Self {
+    pub(crate) fn of(picture: &Rgb8) -> Self {
         let luma = |p: &[u8]| (0.299 * f32::from(p[0]) + 0.587 * f32::from(p[1]) + 0.114 * f32::from(p[2])) / 255.0;
         Self { width: picture.width, height: picture.height, data: picture.data.chunks_exact(3).map(luma).collect() }
     }
@@ -78,7 +78,7 @@ pub struct Pyramid {
 
 impl Pyramid {
     /// At most `levels` sizes, none smaller than 16 pixels.
-    pub fn new(picture: Grey, levels: usize) -> Self {
+    pub(crate) fn new(picture: Grey, levels: usize) -> Self {
         /// Shorter side of the smallest level: the window that is followed must have room.
         const SMALLEST: usize = 32;
         let mut all = vec![picture];

@@ -4,7 +4,7 @@
 //! them. Evidence is pairwise: a *lag* of cameras a and b is the difference of their timestamps of one event, `t_b −
 //! t_a`, so that `lag = offset_a − offset_b`. [`sound`] and [`epipolar`] measure lags, [`motion`] guesses them, and
 //! [`graph`] computes offsets and drops lags that contradict the rest. Undetermined offsets are refused with a
-//! [`Refusal`] and never averaged in.
+//! `Refusal` and never averaged in.
 
 pub mod epipolar;
 mod fft;
@@ -19,7 +19,7 @@ use std::fmt;
 /// Why there is no lag.
 #[derive(Clone, Debug, PartialEq)]
 #[non_exhaustive]
-pub enum Refusal {
+pub(crate) enum Refusal {
     /// Too little in common to compare, seconds or samples of it as a word.
     Short(&'static str),
     /// Nothing is heard.

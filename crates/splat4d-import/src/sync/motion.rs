@@ -34,7 +34,7 @@ pub struct Motion {
 
 /// A lag that motion suggests.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct MotionLag {
+pub(crate) struct MotionLag {
     /// Seconds that the second camera is late.
     pub seconds: f64,
     /// About how far off it may be, seconds: two intervals, as cameras at right angles to each other were.
@@ -91,7 +91,7 @@ impl Motion {
 }
 
 /// How much later b notes what a notes, at most `most` seconds either way, if given.
-pub fn lag(a: &Motion, b: &Motion, most: Option<f64>) -> Result<MotionLag, Refusal> {
+pub(crate) fn lag(a: &Motion, b: &Motion, most: Option<f64>) -> Result<MotionLag, Refusal> {
     if a.times.len() < MIN_INTERVALS || b.times.len() < MIN_INTERVALS {
         return Err(Refusal::Short("the take"));
     }

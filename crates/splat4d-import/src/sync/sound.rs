@@ -49,7 +49,7 @@ const SPEED: f64 = 343.0;
 
 /// A lag that was heard.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct SoundLag {
+pub(crate) struct SoundLag {
     /// Seconds that the second track is late, at [`at`](Self::at).
     pub seconds: f64,
     /// The standard deviation of it, seconds, without the way of sound.
@@ -66,31 +66,31 @@ pub struct SoundLag {
 
 impl SoundLag {
     /// The lag at second 0 of the first track's clock.
-    pub fn at_zero(&self) -> f64 {
+    pub(crate) fn at_zero(&self) -> f64 {
         self.seconds - self.drift.unwrap_or(0.0) * self.at
     }
 }
 
 /// A lag without the way of sound: what was heard `lag` later by b than by a comes from a source that is so many metres from
 /// either.
-pub fn without_way(lag: f64, [from_a, from_b]: [f64; 2]) -> f64 {
+pub(crate) fn without_way(lag: f64, [from_a, from_b]: [f64; 2]) -> f64 {
     lag - (from_b - from_a) / SPEED
 }
 
 /// Seconds that the way of sound may make between cameras that are at most so many metres apart.
-pub fn way(metres: f64) -> f64 {
+pub(crate) fn way(metres: f64) -> f64 {
     metres / SPEED
 }
 
 /// A sound track, and where sounds begin in it.
-pub struct SoundTrack {
+pub(crate) struct SoundTrack {
     samples: Vec<f32>,
     onsets: Vec<f64>,
 }
 
 impl SoundTrack {
-    /// Prepares one channel at [`SOUND_RATE`].
-    pub fn new(samples: Vec<f32>) -> Self {
+    /// Prepares one channel at `SOUND_RATE`.
+    pub(crate) fn new(samples: Vec<f32>) -> Self {
         let onsets = onsets(&samples);
         Self { samples, onsets }
     }
@@ -141,7 +141,7 @@ fn onsets(samples: &[f32]) -> Vec<f64> {
 }
 
 /// How much later b notes what a notes, by their sound; at most `most` seconds either way, if given.
-pub fn lag(a: &SoundTrack, b: &SoundTrack, most: Option<f64>) -> Result<SoundLag, Refusal> {
+pub(crate) fn lag(a: &SoundTrack, b: &SoundTrack, most: Option<f64>) -> Result<SoundLag, Refusal> {
     if a.length() < MIN_OVERLAP || b.length() < MIN_OVERLAP {
         return Err(Refusal::Short("sound"));
     }

@@ -5,11 +5,11 @@ use rayon::prelude::*;
 use splat4d_train::capture::Rgb8;
 
 /// Pixels between corners that are followed.
-pub const APART: f64 = 8.0;
+pub(crate) const APART: f64 = 8.0;
 /// Images are halved until they have no more pixels: 640x360 is looked at as it is, and a film's images at half size.
-pub const PIXELS: usize = 700_000;
+pub(crate) const PIXELS: usize = 700_000;
 /// Sizes of an image: motion of up to `RADIUS · 2^(LEVELS − 1)` pixels is followed.
-pub const LEVELS: usize = 4;
+pub(crate) const LEVELS: usize = 4;
 /// Half the side of the window that is followed, pixels.
 const RADIUS: usize = 6;
 /// Steps of Newton's method at a level, and the one that is small enough, pixels.
@@ -55,7 +55,8 @@ pub struct Track {
 
 impl Track {
     /// Where it was at a time, between its first and last: on the line between two frames.
-    pub fn at(&self, time: f64) -> Option<[f64; 2]> {
+    #[cfg(test)]
+    pub(crate) fn at(&self, time: f64) -> Option<[f64; 2]> {
         let after = self.samples.partition_point(|s| s.0 < time);
         let (t1, b) = *self.samples.get(after)?;
         if t1 == time {
@@ -71,7 +72,7 @@ impl Track {
     /// A line between two noisy places is less noisy half way than at either end, so that lags would be drawn to half frames (on
     /// a real rig half of the pairs were); the weights of a cubic B-spline have nearly the same sum of squares everywhere (0.50
     /// to 0.46), and blur the motion by the same third of a squared frame.
-    pub fn smooth(&self, time: f64) -> Option<[f64; 2]> {
+    pub(crate) fn smooth(&self, time: f64) -> Option<[f64; 2]> {
         let after = self.samples.partition_point(|s| s.0 <= time);
         let first = after.checked_sub(2)?;
         let four = self.samples.get(first..first + 4).or_else(|| {
@@ -96,7 +97,7 @@ impl Track {
     }
 
     /// The pixels between its places farthest from each other along an axis: how much it moved at least.
-    pub fn extent(&self) -> f64 {
+    pub(crate) fn extent(&self) -> f64 {
         let side = |k: usize| {
             let of = self.samples.iter().map(|s| s.1[k]);
             of.clone().fold(f64::NEG_INFINITY, f64::max) - of.fold(f64::INFINITY, f64::min)
@@ -115,7 +116,13 @@ fn b_spline(u: f64) -> [f64; 4] {
 
 /// The corners of an image where `wanted` allows, the strongest first, at least `apart` pixels from each other and from
 /// `taken` ones.
-pub fn corners(picture: &Grey, wanted: Option<&[bool]>, most: usize, apart: f64, taken: &[[f64; 2]]) -> Vec<[f64; 2]> {
+pub(crate) fn corners(
+    picture: &Grey,
+    wanted: Option<&[bool]>,
+    most: usize,
+    apart: f64,
+    taken: &[[f64; 2]],
+) -> Vec<[f64; 2]> {
     let (width, height) = (picture.width, picture.height);
     let margin = RADIUS + 1;
     if width <= 2 * margin || height <= 2 * margin {
@@ -268,7 +275,7 @@ fn at_level(a: &Grey, b: &Grey, [x, y]: [f64; 2], mut moved: [f64; 2], finest: b
 }
 
 /// Follows corners through a camera's frames; where some are lost, new ones are looked for.
-pub struct Tracker {
+pub(crate) struct Tracker {
     most: usize,
     apart: f64,
     last: Option<(f64, Pyramid)>,
@@ -278,12 +285,12 @@ pub struct Tracker {
 
 impl Tracker {
     /// For at most `most` corners at a time, `apart` pixels from each other.
-    pub fn new(most: usize, apart: f64) -> Self {
+    pub(crate) fn new(most: usize, apart: f64) -> Self {
         Self { most, apart, last: None, live: Vec::new(), done: Vec::new() }
     }
 
     /// Takes the next frame; new corners only where `wanted` allows.
-    pub fn push(&mut self, time: f64, picture: Grey, wanted: Option<&[bool]>) {
+    pub(crate) fn push(&mut self, time: f64, picture: Grey, wanted: Option<&[bool]>) {
         let pyramid = Pyramid::new(picture, LEVELS);
         if let Some((_, last)) = &self.last {
             let ends: Vec<[f64; 2]> = self.live.iter().map(|t| t.samples[t.samples.len() - 1].1).collect();
@@ -315,14 +322,14 @@ impl Tracker {
     }
 
     /// All tracks, those that ended first first.
-    pub fn finish(mut self) -> Vec<Track> {
+    pub(crate) fn finish(mut self) -> Vec<Track> {
         std::mem::take(&mut self.live).into_iter().for_each(|t| self.end(t));
         self.done
     }
 }
 
 /// The pixels of an image that differ from the `still` one by more than noise: where something moves.
-pub fn moving(picture: &Grey, still: &Grey) -> Vec<bool> {
+pub(crate) fn moving(picture: &Grey, still: &Grey) -> Vec<bool> {
     /// Differences above this, of 1, are no noise of ordinary cameras.
     const MOVED: f32 = 0.05;
     picture.data.iter().zip(&still.data).map(|(a, b)| (a - b).abs() > MOVED).collect()

@@ -12,7 +12,7 @@ const END_FRAMES: f64 = 2.0;
 
 /// Which part of which recording a file is, by its name.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Chapter {
+pub(crate) struct Chapter {
     /// What all chapters of the recording share: `GX0012`.
     pub recording: String,
     /// The chapter, from 1 on.
@@ -23,7 +23,7 @@ pub struct Chapter {
 
 impl Chapter {
     /// `None`: the name is not GoPro's.
-    pub fn of(path: &Path) -> Option<Self> {
+    pub(crate) fn of(path: &Path) -> Option<Self> {
         let stem = path.file_stem()?.to_str()?.to_ascii_uppercase();
         let (prefix, digits) = stem.split_at_checked(stem.find(|c: char| c.is_ascii_digit())?)?;
         if !digits.bytes().all(|b| b.is_ascii_digit()) {
@@ -43,7 +43,7 @@ impl Chapter {
 
 /// Opens one file or folder, or the chapters of one recording in their order. Errors: those of [`open`]; chapters of
 /// different sizes.
-pub fn open_all(paths: &[PathBuf], fps: f64) -> Result<Box<dyn Source>> {
+pub(crate) fn open_all(paths: &[PathBuf], fps: f64) -> Result<Box<dyn Source>> {
     if let [path] = paths {
         return open(path, fps);
     }

@@ -50,8 +50,8 @@ pub struct Clock {
 
 impl Clock {
     /// Judges frames by their `times` (seconds, ascending) and by `differences`: for some of them their number and the
-    /// [`mean_difference`] from the one before.
-    pub fn of(times: &[f64], differences: &[(usize, f64)]) -> Self {
+    /// `mean_difference` from the one before.
+    pub(crate) fn of(times: &[f64], differences: &[(usize, f64)]) -> Self {
         let intervals: Vec<f64> = times.windows(2).map(|w| w[1] - w[0]).collect();
         if intervals.is_empty() {
             return Self::default();
@@ -86,18 +86,18 @@ impl Clock {
     }
 
     /// Frames per second, as the median interval has them; 0 where there are fewer than two frames.
-    pub fn rate(&self) -> f64 {
+    pub(crate) fn rate(&self) -> f64 {
         if self.interval > 0.0 { 1.0 / self.interval } else { 0.0 }
     }
 
     /// How many frames are missing.
-    pub fn missing(&self) -> usize {
+    pub(crate) fn missing(&self) -> usize {
         self.dropped.iter().map(|g| g.missing).sum()
     }
 }
 
 /// The mean absolute difference of two images' samples, 0 to 255; 255 where their sizes differ.
-pub fn mean_difference(a: &Rgb8, b: &Rgb8) -> f64 {
+pub(crate) fn mean_difference(a: &Rgb8, b: &Rgb8) -> f64 {
     if (a.width, a.height) != (b.width, b.height) || a.data.is_empty() {
         return 255.0;
     }

@@ -63,7 +63,7 @@ pub enum Cropping {
 /// Finds what black bars leave of a source's images; `None`: there are none.
 ///
 /// Errors: those of reading.
-pub fn without_bars(source: &dyn Source, selection: &Selection) -> Result<Option<Crop>> {
+pub(crate) fn without_bars(source: &dyn Source, selection: &Selection) -> Result<Option<Crop>> {
     let info = source.info();
     let rate = info.average_rate.or(info.nominal_rate).unwrap_or(GUESSED[0]);
     let span = selection.to.or(info.duration).unwrap_or(GUESSED[1]) - selection.from.unwrap_or(0.0);

@@ -12,7 +12,7 @@ pub(crate) const ENDINGS: [&str; 4] = ["jpg", "jpeg", "png", "webp"];
 const RATES: std::ops::RangeInclusive<f64> = 1e-6..=1e5;
 
 /// The images of a folder, in the order of the numbers in their names.
-pub struct Folder {
+pub(crate) struct Folder {
     info: Info,
     /// Files and their times.
     files: Vec<(PathBuf, f64)>,
@@ -23,7 +23,7 @@ impl Folder {
     /// numbers are missing.
     ///
     /// Errors: no images, a frame rate that is none, a damaged first image.
-    pub fn open(path: &Path, fps: f64) -> Result<Self> {
+    pub(crate) fn open(path: &Path, fps: f64) -> Result<Self> {
         if !RATES.contains(&fps) {
             return Err(Error::input(format!("invalid frame rate {fps}"))
                 .at(path.display())

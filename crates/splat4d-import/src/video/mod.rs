@@ -14,11 +14,13 @@ mod folder;
 mod probe;
 mod program;
 
-pub use chapters::{Chapter, open_all};
-pub use clock::{Clock, Gap, mean_difference};
-pub use crop::{Crop, Cropping, without_bars};
+pub(crate) use chapters::{Chapter, open_all};
+pub(crate) use clock::mean_difference;
+pub use clock::{Clock, Gap};
+pub(crate) use crop::without_bars;
+pub use crop::{Crop, Cropping};
 pub(crate) use folder::ENDINGS as PICTURE_ENDINGS;
-pub use folder::Folder;
+pub(crate) use folder::Folder;
 pub use probe::{Color, Info, Range, Transfer};
 pub use program::Tools;
 pub use splat4d_train::capture::Rgb8;
@@ -28,7 +30,7 @@ use std::path::Path;
 
 /// Samples per second of what [`Source::sound`] gives: 62 µs a sample, an 18th of what a metre of way makes, and above twice
 /// the highest frequency that sound is compared at.
-pub const SOUND_RATE: f64 = 16_000.0;
+pub(crate) const SOUND_RATE: f64 = 16_000.0;
 
 /// Which frames of a source, and how large.
 #[derive(Clone, Debug, PartialEq)]
@@ -55,7 +57,7 @@ impl Default for Selection {
 
 impl Selection {
     /// An error unless the numbers make sense.
-    pub fn check(&self) -> Result<()> {
+    pub(crate) fn check(&self) -> Result<()> {
         let bad = |what: String, remedy: &str| Err(Error::input(what).remedy(remedy));
         if self.every == 0 {
             return bad("every 0th frame is asked for".into(), "Take every frame (1), every second (2) and so on.");
@@ -142,7 +144,7 @@ pub trait Source: Send + Sync {
     /// Its frames. Errors: nonsense in the selection, interlaced, a program that cannot be started.
     fn frames(&self, selection: &Selection) -> Result<Box<dyn Reader + '_>>;
 
-    /// Its sound as one channel at [`SOUND_RATE`]; the first sample at second 0 of the clock that frames have. None where
+    /// Its sound as one channel at `SOUND_RATE`; the first sample at second 0 of the clock that frames have. None where
     /// there is none.
     fn sound(&self) -> Result<Option<Vec<f32>>>;
 

@@ -36,12 +36,12 @@ pub struct Tools {
 
 impl Tools {
     /// Looks for the programs where the system looks for programs. Errors: not there, too old.
-    pub fn find() -> Result<Self> {
+    pub(crate) fn find() -> Result<Self> {
         Self::at(Path::new("ffmpeg"), Path::new("ffprobe"))
     }
 
     /// Takes the programs from these places.
-    pub fn at(ffmpeg: &Path, ffprobe: &Path) -> Result<Self> {
+    pub(crate) fn at(ffmpeg: &Path, ffprobe: &Path) -> Result<Self> {
         let ask = |program: &Path, arguments: &[&str]| {
             let mut command = Command::new(program);
             let out = command.args(arguments).stdin(Stdio::null()).stderr(Stdio::null()).output();

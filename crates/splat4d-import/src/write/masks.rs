@@ -25,7 +25,7 @@ pub struct Masks {
 
 /// Where the images of a camera begin in its video.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Begin {
+pub(crate) struct Begin {
     /// The second that reading began at; none: the first frame.
     pub from: Option<f64>,
 }
@@ -36,7 +36,7 @@ pub struct Begin {
 ///
 /// Errors: a camera without masks, fewer masks than frames, masks of another shape, no space; of kind `Interrupted` where `stop`
 /// said so.
-pub fn masks(
+pub(crate) fn masks(
     folder: &Path,
     from: &Path,
     pictures: &[Pictures],

@@ -75,8 +75,8 @@ impl Format {
 }
 
 /// What of a source is stored, and under which name.
-pub struct Clip<'a> {
-    /// The camera's name; see [`camera_names`].
+pub(crate) struct Clip<'a> {
+    /// The camera's name; see `camera_names`.
     pub name: String,
     /// Where frames come from.
     pub source: &'a dyn Source,
@@ -114,7 +114,7 @@ pub struct Pictures {
 
 impl Pictures {
     /// The file of a shot, from the capture's folder on.
-    pub fn file(&self, shot: usize) -> PathBuf {
+    pub(crate) fn file(&self, shot: usize) -> PathBuf {
         let (before, after) = self.pattern.split_once("%06d").expect("we wrote the pattern");
         PathBuf::from(format!("{before}{shot:06}{after}"))
     }
@@ -140,7 +140,7 @@ struct Note {
 }
 
 /// Names for cameras that are folders, too: of their sources' names what all systems allow, each once.
-pub fn camera_names(wanted: &[&str]) -> Vec<String> {
+pub(crate) fn camera_names(wanted: &[&str]) -> Vec<String> {
     let mut taken = BTreeSet::new();
     let one = |name: &&str| {
         let allowed = |c: char| if c.is_alphanumeric() || "-_".contains(c) { c } else { '_' };
@@ -159,7 +159,7 @@ pub fn camera_names(wanted: &[&str]) -> Vec<String> {
 /// same and in the same way, is left; `stop` is asked after every few frames.
 ///
 /// Errors: a source that cannot be read, no space; of kind `Interrupted` where `stop` said so.
-pub fn pictures(
+pub(crate) fn pictures(
     folder: &Path,
     clips: &[Clip<'_>],
     format: Format,

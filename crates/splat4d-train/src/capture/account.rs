@@ -9,7 +9,7 @@ pub enum Severity {
     Warning,
 }
 
-/// What a [`Remark`] is about.
+/// What a `Remark` is about.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Aspect {
     /// Files or lines that the capture names and that are not there.

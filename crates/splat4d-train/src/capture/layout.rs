@@ -2,32 +2,11 @@
 //! where there
 //! is none.
 
-use super::{CaptureOptions, RawCapture, colmap, foreign, llff, n3dv, nerfies, own, panoptic, rig, stray, transforms};
+use super::{
+    CaptureOptions, READERS, RawCapture, Reader, colmap, foreign, llff, n3dv, nerfies, rig, stray, transforms,
+};
 use splat4d::{Error, ErrorKind, Result};
 use std::path::Path;
-
-/// A reader: the capture's folder and the marker file that was found, to what the files say.
-type Reader = fn(&Path, &Path, &CaptureOptions) -> Result<RawCapture>;
-
-/// Marker files (or folders) in the order in which they are looked for, with their readers.
-const READERS: &[(&str, Reader)] = &[
-    ("capture.json", own::read),
-    (transforms::TRAIN, transforms::read),
-    ("train_meta.json", panoptic::read),
-    (transforms::ALL, transforms::read),
-    (nerfies::MARKER, nerfies::read),
-    (BOUNDS, read_bounds),
-    (colmap::SPARSE, colmap::read),
-    (colmap::NESTED, colmap::read),
-    (colmap::MULTIVIEW, colmap::read),
-    ("cameras.bin", colmap::read),
-    ("cameras.txt", colmap::read),
-    (colmap::COLMAP, colmap::read),
-    (colmap::WORKSPACES[0], colmap::read),
-    (colmap::WORKSPACES[1], colmap::read),
-    (colmap::WORKSPACES[2], colmap::read),
-    (colmap::WORKSPACES[3], colmap::read),
-];
 
 /// Markers of COLMAP models; poses of another layout use them for their points.
 const MODELS: &[&str] = &[
@@ -46,7 +25,7 @@ const MODELS: &[&str] = &[
 const MODEL_FILES: [&str; 4] = ["images.bin", "images.txt", "points3D.bin", "points3D.txt"];
 
 /// N3DV's marker, which single-camera LLFF folders have too.
-const BOUNDS: &str = "poses_bounds.npy";
+pub(super) const BOUNDS: &str = "poses_bounds.npy";
 
 /// Markers of layouts that this version does not read, and what to do.
 const FOREIGN: &[(&str, &str)] =
@@ -148,7 +127,7 @@ pub(super) fn is_metadata(path: &Path) -> bool {
 }
 
 /// LLFF's poses: of the cameras of a rig with folders of frames, or of the images of one folder.
-fn read_bounds(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<RawCapture> {
+pub(super) fn read_bounds(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<RawCapture> {
     if n3dv::applies(root) { n3dv::read(root, marker, options) } else { llff::read(root, marker, options) }
 }
 

@@ -58,8 +58,7 @@ pub(crate) use flow::{FlowFile, to_picture as flow_picture};
 pub use lens::Distortion;
 pub use n3dv::{about_rows, rows_of};
 pub use options::{
-    Borders, CaptureOptions, CaptureSettings, Exif, FlowSource, HoldOut, Lenses, MAX_POINTS, Sequence, Text, Times,
-    Unregistered,
+    Borders, CaptureOptions, CaptureSettings, Exif, FlowSource, HoldOut, Lenses, Sequence, Text, Times, Unregistered,
 };
 pub use points::PointCloud;
 pub use posed::{PosedCamera, check_intrinsics, colmap_cameras, is_colmap, rigid, transforms_cameras};
@@ -78,6 +77,30 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+
+/// A reader: the capture's folder and the marker file that was found, to what the files say.
+type Reader = fn(&Path, &Path, &CaptureOptions) -> Result<RawCapture>;
+
+/// The list of layouts: a reader is its file, its name in [`CaptureKind`] and an entry here. Marker files (or folders) in the
+/// order in which they are looked for, with their readers.
+const READERS: &[(&str, Reader)] = &[
+    ("capture.json", own::read),
+    (transforms::TRAIN, transforms::read),
+    ("train_meta.json", panoptic::read),
+    (transforms::ALL, transforms::read),
+    (nerfies::MARKER, nerfies::read),
+    (layout::BOUNDS, layout::read_bounds),
+    (colmap::SPARSE, colmap::read),
+    (colmap::NESTED, colmap::read),
+    (colmap::MULTIVIEW, colmap::read),
+    ("cameras.bin", colmap::read),
+    ("cameras.txt", colmap::read),
+    (colmap::COLMAP, colmap::read),
+    (colmap::WORKSPACES[0], colmap::read),
+    (colmap::WORKSPACES[1], colmap::read),
+    (colmap::WORKSPACES[2], colmap::read),
+    (colmap::WORKSPACES[3], colmap::read),
+];
 
 /// Which layout a capture was read from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -13,7 +13,7 @@ impl Capture {
     /// A frame is observed where its time is at most first + share · (last − first) of the training and held-out frames.
     /// With later images go what belongs to them: initial points with later times, and optical flow into the future. A
     /// capture's own points without times are taken at their word. Errors: one time, a share that leaves nothing.
-    pub fn observe(&mut self, share: f64, near: f64) -> Result<()> {
+    pub(crate) fn observe(&mut self, share: f64, near: f64) -> Result<()> {
         let place = |e: Error| e.at(format!("{} (capture.observe = {share})", self.root.display()));
         let times = || self.train.iter().chain(&self.held).map(|&i| self.frames[i].time.0);
         let (first, last) = times().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), t| (a.min(t), b.max(t)));

@@ -257,7 +257,7 @@ impl Value for Text {
 }
 
 /// Most points an initial cloud keeps by default.
-pub const MAX_POINTS: usize = 40_000;
+pub(crate) const MAX_POINTS: usize = 40_000;
 
 impl Default for CaptureOptions {
     fn default() -> Self {

@@ -64,7 +64,7 @@ pub struct Support {
 impl Support {
     /// Whether it is a floater at a strength from 0 (nothing is) to 1. What alone makes an image wrong has Δ = −Σ r².
     /// `error`: the squared error of the median camera.
-    pub fn floats(&self, strength: f64, error: f64) -> bool {
+    pub(crate) fn floats(&self, strength: f64, error: f64) -> bool {
         let matters = self.matters * strength >= MATTERS * error;
         let unmissed = f64::from(self.missed) <= SHARE * strength * f64::from(self.seen);
         let better = self.held <= 0.0 && self.delta <= (strength - 1.0) * self.change;

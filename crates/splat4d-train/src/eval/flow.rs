@@ -14,7 +14,7 @@ const KNOWN: f32 = 0.999;
 /// A pixel whose flow is longer moves, pixels.
 const MOVES: f32 = 0.5;
 /// End-point errors within which a pixel counts as right, pixels.
-pub const WITHIN: [f64; 3] = [1.0, 3.0, 5.0];
+pub(crate) const WITHIN: [f64; 3] = [1.0, 3.0, 5.0];
 
 /// How well drawn flow agrees with known flow.
 #[derive(Clone, Debug, PartialEq)]

@@ -29,7 +29,7 @@ const REMEDY: &str = "Give a safetensors file with torchvision's `features.*` te
 
 /// The feature network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Net {
+pub(crate) enum Net {
     /// AlexNet; results are labelled `LPIPS-alex`.
     Alex,
     /// VGG16; results are labelled `LPIPS-vgg`.
@@ -199,7 +199,7 @@ impl Lpips {
     }
 
     /// Which network was loaded.
-    pub fn net(&self) -> Net {
+    pub(crate) fn net(&self) -> Net {
         self.net
     }
 

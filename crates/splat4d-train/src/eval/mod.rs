@@ -19,7 +19,7 @@ pub mod trajectory;
 
 pub use align::Align;
 pub use colour::ColourMatrix;
-pub use lpips::{InputScaling, Lpips, Net};
+pub use lpips::{InputScaling, Lpips};
 pub use report::{CameraScores, Conditions, Report, Score, Split, View};
 
 use splat4d::scene::Planes;

@@ -20,9 +20,9 @@ use splat4d::scene::{Camera, Time};
 /// Which points each camera truly sees.
 pub const VISIBLE: &str = "truth/tracks_visible.npy";
 /// Pixels within which a point counts as found (TAP-Vid).
-pub const PIXELS: [f64; 5] = [1.0, 2.0, 4.0, 8.0, 16.0];
+pub(crate) const PIXELS: [f64; 5] = [1.0, 2.0, 4.0, 8.0, 16.0];
 /// Shares of the points' height within which a point counts as found in the world.
-pub const SHARES: [f64; 5] = [0.01, 0.02, 0.04, 0.08, 0.16];
+pub(crate) const SHARES: [f64; 5] = [0.01, 0.02, 0.04, 0.08, 0.16];
 /// Cameras that look, at most: the held-out ones, or where there are none the first of training.
 const CAMERAS: usize = 4;
 

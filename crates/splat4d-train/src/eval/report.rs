@@ -51,7 +51,7 @@ impl View {
     }
 
     /// Sets one score.
-    pub fn set(&mut self, metric: &str, score: Score) {
+    pub(crate) fn set(&mut self, metric: &str, score: Score) {
         self.scores.insert(metric.into(), score);
     }
 }
@@ -82,7 +82,7 @@ pub struct Split {
 impl Split {
     /// The mean of every metric over the views in which it is defined, and the scores of the whole, with notes: why a
     /// metric is not defined, or over how many views its mean runs.
-    pub fn means(&self) -> (BTreeMap<String, Score>, BTreeMap<String, String>) {
+    pub(crate) fn means(&self) -> (BTreeMap<String, Score>, BTreeMap<String, String>) {
         let (mut sums, mut notes) = (BTreeMap::<&str, (f64, usize, Option<&str>)>::new(), BTreeMap::new());
         for (metric, score) in self.views.iter().flat_map(|v| &v.scores) {
             let entry = sums.entry(metric).or_default();

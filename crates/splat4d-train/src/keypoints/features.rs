@@ -27,7 +27,7 @@ pub struct Feature {
 
 impl Feature {
     /// Squared distance of the descriptors.
-    pub fn distance(&self, other: &Self) -> u32 {
+    pub(crate) fn distance(&self, other: &Self) -> u32 {
         let square = |(a, b): (&u8, &u8)| (i32::from(*a) - i32::from(*b)).pow(2) as u32;
         self.descriptor.iter().zip(&other.descriptor).map(square).sum()
     }

@@ -11,7 +11,7 @@ pub fn grey(color: &Planes<f32>) -> Planes<f32> {
 }
 
 /// Twice the size, linearly between pixels.
-pub fn doubled(from: &Planes<f32>) -> Planes<f32> {
+pub(crate) fn doubled(from: &Planes<f32>) -> Planes<f32> {
     let mut out = Planes::new(1, 2 * from.height, 2 * from.width);
     for y in 0..out.height {
         for x in 0..out.width {
@@ -24,7 +24,7 @@ pub fn doubled(from: &Planes<f32>) -> Planes<f32> {
 }
 
 /// Every second pixel of every second row.
-pub fn every_second(from: &Planes<f32>) -> Planes<f32> {
+pub(crate) fn every_second(from: &Planes<f32>) -> Planes<f32> {
     let mut out = Planes::new(1, from.height / 2, from.width / 2);
     for y in 0..out.height {
         for x in 0..out.width {

@@ -3,7 +3,44 @@
 //!
 //! A stage has a list of [`Maintenance`] operations; after every step those that are due run, in the order of [`RunOrder`]. An
 //! operation changes rows only through [`TrainState::apply`], so it works for every motion model, and losses are notified.
-//! A new one is a file here, and a line where a program adds it to a stage.
+//! A new one is a file here and its entries in `operations!`: its table of settings, and how it is made of it.
+
+/// The list of operations. The recipe, and the settings that every motion model is trained with, get their tables from it.
+macro_rules! operations {
+    // Tables of settings, between those before and after in the recipe.
+    (tables $then:ident { $($before:tt)* } { $($after:tt)* }) => {
+        $then! {
+            $($before)*
+            densify: $crate::maintenance::DensifySettings,
+            adc: $crate::maintenance::AdcSettings,
+            opacity_reset: $crate::maintenance::OpacityResetSettings,
+            mcmc: $crate::maintenance::McmcSettings,
+            relocate: $crate::maintenance::RelocateSettings,
+            guided: $crate::maintenance::GuidedSettings,
+            floaters: $crate::maintenance::FloaterSettings,
+            prune: $crate::maintenance::PruneSettings,
+            merge: $crate::maintenance::MergeSettings,
+            split: $crate::maintenance::SplitSettings,
+            $($after)*
+        }
+    };
+    // Those that the tables of `$of` switch on and every stage has, in the order in which a stage gets them.
+    (made $of:expr) => {{
+        use $crate::maintenance::*;
+        let c = $of;
+        [
+            boxed(Adc::of(c.adc, &c.densify)),
+            boxed(Mcmc::of(c.mcmc, c.relocate.gradient_share, &c.densify)),
+            boxed(MortonOrder::of(&c.densify)),
+            boxed(Relocate::of(c.relocate, &c.densify)),
+            boxed(Floaters::of(c.floaters, &c.densify)),
+            boxed(Prune::of(c.prune)),
+            boxed(Merge::of(c.merge)),
+            boxed(OpacityReset::of(c.opacity_reset, &c.densify)),
+        ]
+    }};
+}
+pub(crate) use operations;
 
 pub(crate) mod adc;
 pub(crate) mod densify;
@@ -46,6 +83,11 @@ use splat4d::render::Antialias;
 use splat4d::scene::params::{OPACITY, QUAT};
 use splat4d::scene::splats::COV;
 use splat4d::scene::{GEOMETRY, Rows, Space, Time};
+
+/// An operation that a stage can have, where its settings switch it on.
+pub(crate) fn boxed(operation: Option<impl Maintenance + 'static>) -> Option<Box<dyn Maintenance>> {
+    operation.map(|o| Box::new(o) as Box<dyn Maintenance>)
+}
 
 /// Limits that hold for every operation of a run.
 #[derive(Clone, Copy, Debug)]

@@ -26,7 +26,7 @@ macro_rules! methods {
         [
             ("still", |_| Box::new(still::StillMethod)),
             ("tracked", |r| Box::new(tracked::TrackedMethod { tracked: r.tracked.clone() })),
-            ("spacetime", |r| Box::new(spacetime::SpacetimeMethod { spacetime: r.spacetime.clone(), guided: r.guided })),
+            ("spacetime", |r| Box::new(spacetime::SpacetimeMethod { spacetime: r.spacetime.clone() })),
             ("control", |r| Box::new(control::ControlMethod { control: r.control.clone(), nodes: r.nodes })),
             ("deform-mlp", |r| Box::new(deform::DeformMethod { deform: r.deform.clone() })),
             ("hexplane", |r| Box::new(hexplane::HexplaneMethod { hexplane: r.hexplane.clone() })),

@@ -5,7 +5,7 @@ use super::auto::CaptureStats;
 use super::still;
 use super::{Group, InitialMotion, Method, Rate, Stage, TrainContext};
 use crate::loss::scene::{LivingOpacity, VelocitySmoothness};
-use crate::maintenance::{Guided, GuidedSettings};
+use crate::maintenance::Guided;
 use crate::settings::{choices, settings};
 use splat4d::motion::spacetime::{FeatureSpec, TIME_FEATURES, VELOCITIES, VIEW_FEATURES};
 use splat4d::motion::{SpacetimeSpec, Spec};
@@ -65,7 +65,6 @@ impl SpacetimeSettings {
 #[derive(Clone, Debug)]
 pub(crate) struct SpacetimeMethod {
     pub spacetime: SpacetimeSettings,
-    pub guided: GuidedSettings,
 }
 
 impl Method for SpacetimeMethod {
@@ -133,7 +132,7 @@ impl Method for SpacetimeMethod {
             stage.groups.push(Group::new(HEAD_IN, c.rates.falling(self.spacetime.head_lr)));
             stage.groups.push(Group::new(HEAD_OUT, c.rates.falling(self.spacetime.head_lr)));
         }
-        if let Some(guided) = Guided::of(self.guided) {
+        if let Some(guided) = Guided::of(c.guided) {
             stage.keep(guided);
         }
         still::learn_life(&mut stage, plan, self.life(plan));

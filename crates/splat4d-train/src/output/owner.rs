@@ -102,7 +102,7 @@ impl Owner {
     /// Makes the folder's state and takes the folder; the inner error is who has it; `None`: its record cannot be read.
     ///
     /// Errors: the folder cannot be written.
-    pub fn take(folder: &Path, command: &str) -> Result<Result<Self, Option<Standing>>> {
+    pub(crate) fn take(folder: &Path, command: &str) -> Result<Result<Self, Option<Standing>>> {
         Self::with_patience(folder, command, Patience { dead: DEAD, watch: WATCH })
     }
 

@@ -2,7 +2,7 @@
 
 use super::Recipe;
 use crate::init::{self, InitSettings};
-use crate::maintenance::{AdcSettings, DENSE, FINEST};
+use crate::maintenance::{DENSE, FINEST, operations};
 use crate::methods::{CommonSettings, Method, TrainContext, filtered, methods, own};
 use crate::{Error, Result};
 use splat4d::motion::{BUILT_IN, MODELS};
@@ -68,29 +68,26 @@ impl Recipe {
 
     /// The recipe's part of a plan, resolved; the capture's part (extent, clip, times, cameras) is still empty.
     pub fn plan(&self) -> TrainContext {
-        let r = self.resolve();
-        let percent_dense = r.percent_dense();
+        let mut r = self.resolve();
+        r.adc.percent_dense = r.percent_dense();
+        macro_rules! common {
+            ($($table:ident: $settings:ty,)*) => {
+                CommonSettings {
+                    appearance: r.appearance,
+                    rates: r.rates,
+                    life: r.life,
+                    loss: r.loss,
+                    $($table: r.$table,)*
+                }
+            };
+        }
         TrainContext {
             seed: r.run.seed,
             iterations: r.run.iterations,
             batch_size: r.run.batch_size,
             half_size_until: r.run.half_size_until,
             predicted: r.capture.observe < 1.0,
-            common: CommonSettings {
-                appearance: r.appearance,
-                rates: r.rates,
-                life: r.life,
-                loss: r.loss,
-                densify: r.densify,
-                adc: AdcSettings { percent_dense, ..r.adc },
-                opacity_reset: r.opacity_reset,
-                mcmc: r.mcmc,
-                relocate: r.relocate,
-                floaters: r.floaters,
-                prune: r.prune,
-                merge: r.merge,
-                split: r.split,
-            },
+            common: operations! { tables common {} {} },
             ..TrainContext::default()
         }
     }

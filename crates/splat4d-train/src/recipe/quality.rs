@@ -29,10 +29,10 @@ const BEST_COUNT: f64 = 2.0;
 
 impl Quality {
     /// All, from the fastest on.
-    pub const ALL: [Self; 3] = [Self::Draft, Self::Standard, Self::Best];
+    pub(crate) const ALL: [Self; 3] = [Self::Draft, Self::Standard, Self::Best];
 
     /// The word for it.
-    pub fn name(self) -> &'static str {
+    pub(crate) fn name(self) -> &'static str {
         match self {
             Self::Draft => "draft",
             Self::Standard => "standard",

@@ -106,7 +106,7 @@ impl Recipe {
     }
 
     /// Settings that were chosen and do nothing in this recipe.
-    pub fn without_effect(&self) -> Vec<UnusedSetting> {
+    pub(crate) fn without_effect(&self) -> Vec<UnusedSetting> {
         let get = |key: &str| self.get(key).expect("conditions name settings");
         let chosen: Vec<String> = self.choices().into_iter().map(|(key, _)| key).collect();
         let mut out = Vec::new();
@@ -190,7 +190,7 @@ impl Recipe {
 
 /// A setting that was chosen and has no effect.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct UnusedSetting {
+pub(crate) struct UnusedSetting {
     /// `table.field`.
     pub key: String,
     /// Whether it says that something is not to be, which it is not anyhow.

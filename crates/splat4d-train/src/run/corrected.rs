@@ -10,7 +10,7 @@ use splat4d::scene::Time;
 use std::path::Path;
 
 /// The file's name in a run.
-pub const FILE: &str = "refined.json";
+pub(crate) const FILE: &str = "refined.json";
 
 /// Writes what the trainer has learnt of cameras, if that is anything.
 pub(super) fn write(run: &Path, trainer: &Trainer<'_>, capture: &Capture) -> Result<()> {

@@ -20,7 +20,7 @@ impl Dataset {
     }
 
     /// The capture whose frames they are.
-    pub fn capture(&self) -> &Arc<Capture> {
+    pub(crate) fn capture(&self) -> &Arc<Capture> {
         &self.capture
     }
 }

@@ -30,7 +30,8 @@ pub use info::recorded_elsewhere;
 pub use memory::{available_memory, memory_estimate, peak_memory};
 #[cfg(test)]
 pub(crate) use open::OpenCapture;
-pub use open::{capture_options, open_capture, open_frames, plan, training_frames};
+pub(crate) use open::training_frames;
+pub use open::{capture_options, open_capture, open_frames, plan};
 pub(crate) use open::{learnable, scale};
 pub use points::with_found;
 pub(crate) use refine::{Refine, refine};

@@ -119,7 +119,7 @@ pub(crate) struct OpenCapture {
 }
 
 /// The training frames of a capture, with as much memory for images as the recipe grants. Errors: there are none.
-pub fn training_frames(capture: Arc<Capture>, recipe: &Recipe) -> Result<Arc<Dataset>> {
+pub(crate) fn training_frames(capture: Arc<Capture>, recipe: &Recipe) -> Result<Arc<Dataset>> {
     if capture.train.is_empty() {
         return Err(Error::input("the capture has no training frames").remedy("Hold out fewer views with --hold-out"));
     }

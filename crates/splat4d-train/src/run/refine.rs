@@ -30,7 +30,7 @@ pub(crate) struct Refine {
     pub scene: Scene<f32>,
     /// The stages, in order. Their hooks may replace the scene.
     pub stages: Vec<Stage>,
-    /// The frames that the scene is compared with ([`training_frames`](super::training_frames)).
+    /// The frames that the scene is compared with (`training_frames`).
     pub frames: Arc<Dataset>,
     /// Losses, background, SH degree, seed, thresholds, steps between checkpoints. Its motion model and its iterations do
     /// not count: the scene and the stages have theirs.

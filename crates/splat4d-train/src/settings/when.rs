@@ -9,7 +9,7 @@ pub enum When {
     Is(&'static str, &'static [&'static str]),
     /// The setting is none of these words.
     IsNot(&'static str, &'static [&'static str]),
-    /// The setting is on: see [`is_off`].
+    /// The setting is on: see `is_off`.
     On(&'static str),
     /// All of these.
     All(&'static [Self]),
@@ -47,7 +47,7 @@ fn is_open(key: &str, word: &str) -> bool {
 }
 
 /// Whether a value says that something is not to be: 0, false, nothing, `none` or `off`.
-pub fn is_off(value: &toml::Value) -> bool {
+pub(crate) fn is_off(value: &toml::Value) -> bool {
     match value {
         toml::Value::Boolean(on) => !on,
         toml::Value::Integer(i) => *i == 0,

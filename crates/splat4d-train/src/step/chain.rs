@@ -10,10 +10,11 @@ pub(crate) use crate::loss::image::{ImageTerm, View};
 pub(crate) use crate::loss::terms::{ParamLoss, Probe, ProbeLoss, StepInfo};
 pub(crate) use crate::train_state::Observation;
 use crate::train_state::StepGrads;
+use splat4d::backward::sh_grads;
 use splat4d::layers::{Evaluation, Scene};
 use splat4d::math::Real;
 use splat4d::render::{Backend, Image, RenderGrads, Shot, Target};
-use splat4d::scene::{Color, Grads, Part, Rows, SH, Space, Splats, Table, Time};
+use splat4d::scene::{Grads, Rows, Space, Table, Time};
 use std::time::{Duration, Instant as Clock};
 
 /// Where a step's time went.
@@ -202,12 +203,11 @@ impl<F: Real> Chain<F> {
             self.picture.backward(&shot, work)?;
         }
         work.report.timings.render += if compared { lap(&mut clock) } else { Duration::ZERO };
-        self.picture.deliver(scene, work);
+        work.report.d_cameras.push(self.picture.d_splats.camera);
+        work.report.d_focals.push(self.picture.d_splats.focal);
         self.picture.report_visibility(&self.evaluation, &asked, work);
         drop(splats);
-        for (&i, part) in asked.iter().zip(&mut self.picture.d_splats.parts) {
-            self.evaluation.add_gradient(i, &mut part.out, &mut part.color, &mut part.weights);
-        }
+        self.picture.d_splats.add_to(scene, view.t, &mut self.evaluation, work.d);
         if let (Some(channels), Some(d_table)) = (&channels, self.picture.d_channels()) {
             channels.backward(d_table, source, &mut self.evaluation, work.d);
         }
@@ -277,7 +277,7 @@ impl<F: Real> Compared<F> {
         target: &Target<'_, F>,
         work: &mut Work<'_, F>,
     ) -> Result<bool> {
-        let mut d_sh = own_sh(shot.splats, work.d);
+        let mut d_sh = sh_grads(shot.splats, work.d);
         let Some(comparison) = work.backend.compare(shot, target, &mut d_sh, &mut self.d_splats)? else {
             return Ok(false);
         };
@@ -288,19 +288,8 @@ impl<F: Real> Compared<F> {
 
     /// The backend's VJP.
     fn backward(&mut self, shot: &Shot<'_, F>, work: &mut Work<'_, F>) -> Result<()> {
-        let mut d_sh = own_sh(shot.splats, work.d);
+        let mut d_sh = sh_grads(shot.splats, work.d);
         work.backend.vjp(shot, &self.d_image.grads(), &mut d_sh, &mut self.d_splats)
-    }
-
-    /// What came back and belongs to no question: the camera's gradients, and the weights of the head, which go to its layer.
-    fn deliver(&self, scene: &Scene<F>, work: &mut Work<'_, F>) {
-        work.report.d_cameras.push(self.d_splats.camera);
-        work.report.d_focals.push(self.d_splats.focal);
-        if let (Some((layer, keys)), Some(head)) = (scene.head_keys(), &self.d_splats.head) {
-            let [first, second] = work.d[layer].of([keys.first, keys.second]);
-            first.data_mut().iter_mut().zip(&head.first).for_each(|(d, x)| *d += *x);
-            second.data_mut().iter_mut().zip(&head.second).for_each(|(d, x)| *d += *x);
-        }
     }
 
     /// Passes to the observer what the view saw of every layer.
@@ -326,16 +315,4 @@ impl<F: Real> Compared<F> {
 fn lap(clock: &mut Clock) -> Duration {
     let now = Clock::now();
     now - std::mem::replace(clock, now)
-}
-
-/// The gradients of the layers' own SH, where that is the colour.
-fn own_sh<'a, F: Real>(splats: &Splats<'_, F>, d: &'a mut [Grads<F>]) -> Vec<Option<&'a mut Table<F>>> {
-    let own = |(d, part): (&'a mut Grads<F>, &Part<'_, F>)| match part.color {
-        Color::Sh { base: true, .. } => {
-            let [table] = d.of([SH]);
-            Some(table)
-        }
-        _ => None,
-    };
-    d.iter_mut().zip(&splats.parts).map(own).collect()
 }

@@ -330,7 +330,7 @@ impl<'a> Trainer<'a> {
     /// Brings the learner up to date, which a device may keep: before it is read between steps. It is so by itself at
     /// the end of every stage. Returns what steps measured that were not done yet. Errors: its numbers are lost, and
     /// the run must go back to a checkpoint.
-    pub fn settle(&mut self) -> std::result::Result<Vec<Measured>, Fault> {
+    pub(crate) fn settle(&mut self) -> std::result::Result<Vec<Measured>, Fault> {
         self.engine.settle(&mut self.train_state).map_err(|fault| self.named(fault))
     }
 

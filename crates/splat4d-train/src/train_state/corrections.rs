@@ -1,4 +1,4 @@
-//! [`Corrections`]: what training learns of where cameras stand and when they looked.
+//! `Corrections`: what training learns of where cameras stand and when they looked.
 //!
 //! A correction of a pose is a twist ξ = (ρ, θ) in the camera's axes, `exp(ξ)·cam_from_world`; all frames of a fixed camera
 //! share one. A correction of a focal length is a share of it, of a camera. A correction of a clock is a shift of
@@ -91,7 +91,7 @@ pub(crate) struct Origin<'a> {
 
 /// The scale of a capture, in which rates are stated.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Scale {
+pub(crate) struct Scale {
     /// The rig's radius, scene units.
     pub extent: f64,
     /// Seconds between two frames.

@@ -18,11 +18,11 @@ const HALVING_BLUR: f64 = 1.0;
 const CORNER: f32 = 1e-5;
 
 /// A grey image at falling sizes.
-pub struct Pyramid(Vec<Planes<f32>>);
+pub(crate) struct Pyramid(Vec<Planes<f32>>);
 
 impl Pyramid {
     /// Of a grey image.
-    pub fn new(grey: Planes<f32>) -> Self {
+    pub(crate) fn new(grey: Planes<f32>) -> Self {
         let mut levels = vec![grey];
         while levels.len() < LEVELS {
             let last = &levels[levels.len() - 1];

@@ -38,7 +38,7 @@ impl Transfer {
     }
 
     /// Where the pixel lies in the other image at an inverse depth; nothing behind that camera.
-    pub fn at(&self, pixel: [f64; 2], inverse: f64) -> Option<[f64; 2]> {
+    pub(crate) fn at(&self, pixel: [f64; 2], inverse: f64) -> Option<[f64; 2]> {
         let q = mat_vec(&self.turn, [pixel[0], pixel[1], 1.0]);
         let q: [f64; 3] = std::array::from_fn(|k| q[k] + inverse * self.shift[k]);
         (q[2] > 0.0).then(|| [q[0] / q[2], q[1] / q[2]])

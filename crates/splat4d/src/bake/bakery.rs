@@ -51,7 +51,8 @@ pub struct Curve {
 
 impl Curve {
     /// Primitives at the least: one for each Gaussian.
-    pub fn least(&self) -> f64 {
+    #[cfg(test)]
+    pub(crate) fn least(&self) -> f64 {
         self.straight as f64 + self.rate.pieces[PRICES - 1]
     }
 
@@ -170,7 +171,7 @@ impl<'a> Bakery<'a> {
     }
 
     /// Whether some motion is not straight, so that there is something to split.
-    pub fn is_curved(&self) -> bool {
+    pub(crate) fn is_curved(&self) -> bool {
         self.layers().iter().any(|l| self.is_split(l) && !Curved::new(l, &self.tree).rows.is_empty())
     }
 

@@ -28,7 +28,7 @@ pub struct Likeness {
 
 /// The primitives of one time as splats; memory is reused.
 #[derive(Debug)]
-pub struct Moment {
+pub(crate) struct Moment {
     out: Table<f32>,
     sh: Table<f32>,
 }

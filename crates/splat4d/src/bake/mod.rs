@@ -32,7 +32,9 @@ use crate::format::playback::Node;
 use crate::layers::Scene;
 use crate::scene::Camera;
 pub use bakery::{Bakery, Curve, Cut};
-pub use compare::{Likeness, Moment, Shown, compare};
+#[cfg(test)]
+pub(crate) use compare::Moment;
+pub use compare::{Likeness, Shown, compare};
 
 /// Default of [`Options::tolerance`], pixels: on models that no straight line holds, baked and model then differ by
 /// less than 40 dB can show (measured; see the tests), at a fraction of the pieces that a tenth of it would need.
@@ -44,10 +46,10 @@ pub const LOOKS: f64 = 30.0;
 /// Most rounds of [`Options::repeat`].
 pub const MAX_REPEAT: usize = 10_000;
 /// Default of [`Options::renders`]: as many as pay off.
-pub const RENDERS: usize =
+pub(crate) const RENDERS: usize =
     if weights::STILL_RENDERS > weights::PATH_RENDERS { weights::STILL_RENDERS } else { weights::PATH_RENDERS };
 /// Default of [`Options::samples`]: 30,000 Gaussians at 27 seconds of 30 frames a second.
-pub const SAMPLES: usize = 24_000_000;
+pub(crate) const SAMPLES: usize = 24_000_000;
 
 /// Options of baking.
 #[derive(Clone, Debug)]

@@ -300,7 +300,7 @@ impl Dragging {
     }
 }
 
-/// Writes a drag into the layer that [`Bend::around`] put it around.
+/// Writes a drag into the layer that `Bend::around` put it around.
 fn fill(layer: &mut Layer<f32>, offsets: &NodeOffsets) {
     let motion = layer.motion.clone();
     let edited = Edited::of(motion.as_ref()).expect("the drag was put around it");

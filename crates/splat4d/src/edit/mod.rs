@@ -25,7 +25,7 @@ use crate::{Error, ErrorKind, Result};
 use serde::{Deserialize, Serialize};
 
 /// The version of the list of steps that this library reads and writes.
-pub const VERSION: u32 = 1;
+pub(crate) const VERSION: u32 = 1;
 /// Most steps: a bound for files.
 const MOST_STEPS: usize = 10_000;
 
@@ -33,7 +33,7 @@ const MOST_STEPS: usize = 10_000;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Edits {
-    /// [`VERSION`].
+    /// `VERSION`.
     pub version: u32,
     /// Title of the scene that they were made for; none: any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -235,7 +235,7 @@ pub enum Step {
 
 impl Step {
     /// Its name in files.
-    pub fn name(&self) -> &'static str {
+    pub(crate) fn name(&self) -> &'static str {
         match self {
             Step::Delete { .. } => "delete",
             Step::Crop { .. } => "crop",

@@ -1,11 +1,8 @@
-//! From flow in images back to flow in space: one camera with depth, several cameras without; integration over frames
-//! and how far it drifts.
+//! From flow in images back to flow in space with one camera's depth; integration over frames and how far it drifts.
 //!
 //! One camera cannot observe motion along its rays: with the depth of one frame alone ([`lift_in_plane`]) that part is
-//! left out, with both frames' depths ([`lift`]) it is there, and with three or more cameras ([`triangulate`]) it
-//! follows.
+//! left out, with both frames' depths ([`lift`]) it is there.
 
-use crate::math::sym3;
 use crate::scene::Camera;
 
 /// Two points on a pixel ray: the start by its depth z, the end by the flow and its own depth. World, scene units.
@@ -21,59 +18,6 @@ pub fn lift(from: &Camera, to: &Camera, pixel: [f64; 2], flow: [f64; 2], depth: 
 /// motion along the viewing direction is missing. The camera stands still.
 pub fn lift_in_plane(camera: &Camera, pixel: [f64; 2], flow: [f64; 2], depth: f64) -> [f64; 3] {
     lift(camera, camera, pixel, flow, depth, depth)
-}
-
-/// One camera's observation of a point's motion.
-#[derive(Clone, Copy, Debug)]
-pub struct Observation<'a> {
-    /// From where (pinhole, standing still).
-    pub camera: &'a Camera,
-    /// The point's flow in its image, pixels.
-    pub flow: [f64; 2],
-    /// Confidence, ≥ 0.
-    pub weight: f64,
-}
-
-/// Smallest eigenvalue of the normal equations, of the largest, that counts as a direction that was seen.
-const SEEN: f64 = 1e-9;
-
-/// The displacement of the point `x` that explains all flows best: weighted least squares J_c s = F_c over cameras, J the
-/// Jacobian of the projection at x. Also returns how many directions of space the cameras saw (3: all). What no camera
-/// saw is zero.
-///
-/// One camera sees 2, so that its answer lacks the motion along its ray. First order in s: exact for small motions.
-pub fn triangulate(x: [f64; 3], sights: &[Observation<'_>]) -> ([f64; 3], usize) {
-    let (mut a, mut b) = ([0.0; 6], [0.0; 3]);
-    for sight in sights {
-        let p = sight.camera.cam_from_world.apply(x);
-        if p[2] <= 1e-9 {
-            continue;
-        }
-        let k = &sight.camera.intrinsics;
-        let r = &sight.camera.cam_from_world.rotation;
-        let row = |f: f64, axis: usize| -> [f64; 3] {
-            std::array::from_fn(|j| f * (r[axis][j] / p[2] - p[axis] / (p[2] * p[2]) * r[2][j]))
-        };
-        for (j, f) in [(row(k.fx, 0), sight.flow[0]), (row(k.fy, 1), sight.flow[1])] {
-            let w = sight.weight;
-            for (slot, (u, v)) in [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)].into_iter().enumerate() {
-                a[slot] += w * j[u] * j[v];
-            }
-            (0..3).for_each(|u| b[u] += w * j[u] * f);
-        }
-    }
-    let (values, columns) = sym3::eigen(a);
-    let top = values.iter().copied().fold(0.0, f64::max);
-    let (mut out, mut rank) = ([0.0; 3], 0);
-    for (k, value) in values.iter().enumerate() {
-        let v = columns.map(|row| row[k]);
-        if *value > SEEN * top && top > 0.0 {
-            rank += 1;
-            let along = (v[0] * b[0] + v[1] * b[1] + v[2] * b[2]) / value;
-            (0..3).for_each(|k| out[k] += along * v[k]);
-        }
-    }
-    (out, rank)
 }
 
 /// How a field of velocities is followed.
@@ -167,23 +111,6 @@ mod tests {
         let turned = mat_vec(&a.cam_from_world.inverse().rotation, [0.1, 0.05, 0.0]);
         let flow = flow_of(&a, x, turned);
         assert!(near(lift_in_plane(&a, p, flow, za), turned, 1e-12));
-    }
-
-    #[test]
-    fn three_cameras_see_all_of_a_motion_and_one_does_not() {
-        let cameras = [camera(0.0), camera(70.0), camera(-50.0)];
-        let (x, s) = ([0.2, 0.1, -0.3], [1e-5, -2e-5, 1.5e-5]);
-        let sights: Vec<Observation<'_>> =
-            cameras.iter().map(|camera| Observation { camera, flow: flow_of(camera, x, s), weight: 1.0 }).collect();
-        let (found, rank) = triangulate(x, &sights);
-        assert!(rank == 3 && near(found, s, 1e-9), "{found:?}");
-        let (alone, rank) = triangulate(x, &sights[..1]);
-        assert_eq!(rank, 2);
-        let ray = camera(0.0).center();
-        let ray: [f64; 3] = std::array::from_fn(|k| x[k] - ray[k]);
-        let along: f64 = (0..3).map(|k| alone[k] * ray[k]).sum();
-        assert!(along.abs() < 1e-9, "what it did not see is zero: {along}");
-        assert_eq!(triangulate(x, &[]).1, 0);
     }
 
     #[test]

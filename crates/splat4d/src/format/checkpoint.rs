@@ -14,7 +14,7 @@ use crate::scene::{GEOMETRY, Params, SH};
 use crate::{Error, ErrorKind, Result};
 
 /// Files of torch.save.
-pub const DIALECT: Dialect = Dialect {
+pub(crate) const DIALECT: Dialect = Dialect {
     name: "checkpoint of PyTorch",
     ending: ".pt",
     up: Y_DOWN,

@@ -63,9 +63,9 @@ pub struct WriteOptions {
     pub cameras: Vec<Camera>,
     /// Refuse Gaussians whose fade in time the dialect cannot say exactly, in place of fitting one.
     pub exact: bool,
-    /// Which way is up, for dialects whose files say so; [`Dialect::write`] takes it from the scene.
+    /// Which way is up, for dialects whose files say so; `Dialect::write` takes it from the scene.
     pub up: [f64; 3],
-    /// The scene's offset; [`Dialect::write`] sets it.
+    /// The scene's offset; `Dialect::write` sets it.
     pub offset: [f64; 3],
     /// Write positions of the world: the offset is added, in double precision. Only .ply can.
     pub world: bool,
@@ -151,7 +151,7 @@ impl Dialect {
     }
 
     /// The last part of its ending: `.ply` of `.compressed.ply`.
-    pub fn extension(&self) -> &'static str {
+    pub(crate) fn extension(&self) -> &'static str {
         &self.ending[self.ending.rfind('.').unwrap_or(0)..]
     }
 

@@ -19,7 +19,7 @@ use crate::{Error, Result};
 use std::sync::Arc;
 
 /// params.npz of Dynamic3DGaussians.
-pub const DIALECT: Dialect = Dialect {
+pub(crate) const DIALECT: Dialect = Dialect {
     name: "Dynamic3DGaussians .npz",
     ending: ".npz",
     up: Y_DOWN,

@@ -31,16 +31,16 @@ macro_rules! dtypes {
         /// Element type of an array; names and sizes as in the format.
         #[derive(Clone, Copy, Debug, PartialEq, Eq)]
         #[non_exhaustive]
-        pub enum Dtype { $($(#[$doc])* $name,)* }
+        pub(crate) enum Dtype { $($(#[$doc])* $name,)* }
 
         impl Dtype {
             /// The name in the header.
-            pub fn name(self) -> &'static str {
+            pub(crate) fn name(self) -> &'static str {
                 match self { $(Dtype::$name => $text,)* }
             }
 
             /// Bytes a number.
-            pub fn size(self) -> usize {
+            pub(crate) fn size(self) -> usize {
                 match self { $(Dtype::$name => $size,)* }
             }
 

@@ -56,7 +56,7 @@ pub fn read(bytes: &[u8]) -> Result<(Params, Warnings)> {
 }
 
 /// Writes Gaussians in their order; view dependence is left out. Errors: the sink's.
-pub fn write(params: &Params, out: &mut impl Write) -> Result<Warnings> {
+pub(crate) fn write(params: &Params, out: &mut impl Write) -> Result<Warnings> {
     let mut warnings = Warnings::default();
     let (geometry, sh) = (&params[GEOMETRY], &params[SH]);
     if sh.width() > 3 {

@@ -31,7 +31,7 @@ pub const DIALECT: Dialect = Dialect {
 };
 
 /// First four bytes.
-pub const MAGIC: [u8; 4] = 0x674Bu32.to_le_bytes();
+pub(crate) const MAGIC: [u8; 4] = 0x674Bu32.to_le_bytes();
 /// Bytes a Gaussian.
 const ROW: usize = 64;
 /// Texels a row of the texture, 16 bytes each: the players' shaders compute with 1024 Gaussians a row.

@@ -108,7 +108,7 @@ impl<'a> Archive<'a> {
     }
 
     /// Name of the file whose bytes stand first.
-    pub fn first(&self) -> Option<&str> {
+    pub(crate) fn first(&self) -> Option<&str> {
         self.entries.iter().min_by_key(|(_, e)| e.body.start).map(|(name, _)| name.as_str())
     }
 

@@ -52,7 +52,7 @@ pub(super) struct Layout {
 pub(super) struct Came {
     /// Gradient to the background, by tile.
     pub sums: Vec<f32>,
-    /// Of every splat [`NUMBERS`].
+    /// Of every splat `NUMBERS`.
     pub rows: Vec<f32>,
     /// Gradient to pose and focal lengths.
     pub camera: [f64; CAMERA],

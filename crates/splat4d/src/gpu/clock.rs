@@ -94,7 +94,7 @@ impl GpuTimings {
     }
 
     /// The GPU's stages by name, in the order in which they run.
-    pub fn stages(&self) -> [(&'static str, f64); STAGES] {
+    pub(crate) fn stages(&self) -> [(&'static str, f64); STAGES] {
         [
             ("answer", self.answer),
             ("project", self.project),

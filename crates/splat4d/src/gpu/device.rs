@@ -106,7 +106,7 @@ impl Gpu {
     }
 
     /// The card's name as its driver gives it.
-    pub fn name(&self) -> &str {
+    pub(crate) fn name(&self) -> &str {
         &self.info.name
     }
 

@@ -8,7 +8,7 @@ use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::{GEOMETRY, Params, SH, Time};
 
 /// Opacity (logit) of a Gaussian that does not live: alpha 2·10⁻⁹, far below what is rendered.
-pub const HIDDEN: f32 = -20.0;
+pub(crate) const HIDDEN: f32 = -20.0;
 
 /// The frames of a scene as rows that are the same Gaussian in all of them.
 pub struct Constant<'a> {
@@ -57,16 +57,16 @@ impl<'a> Constant<'a> {
     }
 
     /// Whether no Gaussian is ever alive.
-    pub fn is_empty(&self) -> bool {
+    pub(crate) fn is_empty(&self) -> bool {
         self.first.is_empty()
     }
 
     /// The times of the frames, seconds.
-    pub fn times(&self) -> &[f64] {
+    pub(crate) fn times(&self) -> &[f64] {
         &self.times
     }
 
-    /// Frame `i`, whose opacities are [`HIDDEN`] where a Gaussian does not live. Frames are asked for one after the
+    /// Frame `i`, whose opacities are `HIDDEN` where a Gaussian does not live. Frames are asked for one after the
     /// other; frame 0 begins again. Rotations keep the sign and the order of axes that are nearest to the frame before.
     pub fn frame(&mut self, i: usize) -> &Params<f32> {
         if i == 0 {

@@ -23,7 +23,7 @@ fn cannot(what: &str, remedy: &str) -> Error {
 
 /// The layer as a polynomial of time where its model is one in other numbers (`native4d`); else the layer as it is.
 ///
-/// Errors: those of [`to_spacetime`].
+/// Errors: those of `to_spacetime`.
 pub(crate) fn with_polynomial<F: Real>(layer: &Layer<F>) -> Result<Cow<'_, Layer<F>>> {
     match layer.motion.spec() {
         Spec::Native4d(_) => to_spacetime(layer).map(Cow::Owned),

@@ -33,7 +33,7 @@ impl<F: Real> Layer<F> {
     }
 
     /// Whether it ever cross-fades.
-    pub fn cross_fades(&self) -> bool {
+    pub(crate) fn cross_fades(&self) -> bool {
         self.cross_fade != [0.0; 2]
     }
 }

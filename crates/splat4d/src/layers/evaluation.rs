@@ -233,7 +233,7 @@ impl<F: Real> Query<F> {
 
 /// Shows the answers to many questions for the Gaussians of one layer, of which one is held at a time, however many there are. The motion
 /// model hears of all of them first, so that one that scans through time does so once.
-pub fn sweep<F: Real>(layer: &Layer<F>, asked: &[(Rows<'_>, Time)], mut show: impl FnMut(usize, &LayerTape<F>)) {
+pub(crate) fn sweep<F: Real>(layer: &Layer<F>, asked: &[(Rows<'_>, Time)], mut show: impl FnMut(usize, &LayerTape<F>)) {
     let (p, of) = (&layer.params, Space::Gaussians);
     let (mut cache, mut tape) = (Cache::default(), LayerTape::default());
     let questions: Vec<At<'_, F>> = asked.iter().map(|&(rows, t)| At { p, of, rows, t }).collect();

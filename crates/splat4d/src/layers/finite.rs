@@ -10,7 +10,7 @@ const REMEDY: &str = "The scene is damaged, or an edit made its numbers too larg
 
 impl Params<f32> {
     /// Errors: a number of a table is NaN or infinite; its row and column are named.
-    pub fn check_finite(&self) -> Result<()> {
+    pub(crate) fn check_finite(&self) -> Result<()> {
         let Some((key, row, column)) = self.first_non_finite() else { return Ok(()) };
         let name = self.column_name(key, column);
         let whose = if self.info(key).space == Space::Gaussians { "Gaussian" } else { "row" };
@@ -45,7 +45,7 @@ impl Layer<f32> {
 
 impl Scene<f32> {
     /// Errors: a number of the scene is NaN or infinite; its layer, column and row are named.
-    pub fn check_finite(&self) -> Result<()> {
+    pub(crate) fn check_finite(&self) -> Result<()> {
         let bad = |what: &str| Err(Error::input(format!("the scene's {what} is NaN or infinite")).remedy(REMEDY));
         if !self.clip.iter().all(|t| t.is_finite()) {
             return bad("clip");

@@ -13,10 +13,12 @@ mod rotate;
 #[cfg(test)]
 mod tests;
 
-pub use constant::{Constant, HIDDEN};
+pub use constant::Constant;
+pub(crate) use constant::HIDDEN;
 pub(crate) use convert::with_polynomial;
 pub use convert::{to_native4d, to_spacetime};
-pub use evaluation::{Evaluation, sweep};
+pub use evaluation::Evaluation;
+pub(crate) use evaluation::sweep;
 pub use freeze::{Gaussians, freeze, freeze_rows, moment};
 pub use rotate::rotation_between;
 
@@ -147,12 +149,12 @@ impl<F: Real> LayerTape<F> {
     }
 
     /// The space asked for.
-    pub fn space(&self) -> Space {
+    pub(crate) fn space(&self) -> Space {
         self.of
     }
 
     /// The time asked for.
-    pub fn time(&self) -> Time {
+    pub(crate) fn time(&self) -> Time {
         self.t
     }
 
@@ -396,7 +398,7 @@ impl Head {
     }
 
     /// The head of that name.
-    pub fn from_name(name: &str) -> Option<Self> {
+    pub(crate) fn from_name(name: &str) -> Option<Self> {
         [Head::Identity, Head::Features].into_iter().find(|h| h.name() == name)
     }
 }

@@ -210,6 +210,7 @@ fn rotate(a: &mut Mat3, v: &mut Mat3, p: usize, q: usize) {
 }
 
 /// The Γ with ΓΣ + ΣΓ = V (Lyapunov's equation).
+#[cfg(test)]
 pub(crate) fn lyapunov(sigma: &Eigen, v: &Mat3) -> Mat3 {
     sigma.weigh(v, |x, y| 1.0 / (x + y))
 }
@@ -270,7 +271,8 @@ pub(crate) fn log(from: &Mat3, to: &Mat3) -> Mat3 {
 }
 
 /// The covariances' part of the exponential at Σ of V: (I+Γ)Σ(I+Γ) with ΓΣ + ΣΓ = V, I+Γ kept above `STRETCH_MIN`.
-pub fn exp(sigma: &Mat3, v: &Mat3) -> Mat3 {
+#[cfg(test)]
+pub(crate) fn exp(sigma: &Mat3, v: &Mat3) -> Mat3 {
     let gamma = lyapunov(&Eigen::of_covariance(sigma), v);
     let stretch = Eigen::of(&mix(1.0, &IDENTITY, 1.0, &gamma)).map(|x| x.max(STRETCH_MIN));
     sandwich(&stretch, sigma)

@@ -80,7 +80,7 @@ const TIME_AXES: [[usize; 3]; 3] = [[0, 1, 3], [1, 2, 3], [0, 2, 3]];
 /// Numbers of a point that grids see.
 const POINT: usize = 4;
 /// Name of the table that holds the centre and the half side of the box of the initial cloud, scene units.
-pub const BOUNDS: &str = "deform_bounds";
+pub(crate) const BOUNDS: &str = "deform_bounds";
 /// Share of the points that may lie outside the box on either side of an axis.
 const OUTSIDE: f64 = 0.005;
 /// The box is this much larger than what holds the points.
@@ -248,15 +248,6 @@ impl Deform {
         let Eyes::Hashed { grids } = &self.eyes else { return Vec::new() };
         let levels = grids.iter().map(|g| g.columns().len()).max().unwrap_or(0);
         (0..levels).map(|l| grids.iter().filter_map(|g| g.columns().get(l).cloned()).collect()).collect()
-    }
-
-    /// Says whether the networks learn: while they do not and move nothing, they are not evaluated (a static start costs what
-    /// `still` costs).
-    pub fn set_trainable<F: Real>(&self, p: &mut Params<F>, learns: bool) {
-        let keys: Vec<Key> = self.trunk.keys().collect();
-        for key in keys {
-            p.info_mut(key).trainable = learns;
-        }
     }
 
     /// t̂ and dt̂/dt.

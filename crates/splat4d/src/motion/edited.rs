@@ -19,7 +19,8 @@ mod path;
 mod tests;
 
 pub use color::ColorMap;
-pub use drag::{DragSpec, NodeOffset, NodeOffsets};
+pub use drag::DragSpec;
+pub(crate) use drag::{NodeOffset, NodeOffsets};
 pub(crate) use path::eased;
 pub use path::{FadeKey, PathKey};
 
@@ -147,7 +148,7 @@ fn capabilities(inner: Capabilities, change: &Change) -> Capabilities {
 }
 
 /// See the module's documentation.
-pub struct Edited<F: Real = f32> {
+pub(crate) struct Edited<F: Real = f32> {
     inner: Arc<dyn Motion<F>>,
     change: Change,
     /// Where a drag has its numbers.
@@ -187,7 +188,7 @@ impl<F: Real> Edited<F> {
     /// Puts a change around a model that is there already; of a drag the tables are made, or those of a file claimed.
     ///
     /// Errors: a change out of its ranges, loaded arrays of the wrong shape.
-    pub fn around(inner: Arc<dyn Motion<F>>, change: Change, p: &mut Params<F>) -> Result<Self> {
+    pub(crate) fn around(inner: Arc<dyn Motion<F>>, change: Change, p: &mut Params<F>) -> Result<Self> {
         change.check()?;
         let drag = match &change {
             Change::Drag(spec) => Some(drag::Keys::new(spec, p)?),
@@ -197,22 +198,22 @@ impl<F: Real> Edited<F> {
     }
 
     /// The edited model that a layer moves by, if it does.
-    pub fn of(motion: &dyn Motion<F>) -> Option<&Self> {
+    pub(crate) fn of(motion: &dyn Motion<F>) -> Option<&Self> {
         (motion as &dyn Any).downcast_ref()
     }
 
     /// The model inside.
-    pub fn inner(&self) -> &Arc<dyn Motion<F>> {
+    pub(crate) fn inner(&self) -> &Arc<dyn Motion<F>> {
         &self.inner
     }
 
     /// The change around it.
-    pub fn change(&self) -> &Change {
+    pub(crate) fn change(&self) -> &Change {
         &self.change
     }
 
     /// Writes the numbers of a drag into its tables. Panics: the change is no drag, or has another shape.
-    pub fn fill_drag(&self, from: &NodeOffsets, p: &mut Params<F>) {
+    pub(crate) fn fill_drag(&self, from: &NodeOffsets, p: &mut Params<F>) {
         let (Change::Drag(spec), Some(keys)) = (&self.change, &self.drag) else { panic!("this edit drags nothing") };
         keys.fill(spec, from, p);
     }

@@ -23,7 +23,8 @@ mod row;
 #[cfg(test)]
 mod tests;
 
-pub use row::{Fused, FusedGrads, Fusion, Normal, Prediction, Predictor};
+pub(crate) use row::Fused;
+pub use row::{Fusion, Normal, Prediction, Predictor};
 
 use super::{At, Cache, Capabilities, Model, Motion, Phase, Spec, Tape};
 use crate::math::{Real, Rng};

@@ -33,7 +33,8 @@ use std::sync::Arc;
 use registry::registry;
 
 pub use outside::{MakeMotion, is_registered, register};
-pub use registry::{Capabilities, Model, Phase, Polynomial, Slices};
+pub(crate) use registry::Model;
+pub use registry::{Capabilities, Phase, Polynomial, Slices};
 pub use spacetime::{Spacetime, SpacetimeSpec};
 pub use still::Still;
 
@@ -229,7 +230,7 @@ pub trait Motion<F: Real = f32>: Any + Send + Sync {
 }
 
 /// dμ/dt by central differences over ± `VELOCITY_STEP`.
-pub fn central_velocity<F: Real, M: Motion<F> + ?Sized>(model: &M, q: &At<'_, F>, out: &mut Table<F>) {
+pub(crate) fn central_velocity<F: Real, M: Motion<F> + ?Sized>(model: &M, q: &At<'_, F>, out: &mut Table<F>) {
     let sides = [-VELOCITY_STEP, VELOCITY_STEP].map(|h| {
         let side = At { t: Time(q.t.0 + h), ..*q };
         let (mut cache, mut tape) = (Cache::default(), Tape::default());

@@ -10,7 +10,7 @@ use crate::scene::{GEOMETRY, Key, LIFE, Params};
 use std::sync::Arc;
 
 /// A built-in model as plain data: the payload of its entry in the list.
-pub trait Model {
+pub(crate) trait Model {
     /// Makes the model, and in `p` the tables it needs (or claims the loaded ones).
     ///
     /// Errors: numbers that are out of their ranges, loaded arrays of the wrong shape.
@@ -136,7 +136,7 @@ impl Polynomial {
 /// Makes of the list of models `Spec`, the names, and all that is asked of a model by its spec.
 ///
 /// `models` train by themselves, `wrappers` around another one. An entry names the variant, what binds its payload and
-/// the payload's type, the model's name, and a reference to what implements [`Model`].
+/// the payload's type, the model's name, and a reference to what implements `Model`.
 macro_rules! registry {
     (
         models { $($(#[$doc:meta])* $variant:ident $(($bound:ident: $spec:ty))? = $name:literal => $model:expr;)* }
@@ -174,7 +174,7 @@ macro_rules! registry {
             }
 
             /// The model inside a wrapper. `None`: it wraps none.
-            pub fn inner(&self) -> Option<&Spec> {
+            pub(crate) fn inner(&self) -> Option<&Spec> {
                 match self {
                     $(Spec::$w_variant(spec) => Some(&spec.inner),)*
                     _ => None,
@@ -182,7 +182,7 @@ macro_rules! registry {
             }
 
             /// Whether [`build`] can make it.
-            pub fn is_built_in(&self) -> bool {
+            pub(crate) fn is_built_in(&self) -> bool {
                 !matches!(self, Spec::Custom(_))
             }
 

@@ -13,7 +13,7 @@
 //!
 //! Nothing is detached (the reference stops the gradient at x and p inside the blend): finite differences hold for every
 //! table. What is not learnt is which nodes are looked at: every Gaussian has a list of the nearest ones, refreshed by
-//! [`Skinned::bind`] now and then; among them the weights choose again at every step, continuously.
+//! `Skinned::bind` now and then; among them the weights choose again at every step, continuously.
 
 mod blend;
 mod offset;
@@ -61,7 +61,7 @@ pub const NODE_HYPER: usize = 5;
 /// Numbers of a node's pose: shift 3, quaternion residual about the identity 4.
 pub(crate) const POSE: usize = 7;
 /// Columns of a table of poses.
-pub const POSE_COLUMNS: [(&str, usize); 2] = [("shift", 3), ("turn", 4)];
+pub(crate) const POSE_COLUMNS: [(&str, usize); 2] = [("shift", 3), ("turn", 4)];
 
 /// The trajectories of control nodes.
 pub trait Trajectory<F: Real>: Send + Sync {
@@ -116,7 +116,7 @@ impl Default for SkinSpec {
 
 impl SkinSpec {
     /// Errors: a number out of its range.
-    pub fn check(&self) -> Result<()> {
+    pub(crate) fn check(&self) -> Result<()> {
         let ranges = [
             ("nodes", self.nodes, 0, MAX_NODES),
             ("neighbours", self.neighbours, 1, MAX_NEIGHBOURS),
@@ -154,7 +154,7 @@ impl Skin {
     ///
     /// Where the layer has fewer Gaussians than `spec.nodes`, there are as many nodes as Gaussians. Errors: numbers of the
     /// spec out of range, loaded arrays of the wrong shape.
-    pub fn new<F: Real>(spec: SkinSpec, seed: u64, p: &mut Params<F>) -> Result<Self> {
+    pub(crate) fn new<F: Real>(spec: SkinSpec, seed: u64, p: &mut Params<F>) -> Result<Self> {
         spec.check()?;
         let rows = p.len();
         let loaded = p.unclaimed().iter().find(|a| a.name == "node_means").map(|a| a.rows);
@@ -289,12 +289,12 @@ impl<F: Real> Skinned<F> {
     }
 
     /// The same, as a layer holds it.
-    pub fn shared(skin: Skin, trajectory: Box<dyn Trajectory<F>>, spec: Spec) -> Arc<dyn Motion<F>> {
+    pub(crate) fn shared(skin: Skin, trajectory: Box<dyn Trajectory<F>>, spec: Spec) -> Arc<dyn Motion<F>> {
         Arc::new(Self::new(skin, trajectory, spec))
     }
 
     /// Refreshes every Gaussian's list of nearest nodes; training does so now and then.
-    pub fn bind(&self, p: &mut Params<F>) {
+    pub(crate) fn bind(&self, p: &mut Params<F>) {
         self.skin.bind(p);
     }
 

@@ -124,7 +124,7 @@ impl Default for SsmSpec {
 
 impl SsmSpec {
     /// Errors: a number out of its range.
-    pub fn check(&self) -> Result<()> {
+    pub(crate) fn check(&self) -> Result<()> {
         self.skin.check()?;
         let broken = |what: String| {
             Err(Error::input(what).remedy("The file is damaged or was written by another program; export it again"))
@@ -164,9 +164,9 @@ pub(crate) struct Field {
 }
 
 /// Name of the table of embeddings, \[nodes, D\].
-pub const EMBEDDINGS: &str = "node_embeddings";
+pub(crate) const EMBEDDINGS: &str = "node_embeddings";
 /// Name of the table of what nodes know of their surroundings.
-pub const CONTEXT: &str = "node_context";
+pub(crate) const CONTEXT: &str = "node_context";
 /// Numbers a node has at a tick of a scan: its pose and the gradient to it, as they are and on their way.
 const TICK: usize = 32;
 /// Spread of the embeddings at the start.

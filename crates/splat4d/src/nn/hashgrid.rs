@@ -132,7 +132,7 @@ impl HashGrid {
     }
 
     /// The sizes.
-    pub fn shape(&self) -> HashShape {
+    pub(crate) fn shape(&self) -> HashShape {
         self.shape
     }
 

@@ -324,13 +324,13 @@ impl Mlp {
     }
 
     /// Whether the last map is zero, so that everything that comes out is; nothing but it has a gradient then.
-    pub fn is_zero<F: Real>(&self, p: &Params<F>) -> bool {
+    pub(crate) fn is_zero<F: Real>(&self, p: &Params<F>) -> bool {
         let Map { weight, bias, .. } = self.maps[self.shape.layers];
         [weight, bias].iter().all(|&key| p[key].data().iter().all(|x| *x == F::ZERO))
     }
 
     /// Keys of every table.
-    pub fn keys(&self) -> impl Iterator<Item = Key> + '_ {
+    pub(crate) fn keys(&self) -> impl Iterator<Item = Key> + '_ {
         self.maps.iter().flat_map(|m| [m.weight, m.bias])
     }
 

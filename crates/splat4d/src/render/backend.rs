@@ -45,7 +45,7 @@ impl<'a, F: Real> Shot<'a, F> {
     }
 
     /// Abilities that drawing it takes.
-    pub fn wanted(&self) -> Wanted {
+    pub(crate) fn wanted(&self) -> Wanted {
         Wanted { extra: self.extra.is_some(), head: self.splats.head.is_some(), ..Wanted::default() }
     }
 }

@@ -19,7 +19,7 @@ pub struct PairCounts {
 
 impl<F: Real> Raster<F> {
     /// Counts of what [`Raster::blend`] does with the pairs that are held (all of them, but for absurd scenes).
-    pub fn count_pairs(&self, config: &RenderConfig) -> PairCounts {
+    pub(crate) fn count_pairs(&self, config: &RenderConfig) -> PairCounts {
         let limits = Limits::new(config);
         let counts = self.bins.starts.par_windows(2).enumerate().map(|(bin, pair)| {
             let records = &self.records[pair[0] as usize..pair[1] as usize];

@@ -61,7 +61,7 @@ impl Importance {
         Self { renderer: Renderer::new(config) }
     }
 
-    /// See [`Renderer::contributions`].
+    /// See `Renderer::contributions`.
     pub fn contributions(&mut self, splats: &Splats<'_>, camera: &Camera, out: &mut Vec<f32>) {
         self.renderer.contributions(splats, camera, out);
     }
@@ -71,7 +71,7 @@ impl Importance {
         self.renderer.last_contributions(out);
     }
 
-    /// See [`Renderer::removals`].
+    /// See `Renderer::removals`.
     pub fn removals(&mut self, shot: &Shot<'_>, out: &mut Vec<f32>) {
         self.renderer.removals(shot, out);
     }
@@ -82,12 +82,12 @@ impl Importance {
     }
 
     /// Splats as a camera sees them, before any is blended, one a splat.
-    pub fn project(&mut self, splats: &Splats<'_>, camera: &Camera) -> &[Projected] {
+    pub(crate) fn project(&mut self, splats: &Splats<'_>, camera: &Camera) -> &[Projected] {
         self.renderer.list(splats, camera);
         self.renderer.projected()
     }
 
-    /// See [`Renderer::projected`].
+    /// See `Renderer::projected`.
     pub fn projected(&self) -> &[Projected] {
         self.renderer.projected()
     }
@@ -100,12 +100,12 @@ impl<F: Real> Renderer<F> {
     /// Costs
     /// less than a render's blend. Source: the significance of LightGaussian (Fan et al. 2024) and the spatial score of
     /// 4DGS-1K (Yuan et al. 2025).
-    pub fn contributions(&mut self, splats: &Splats<'_, F>, camera: &Camera, out: &mut Vec<F>) {
+    pub(crate) fn contributions(&mut self, splats: &Splats<'_, F>, camera: &Camera, out: &mut Vec<F>) {
         self.list(splats, camera);
         self.last_contributions(out);
     }
 
-    /// [`Renderer::contributions`] of what was drawn last. A backward may still follow.
+    /// `Renderer::contributions` of what was drawn last. A backward may still follow.
     pub(crate) fn last_contributions(&mut self, out: &mut Vec<F>) {
         self.score_all::<Contribution>(None, out);
     }
@@ -117,7 +117,7 @@ impl<F: Real> Renderer<F> {
     /// Neither head nor further channels are looked at: it is the base colours' image that changes. `out` is
     /// overwritten,
     /// one a splat. Draws by itself; no backward may follow.
-    pub fn removals(&mut self, shot: &Shot<'_, F>, out: &mut Vec<F>) {
+    pub(crate) fn removals(&mut self, shot: &Shot<'_, F>, out: &mut Vec<F>) {
         self.list_and_blend(shot);
         self.score_all::<Removal>(Some(shot.background), out);
     }

@@ -502,7 +502,7 @@ impl<F: Real> Renderer<F> {
     }
 
     /// Screen ellipses of the last render, one a splat; radius 0: not drawn.
-    pub fn projected(&self) -> &[Projected<F>] {
+    pub(crate) fn projected(&self) -> &[Projected<F>] {
         &self.projected
     }
 

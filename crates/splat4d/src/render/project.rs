@@ -206,13 +206,14 @@ fn compensation<F: Real>(view: &View<F>, e: &Ellipse<F>) -> (F, bool) {
 /// Projects one Gaussian: mean and packed covariance in the world, opacity in (0,1).
 ///
 /// `None`, culled: z ≤ near, opacity (after ρ) below the α cut-off, determinant ≤ 0, anything not finite.
+#[cfg(test)]
 #[inline(always)]
-pub fn project<F: Real>(view: &View<F>, mean: [F; 3], cov: [F; 6], opacity: F) -> Option<Projected<F>> {
+pub(crate) fn project<F: Real>(view: &View<F>, mean: [F; 3], cov: [F; 6], opacity: F) -> Option<Projected<F>> {
     let (out, drawn) = screen(view, mean, cov, opacity);
     drawn.then_some(out)
 }
 
-/// [`project`] without a branch, so that a loop over it is a loop over vectors; `false`: culled, and any numbers.
+/// `project` without a branch, so that a loop over it is a loop over vectors; `false`: culled, and any numbers.
 #[inline(always)]
 fn screen<F: Real>(view: &View<F>, mean: [F; 3], cov: [F; 6], opacity: F) -> (Projected<F>, bool) {
     let p = in_camera(view, mean);
@@ -264,7 +265,7 @@ pub(crate) struct GaussianGrads<F> {
     pub camera: [F; CAMERA],
 }
 
-/// VJP of [`project`] for a row that was not culled; without a branch.
+/// VJP of `project` for a row that was not culled; without a branch.
 ///
 /// Source: gsplat and Kerbl et al. 2023, appendix; d_conic → d_Σ' = −Σ'⁻¹ G Σ'⁻¹.
 #[inline(always)]
@@ -603,12 +604,13 @@ fn bin_range<F: Real>(p: &Projected<F>, view: &View<F>) -> ([i32; 4], bool) {
 
 impl Footprint {
     /// The bins that hold a pixel centre inside the cut-off ellipse of `p` in the image of `view`.
-    pub fn new<F: Real>(p: &Projected<F>, view: &View<F>) -> Self {
+    #[cfg(test)]
+    pub(crate) fn new<F: Real>(p: &Projected<F>, view: &View<F>) -> Self {
         let (bins, met) = bin_range(p, view);
         if met { Self::of_bins(p, bins, view) } else { Self::default() }
     }
 
-    /// [`Footprint::new`] of a box that has bins: first and last column, first and last row.
+    /// `Footprint::new` of a box that has bins: first and last column, first and last row.
     #[inline(always)]
     fn of_bins<F: Real>(p: &Projected<F>, bins: [i32; 4], view: &View<F>) -> Self {
         let [x0, x1, y0, y1] = bins.map(|v| v as usize);

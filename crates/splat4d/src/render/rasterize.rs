@@ -141,7 +141,7 @@ impl<F: Real> Raster<F> {
     /// Colours over `background`, Σ c α T + T_end·background, and alpha, 1 − T_end: planes [height, width].
     ///
     /// All at once, since reading the tiles takes longer than writing the planes.
-    pub fn picture(&self, background: [F; CHANNELS], color: [&mut [F]; CHANNELS], alpha: &mut [F]) {
+    pub(crate) fn picture(&self, background: [F; CHANNELS], color: [&mut [F]; CHANNELS], alpha: &mut [F]) {
         let band = BIN * self.width.max(1);
         let [red, green, blue] = color.map(|plane| plane.par_chunks_mut(band));
         red.zip(green).zip(blue).zip(alpha.par_chunks_mut(band)).enumerate().for_each(

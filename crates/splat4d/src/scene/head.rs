@@ -34,7 +34,7 @@ pub struct HeadKeys {
 impl HeadKeys {
     /// Makes the weights, or claims the loaded ones: W₁ uniform within ±√(6/[`INPUTS`]) (He et al. 2015), W₂ zero, so that
     /// the head starts as the identity. Errors: loaded arrays of the wrong shape.
-    pub fn new<F: Real>(seed: u64, p: &mut Params<F>) -> Result<Self> {
+    pub(crate) fn new<F: Real>(seed: u64, p: &mut Params<F>) -> Result<Self> {
         let bound = (6.0 / INPUTS as f64).sqrt();
         let rng = Rng::new(seed, HEAD_IN, 0);
         let first = p.array(HEAD_IN, HIDDEN * INPUTS, |w| {
@@ -50,7 +50,7 @@ impl HeadKeys {
     }
 
     /// The weights themselves.
-    pub fn weights<F: Real>(self, p: &Params<F>) -> HeadWeights<'_, F> {
+    pub(crate) fn weights<F: Real>(self, p: &Params<F>) -> HeadWeights<'_, F> {
         HeadWeights { first: p[self.first].data(), second: p[self.second].data() }
     }
 }

@@ -97,7 +97,7 @@ impl KeyMasks {
     }
 
     /// Follows a row edit: a new row has its parent's bits.
-    pub fn edited(&self, edit: &RowEdit) -> Self {
+    pub(crate) fn edited(&self, edit: &RowEdit) -> Self {
         if edit.space != Space::Gaussians {
             return self.clone();
         }

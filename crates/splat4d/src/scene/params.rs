@@ -81,7 +81,8 @@ pub const SH: Key = Key(1);
 pub const LIFE: Key = Key(2);
 
 /// Columns of [`GEOMETRY`].
-pub const GEOMETRY_COLUMNS: [(&str, usize); 4] = [("means", 3), ("quats", 4), ("log_scales", 3), ("opacity_logits", 1)];
+pub(crate) const GEOMETRY_COLUMNS: [(&str, usize); 4] =
+    [("means", 3), ("quats", 4), ("log_scales", 3), ("opacity_logits", 1)];
 /// First column of the quaternion in [`GEOMETRY`].
 pub const QUAT: usize = 3;
 /// First column of the log scales in [`GEOMETRY`].

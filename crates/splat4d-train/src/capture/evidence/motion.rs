@@ -38,14 +38,14 @@ pub struct Agreement {
 
 impl Agreement {
     /// Whether nothing moves.
-    pub fn is_static(&self) -> bool {
+    pub(crate) fn is_static(&self) -> bool {
         self.share >= 1.0 - STATIC[usize::from(!self.timed)]
     }
 }
 
 impl Capture {
     /// Compares training frames of moving cameras over time. `None`: too few features match, or no camera moves.
-    pub fn agreement(&self) -> Option<Agreement> {
+    pub(crate) fn agreement(&self) -> Option<Agreement> {
         let mut frames: Vec<usize> =
             self.train.iter().copied().filter(|&i| !self.cameras[self.frames[i].camera].fixed).collect();
         frames.sort_by(|&a, &b| self.frames[a].time.0.total_cmp(&self.frames[b].time.0));

@@ -205,7 +205,7 @@ pub(crate) fn stage(
     c.densify.strategy = Strategy::None;
     c.appearance.sh_degree = 0;
     (c.loss.opacity_life, c.loss.velocity) = (0.0, 0.0);
-    let base = SpacetimeMethod { spacetime, guided: recipe.guided }.stages(&plan).remove(0);
+    let base = SpacetimeMethod { spacetime }.stages(&plan).remove(0);
     Stage {
         name: "quantised".into(),
         iterations,

@@ -73,7 +73,7 @@ impl Channel {
     }
 
     /// The other time at which it looks at the view's splats.
-    pub fn other_time<F: Copy>(&self, view: &View<'_, F>) -> Option<Time> {
+    pub(crate) fn other_time<F: Copy>(&self, view: &View<'_, F>) -> Option<Time> {
         match self {
             Channel::Flow | Channel::Tracks => Some(self.way(view)?.to),
             Channel::Normals | Channel::Sigmoid(_) => None,
@@ -101,7 +101,7 @@ pub struct Needs {
 
 impl Needs {
     /// Adds what another term needs.
-    pub fn join(&mut self, other: Needs) {
+    pub(crate) fn join(&mut self, other: Needs) {
         self.depth |= other.depth;
         self.extra.extend(other.extra);
         self.extra.sort_unstable();
@@ -126,7 +126,7 @@ pub struct Shown<'a, F = f32> {
 
 impl<'a, F: Real> Shown<'a, F> {
     /// A drawn image with these further channels.
-    pub fn new(image: &'a Image<F>, channels: &'a [(Channel, usize)]) -> Self {
+    pub(crate) fn new(image: &'a Image<F>, channels: &'a [(Channel, usize)]) -> Self {
         Self { color: &image.color, alpha: &image.alpha, depth: &image.depth, extra: &image.extra, channels }
     }
 

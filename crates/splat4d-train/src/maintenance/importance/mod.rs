@@ -1,4 +1,4 @@
-//! Importance of Gaussians: which to keep ([`score()`], [`prune`]) and which to render when (`key_masks`).
+//! Importance of Gaussians: which to keep (`score()`, `prune`) and which to render when (`key_masks`).
 //!
 //! After 4DGS-1K (Yuan et al. 2025), for layers of any motion model: the importance of a Gaussian is its effect on the
 //! training images, combined with its lifespan. Nothing is learned here; a scene recovers by further training.
@@ -11,7 +11,8 @@ mod tests;
 mod weighing;
 
 pub(crate) use masks::{MaskConfig, key_masks};
-pub use score::{ScoreConfig, Scores, UNIT_FRAMES, score};
+pub use score::Scores;
+pub(crate) use score::{ScoreConfig, score};
 pub use temporal::{Combine, Spatial, Temporal};
 
 use splat4d::layers::Scene;
@@ -23,7 +24,7 @@ use splat4d::scene::{RowEdit, Space};
 /// Apply it with [`TrainState::apply`](crate::train_state::TrainState::apply), which carries moments and statistics along, or with
 /// `Layer::edit`. Panics: scores of
 /// another scene, a ratio outside of 0 to 1.
-pub fn prune(scene: &Scene<f32>, scores: &Scores, ratio: f64) -> Vec<RowEdit> {
+pub(crate) fn prune(scene: &Scene<f32>, scores: &Scores, ratio: f64) -> Vec<RowEdit> {
     assert!((0.0..=1.0).contains(&ratio), "expected a share between 0 and 1, found {ratio}");
     let sizes =
         |rows: usize, layer: usize| assert_eq!(rows, scene.layers[layer].params.len(), "scores of layer {layer}");

@@ -22,11 +22,11 @@ const VOLUME_POWER: f64 = 0.1;
 /// Variances below this share of the largest are not distinguished: covariances are f32.
 const THINNEST: f64 = 1e-6;
 /// Frames of a unit of time: a second at the 30 frames a second of 4DGS-1K's captures.
-pub const UNIT_FRAMES: f64 = 30.0;
+pub(crate) const UNIT_FRAMES: f64 = 30.0;
 
 /// How Gaussians are scored.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct ScoreConfig {
+pub(crate) struct ScoreConfig {
     /// The quantity of a view that counts.
     pub spatial: Spatial,
     /// The temporal score of the life.
@@ -38,7 +38,7 @@ pub struct ScoreConfig {
     /// Power of the mean share that a Gaussian has of the pixels it touches. Above 0, haze goes first: it costs a blend as
     /// much a pixel as what is solid does, and gives less (our own addition; 0: as published).
     pub cost: f64,
-    /// Frames of a unit of time, in which derivatives of the life are measured ([`UNIT_FRAMES`]).
+    /// Frames of a unit of time, in which derivatives of the life are measured (`UNIT_FRAMES`).
     pub unit: f64,
     /// Every so many of the views at a time are looked at, another choice at each time, and at least one.
     pub every: usize,
@@ -77,7 +77,7 @@ pub struct Scores {
 /// in all. The same bits for any number of threads.
 ///
 /// Errors: there is no frame.
-pub fn score(
+pub(crate) fn score(
     scene: &Scene<f32>,
     frames: &dyn Frames,
     config: &ScoreConfig,

@@ -35,7 +35,7 @@ pub struct ChunkPlan {
 
 impl ChunkPlan {
     /// The plan with even cuts; `None`: the take is learnt at once. Errors: an overlap that does not fit.
-    pub fn even(capture: &Capture, recipe: &Recipe) -> Result<Option<Self>> {
+    pub(crate) fn even(capture: &Capture, recipe: &Recipe) -> Result<Option<Self>> {
         let settings = recipe.chunks;
         if capture.train.is_empty() {
             return Ok(None);
@@ -133,7 +133,7 @@ impl ChunkPlan {
     }
 
     /// The frames that a cut's neighbours share.
-    pub fn shared(&self, cut: usize) -> Range<usize> {
+    pub(crate) fn shared(&self, cut: usize) -> Range<usize> {
         self.cuts[cut] - self.overlap / 2..self.cuts[cut] + self.overlap / 2
     }
 

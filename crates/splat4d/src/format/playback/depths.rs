@@ -4,7 +4,7 @@ use super::page::{FULL8, FULL10, FULL16};
 use crate::{Error, Result};
 
 /// Fewest bits of a code: one step to either side of a middle needs two.
-pub const LEAST_DEPTH: u32 = 2;
+pub(crate) const LEAST_DEPTH: u32 = 2;
 
 /// Bits that the writer uses of the codes of docs/format.md, "Page"; what is below them carries nothing, so that deflate
 /// removes it. A reader need not know: ranges are stretched a little, so that the largest code in use is their end.
@@ -48,7 +48,7 @@ impl Default for Depths {
 }
 
 impl Depths {
-    /// Errors: a depth below [`LEAST_DEPTH`] or above what a page has, by name.
+    /// Errors: a depth below `LEAST_DEPTH` or above what a page has, by name.
     pub fn check(&self) -> Result<()> {
         let all = [
             ("position", self.position, FULL16),

@@ -42,7 +42,8 @@ impl<F: Read + Write + Seek> Growing<F> {
     }
 
     /// The file itself.
-    pub fn file(&mut self) -> &mut F {
+    #[cfg(test)]
+    pub(crate) fn file(&mut self) -> &mut F {
         &mut self.file
     }
 

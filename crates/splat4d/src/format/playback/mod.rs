@@ -1,7 +1,7 @@
 //! The playback file `.s4d`: a dynamic scene, small, readable in parts, checked. docs/format.md is its specification.
 //!
 //! [`write()`] takes a [`Draft`] (floats, sorted into time spans by the baker), orders, quantises and packs it.
-//! [`Index::parse`] reads the start of a file, `decode_page` and [`decode_palette`] any section by itself, and
+//! [`Index::parse`] reads the start of a file, `decode_page` and `decode_palette` any section by itself, and
 //! [`read()`] a whole file as a scene of one layer per page.
 
 mod block;
@@ -28,7 +28,7 @@ mod tests;
 mod write;
 
 pub use coder::Coder;
-pub use depths::{Depths, LEAST_DEPTH};
+pub use depths::Depths;
 pub use features::feature_ranges;
 pub(crate) use features::of_layer as features_of;
 pub use grow::{Growing, finish};
@@ -39,7 +39,8 @@ pub(crate) use mask::decode_masks;
 pub use meta::{Meta, NamedCamera, PathKey, Viewpoint};
 pub(crate) use page::{Page, decode_page};
 pub use pages::{Pages, PagesDraft, read_pages, write_pages};
-pub use palette::{Palette, decode_palette};
+pub use palette::Palette;
+pub(crate) use palette::decode_palette;
 pub use provenance::{Provenance, provenance, with_provenance};
 pub use read::read;
 pub use strict::strict;

@@ -35,7 +35,7 @@ pub struct Palette {
 }
 
 /// Decodes a palette from its stored bytes. Errors: they are not the entry's, or do not hold together.
-pub fn decode_palette(entry: &Entry, stored: &[u8]) -> Result<Palette> {
+pub(crate) fn decode_palette(entry: &Entry, stored: &[u8]) -> Result<Palette> {
     assert!(entry.kind == Kind::Palette, "only a palette is decoded as one");
     let bytes = unpack(entry, stored)?;
     let ranges = std::array::from_fn(|i| f32::from_le_bytes(std::array::from_fn(|b| bytes[4 * i + b])));

@@ -20,7 +20,7 @@ use std::f64::consts::SQRT_2;
 use std::io::Write;
 
 /// Moving .ply of FreeTimeGS.
-pub const FTGS: Dialect = Dialect {
+pub(crate) const FTGS: Dialect = Dialect {
     name: "FreeTimeGS .ply",
     ending: ".ftgs.ply",
     up: Y_DOWN,

@@ -32,9 +32,9 @@ use rows::Rows;
 use std::io::Write;
 
 pub use compressed::COMPRESSED;
-pub use ftgs::FTGS;
+pub(crate) use ftgs::FTGS;
 pub(crate) use pack::write_compressed;
-pub use stg::{STG, is_stg, read_stg, write_stg};
+pub use stg::{STG, write_stg};
 
 /// Plain 3DGS .ply, and any .ply that no other dialect recognizes.
 pub const DIALECT: Dialect = Dialect {

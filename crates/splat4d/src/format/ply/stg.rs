@@ -59,7 +59,7 @@ fn names() -> [String; WIDTH] {
 }
 
 /// Whether a .ply file holds Spacetime Gaussians. False for anything unreadable.
-pub fn is_stg(bytes: &[u8]) -> bool {
+pub(crate) fn is_stg(bytes: &[u8]) -> bool {
     let stg = |e: &Element| e.name == "vertex" && e.find("trbf_center").is_some() && e.find("motion_0").is_some();
     Header::read(bytes).is_ok_and(|h| h.elements.iter().any(stg))
 }
@@ -67,7 +67,7 @@ pub fn is_stg(bytes: &[u8]) -> bool {
 /// Reads a moving scene. Where no comment of ours states the clock, one second is assumed.
 ///
 /// Errors: not a PLY file, truncated, or a property is missing.
-pub fn read_stg(bytes: &[u8]) -> Result<(Scene<f32>, Warnings)> {
+pub(crate) fn read_stg(bytes: &[u8]) -> Result<(Scene<f32>, Warnings)> {
     let mut warnings = Warnings::default();
     let header = Header::read(bytes)?;
     let Some(vertex) = header.elements.iter().find(|e| e.name == "vertex") else {

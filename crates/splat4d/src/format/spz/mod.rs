@@ -44,7 +44,7 @@ pub(crate) const VERSIONS: std::ops::RangeInclusive<u32> = 2..=4;
 /// First version that names its axes when it is written: readers of version 2 (spz-js 1.2) refuse bytes behind the streams.
 const NAMES_AXES: u32 = 3;
 /// First bytes of a version 4 file, and of the header inside older ones.
-pub const MAGIC: [u8; 4] = *b"NGSP";
+pub(crate) const MAGIC: [u8; 4] = *b"NGSP";
 /// First bytes of a gzip stream (RFC 1952).
 pub(crate) const GZIP_MAGIC: [u8; 2] = [0x1F, 0x8B];
 /// Flag: trained with the anti-aliasing filter of Mip-Splatting.
@@ -128,7 +128,7 @@ pub fn read(bytes: &[u8]) -> Result<(Params, SpzInfo, Warnings)> {
 /// Writes a file of the given version that names its axes, where `up` lies along one. Says what was clipped or left out.
 ///
 /// Errors: the sink's; no Gaussians (readers refuse such files). Panics: the version is not one of 2 to 4.
-pub fn write(params: &Params, version: u32, up: [f64; 3], out: &mut impl Write) -> Result<Warnings> {
+pub(crate) fn write(params: &Params, version: u32, up: [f64; 3], out: &mut impl Write) -> Result<Warnings> {
     assert!(VERSIONS.contains(&version), "versions 2 to 4 of .spz can be written, not {version}");
     let mut warnings = Warnings::default();
     let rows = sound_rows(params, &mut warnings);

@@ -23,7 +23,7 @@ use crate::{Error, ErrorKind, Result};
 use std::io::Write;
 
 /// A layer as text.
-pub const TEXT: Dialect = Dialect {
+pub(crate) const TEXT: Dialect = Dialect {
     name: "USD (ParticleField3DGaussianSplat)",
     ending: ".usda",
     up: Y_UP,
@@ -35,7 +35,7 @@ pub const TEXT: Dialect = Dialect {
 };
 
 /// An archive with one such layer.
-pub const ARCHIVE: Dialect = Dialect {
+pub(crate) const ARCHIVE: Dialect = Dialect {
     name: "USD archive (ParticleField3DGaussianSplat)",
     ending: ".usdz",
     mark: Some(is_archive),

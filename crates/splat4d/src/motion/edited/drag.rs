@@ -42,11 +42,11 @@ impl DragSpec {
 }
 
 /// Place, shift, and the turn as a unit quaternion.
-pub type NodeOffset = ([f64; 3], [f64; 3], [f64; 4]);
+pub(crate) type NodeOffset = ([f64; 3], [f64; 3], [f64; 4]);
 
 /// Numbers of a drag, to be written into its tables.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct NodeOffsets {
+pub(crate) struct NodeOffsets {
     /// [times, nodes]: place, shift, and the turn as a unit quaternion.
     pub nodes: Vec<NodeOffset>,
     /// [Gaussians, K]: node and weight.

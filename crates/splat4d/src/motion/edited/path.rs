@@ -32,13 +32,13 @@ impl Default for PathKey {
 
 impl PathKey {
     /// A similarity at a time.
-    pub fn new(t: f64, at: &Sim3) -> Self {
+    pub(crate) fn new(t: f64, at: &Sim3) -> Self {
         let turn = quat::from_rotation(&at.rotation);
         Self { t, scale: at.scale, turn, shift: at.translation, ease: false }
     }
 
     /// The similarity about a point.
-    pub fn similarity(&self, about: [f64; 3]) -> Sim3 {
+    pub(crate) fn similarity(&self, about: [f64; 3]) -> Sim3 {
         let rotation = quat::to_rotation(quat::normalize(self.turn).0);
         let still = Sim3 { scale: self.scale, rotation, translation: [0.0; 3] };
         Sim3 { translation: sub(add(about, self.shift), still.apply(about)), ..still }

@@ -70,11 +70,6 @@ impl Predictor {
     /// All, by the names that recipes and files use.
     pub const ALL: [(&'static str, Self); 3] =
         [("euclidean", Self::Euclidean), ("wasserstein", Self::Wasserstein), ("hold", Self::Hold)];
-
-    /// By its name.
-    pub fn from_name(name: &str) -> Option<Self> {
-        Self::ALL.iter().find(|(n, _)| *n == name).map(|(_, p)| *p)
-    }
 }
 
 /// A prediction one frame ahead, and what its gradient needs.
@@ -156,11 +151,6 @@ impl Fusion {
     /// All, by the names that recipes and files use.
     pub const ALL: [(&'static str, Self); 3] =
         [("off", Self::Off), ("geodesic", Self::Geodesic), ("literal", Self::Literal)];
-
-    /// By its name.
-    pub fn from_name(name: &str) -> Option<Self> {
-        Self::ALL.iter().find(|(n, _)| *n == name).map(|(_, f)| *f)
-    }
 }
 
 /// ε of Kalman's gain, scene units²: below every splat.
@@ -168,7 +158,7 @@ const EPSILON: f64 = 1e-12;
 
 /// Prediction and observation as one, and what its gradient needs.
 #[derive(Clone, Copy, Debug)]
-pub struct Fused {
+pub(crate) struct Fused {
     /// The state.
     pub point: Normal,
     /// How far the prediction counts at all: `trust` times what the gate leaves.
@@ -197,7 +187,7 @@ enum Rule {
 
 /// Gradients of a fusion.
 #[derive(Clone, Copy, Debug)]
-pub struct FusedGrads {
+pub(crate) struct FusedGrads {
     /// To the observation.
     pub seen: Normal,
     /// To the prediction.
@@ -211,7 +201,7 @@ pub struct FusedGrads {
 impl Fused {
     /// `gain`: share of the observation in [0, 1] (geodesic); `trust`: how far predictions count, in [0, 1]; `gate`:
     /// squared Mahalanobis distance at which nothing of the prediction is left (it fades from half of that); 0: no gate.
-    pub fn new(fusion: Fusion, seen: &Normal, predicted: &Normal, gain: f64, trust: f64, gate: f64) -> Self {
+    pub(crate) fn new(fusion: Fusion, seen: &Normal, predicted: &Normal, gain: f64, trust: f64, gate: f64) -> Self {
         let delta: [f64; 3] = std::array::from_fn(|k| seen.mean[k] - predicted.mean[k]);
         let sum = mix(1.0, &seen.cov, 1.0, &predicted.cov);
         let precision = inverse(&mix(1.0, &sum, EPSILON, &IDENTITY));
@@ -250,7 +240,7 @@ impl Fused {
     }
 
     /// VJP. `seen` as it was given to [`new`](Self::new).
-    pub fn backward(&self, seen: &Normal, d: &Normal) -> FusedGrads {
+    pub(crate) fn backward(&self, seen: &Normal, d: &Normal) -> FusedGrads {
         let dot = |a: [f64; 3], b: [f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
         let mut out = FusedGrads { seen: *d, predicted: Normal::ZERO, gain: 0.0, trust: 0.0 };
         let d_open = match &self.rule {

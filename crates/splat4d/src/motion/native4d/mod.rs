@@ -3,7 +3,7 @@
 //! A Gaussian has a mean (μ, μ_t), scales in space and time and a rotation of four dimensions, a pair of quaternions: X
 //! ↦ l X r̄ (`quats` holds l). Its slice at t is an ordinary Gaussian that moves at constant velocity; its opacity is
 //! o·exp(−½(t − μ_t)²/Σ_tt): the model has its own lifespan, which [`Motion::life`] returns. Two equal quaternions
-//! rotate only space: the Gaussian is then static. See `slice` for the mathematics, [`crate::layers::to_spacetime`] for
+//! rotate only space: the Gaussian is then static. See `slice` for the mathematics, `crate::layers::to_spacetime` for
 //! the same motion in another parametrisation.
 //!
 //! Colour may change with time: block n of the spherical harmonics has the factor cos(2πn(μ_t − t)/T) (the same source,
@@ -31,7 +31,7 @@ pub(crate) use sliced::Sliced;
 /// Most blocks of spherical harmonics beyond the first (Yang et al. 2024 use n = 0, 1, 2).
 pub const MAX_HARMONICS: usize = 2;
 /// Columns of the model's own table.
-pub const COLUMNS: [(&str, usize); 3] = [("time_means", 1), ("log_time_scales", 1), ("right_quats", 4)];
+pub(crate) const COLUMNS: [(&str, usize); 3] = [("time_means", 1), ("log_time_scales", 1), ("right_quats", 4)];
 /// Its name.
 pub const TABLE: &str = "native4d";
 /// The parts of a split live shorter by this factor: Kerbl et al. 2023 divide scales by 1.6, Yang et al. 2024 all four.
@@ -131,7 +131,7 @@ impl Native4d {
         Ok(Self { spec, own })
     }
 
-    /// Key of the table of [`COLUMNS`].
+    /// Key of the table of `COLUMNS`.
     pub(crate) fn own(&self) -> Key {
         self.own
     }
