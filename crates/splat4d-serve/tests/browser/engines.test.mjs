@@ -63,13 +63,16 @@ const HEAD = `const WIDTH = ${WIDTH}, HEIGHT = ${HEIGHT}, canvas = document.quer
       for (let i = 4 * WIDTH * y; i < 4 * WIDTH * (y + 1); i++) out.push(Math.round(255 * Math.min(Math.max(floats[i], 0), 1)));
     return out;
   };
-  const pause = () => new Promise((done) => setTimeout(done, 100));
-  // Engines sort in workers: an image is taken when three in a row are the same.
+  const pause = () => new Promise((done) => setTimeout(done, 300));
+  // Engines sort in workers, and show what was there until the order is: an image is taken that is not the one before, when
+  // three in a row are the same.
+  let before = null;
+  const same = (a, b) => a !== null && b !== null && a.every((x, i) => x === b[i]);
   const still = async (image) => {
-    for (let last = null, same = 0; ; await pause()) {
+    for (let last = null, times = 0; ; await pause()) {
       const now = bytes(await image());
-      same = last?.every((x, i) => x === now[i]) ? same + 1 : 0;
-      if (same === 2) return now;
+      times = same(last, now) && !same(before, now) ? times + 1 : 0;
+      if (times === 2) return (before = now);
       last = now;
     }
   };
@@ -78,14 +81,17 @@ const HEAD = `const WIDTH = ${WIDTH}, HEIGHT = ${HEIGHT}, canvas = document.quer
     return { m, fov: 2 * Math.atan(c.height / 2 / c.fy) * 180 / Math.PI };
   };
   const shows = (object, image) => {
-    window.seek = async (time) => { await object.load(time); return await still(image); };
+    window.seek = async (time) => {
+      before ??= bytes(await image());
+      await object.load(time);
+      return await still(image);
+    };
     window.play = async (until) => {
       object.frames.play();
       while (object.frames.time < until) { await image(); await pause(); }
       object.frames.pause();
       return { time: object.frames.time, image: await still(image) };
     };
-    window.frames = object.frames;
     window.shown = true;
   };`;
 
