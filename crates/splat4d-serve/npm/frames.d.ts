@@ -1,6 +1,8 @@
 export interface FramesOptions {
   /** Pages came: what `at` returns changes. */
   onchange?: () => void;
+  /** A page could not be read, for example of a truncated file. */
+  onerror?: (error: Error) => void;
   /** Bytes of pages that stay in memory. */
   budget?: number;
 }
@@ -37,7 +39,7 @@ export class Frames {
   speed: number;
   readonly duration: number;
   tick(now?: number): void;
-  /** Sets the clock and resolves when the pages of that time are there. */
+  /** Sets the clock and resolves when the pages of that time are there. Rejects where one of them cannot be read. */
   load(time: number): Promise<void>;
   /** `eye`: colours are those seen from there; `forward`: what is nearer than the capture's cameras could see is left out. */
   at(time: number, eye?: ArrayLike<number> | null, forward?: ArrayLike<number> | null): FrameArrays;

@@ -6,6 +6,8 @@
 //   const g = frames.at(0.5, [0, 0, -4]);   // g.count, g.position, g.rotation, g.scale, g.opacity, g.color
 
 import { NEAR } from './player/camera.js';
+import { SH, SPEED_RANGE, STEP_MAX } from './player/constants.js';
+import { cutShort } from './player/errors.js';
 import { advance } from './player/schedule.js';
 import { SceneFile } from './player/scene-file.js';
 import { Stream } from './player/stream.js';
@@ -30,37 +32,28 @@ const MEAN = 0,
   SOFT = 22,
   CENTER = 23,
   RECORD = 24;
-/// Longest step of a playing clock, s: a page that was hidden goes on where it was.
-const STEP_MAX = 1;
-const SPEED_RANGE = [0.1, 4];
-/// The basis of docs/format.md, "Palette".
-const [A, B, C, E, F, G, H, I, J] = [
-  0.4886025119029199, 1.0925484305920792, 0.5462742152960396, 0.31539156525252005, 0.5900435899266435, 2.890611442640554,
-  0.4570457994644658, 0.3731763325901154, 1.445305721320277,
-];
-
 /// Basis functions above degree 0 at a unit direction, into `out`, as many as `per`.
 function basis(x, y, z, per, out) {
   const xx = x * x,
     yy = y * y,
     zz = z * z;
-  out[0] = -A * y;
-  out[1] = A * z;
-  out[2] = -A * x;
+  out[0] = -SH.first * y;
+  out[1] = SH.first * z;
+  out[2] = -SH.first * x;
   if (per < 8) return;
-  out[3] = B * x * y;
-  out[4] = -B * y * z;
-  out[5] = E * (2 * zz - xx - yy);
-  out[6] = -B * x * z;
-  out[7] = C * (xx - yy);
+  out[3] = SH.product * x * y;
+  out[4] = -SH.product * y * z;
+  out[5] = SH.axial * (2 * zz - xx - yy);
+  out[6] = -SH.product * x * z;
+  out[7] = SH.difference * (xx - yy);
   if (per < 15) return;
-  out[8] = -F * y * (3 * xx - yy);
-  out[9] = G * x * y * z;
-  out[10] = -H * y * (4 * zz - xx - yy);
-  out[11] = I * z * (2 * zz - 3 * xx - 3 * yy);
-  out[12] = -H * x * (4 * zz - xx - yy);
-  out[13] = J * z * (xx - yy);
-  out[14] = -F * x * (xx - 3 * yy);
+  out[8] = -SH.third * y * (3 * xx - yy);
+  out[9] = SH.triple * x * y * z;
+  out[10] = -SH.side * y * (4 * zz - xx - yy);
+  out[11] = SH.pole * z * (2 * zz - 3 * xx - 3 * yy);
+  out[12] = -SH.side * x * (4 * zz - xx - yy);
+  out[13] = SH.cone * z * (xx - yy);
+  out[14] = -SH.third * x * (xx - 3 * yy);
 }
 
 /// A page's Gaussians as numbers.
@@ -172,17 +165,24 @@ export class Frames {
   #pages = new Pages();
   #gone = false;
   #arrays = null;
+  /// Why pages are missing, the newest reason.
+  #failure = null;
 
   /// `source`: an address, File, Blob or ArrayBuffer. `onchange()` is called when pages came: what `at` returns changes then.
-  /// `budget`: bytes of pages that stay in memory.
-  constructor(source, { onchange = () => {}, budget } = {}) {
+  /// `onerror(error)`: a page could not be read, for example of a truncated file. `budget`: bytes of pages that stay in memory.
+  constructor(source, { onchange = () => {}, onerror = () => {}, budget } = {}) {
     this.ready = SceneFile.open(source).then((file) => {
       if (this.#gone) return file.close();
       this.#file = file;
       this.meta = file.meta;
       if (Number.isNaN(this.time)) this.time = file.meta.clip[0];
       this.capacity = most(file.pages);
-      this.#stream = new Stream(file, this.#pages, { ...(budget ? { budget } : {}), onchange });
+      const failed = (error) => {
+        this.#failure = error;
+        onerror(error);
+      };
+      this.#stream = new Stream(file, this.#pages, { ...(budget ? { budget } : {}), onchange, onerror: failed });
+      if (file.truncated) failed(cutShort(file, source));
       this.#stream.update(this.time);
       onchange();
     });
@@ -235,11 +235,15 @@ export class Frames {
     this.#stream.update(this.time, { playing: this.#playing, speed: this.#speed, loop: this.loop });
   }
 
-  /// Sets the clock and resolves when the pages of that time are there.
+  /// Sets the clock and resolves when the pages of that time are there. Rejects where one of them cannot be read.
   async load(time) {
     this.time = time;
     await this.ready;
-    await this.#stream?.settled(time);
+    if (!this.#stream) return;
+    await this.#stream.settled(time);
+    if (this.#gone) return;
+    const whole = this.#stream.ready(time) === 1 && !this.#file.lacks(time);
+    if (this.#failure && !whole) throw this.#failure;
   }
 
   /// The Gaussians that are visible at `time`, colours as seen from `eye` (null: base colours): {count, position 3, rotation 4 as
@@ -249,8 +253,9 @@ export class Frames {
   at(time, eye = null, forward = null) {
     const { capacity } = this;
     this.#arrays ??= {
-      count: 0, position: new Float32Array(3 * capacity), rotation: new Float32Array(4 * capacity),
-      scale: new Float32Array(3 * capacity), opacity: new Float32Array(capacity), color: new Float32Array(3 * capacity),
+      // Rows that were never written are Gaussians too: an engine may compute with them.
+      count: 0, position: new Float32Array(3 * capacity), rotation: new Float32Array(4 * capacity).fill(0.5),
+      scale: new Float32Array(3 * capacity).fill(1), opacity: new Float32Array(capacity), color: new Float32Array(3 * capacity),
     };
     const to = this.#arrays;
     to.count = 0;

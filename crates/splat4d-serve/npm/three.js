@@ -6,6 +6,7 @@
 
 import * as THREE from 'three';
 import { NEAR } from './player/camera.js';
+import { SPEED_RANGE, STEP_MAX } from './player/constants.js';
 import { BATCH, CHANNELS, ORDER_WIDTH, SPLAT } from './player/glsl.js';
 import { Order } from './player/order.js';
 import { Follower, Schedule, advance } from './player/schedule.js';
@@ -17,9 +18,6 @@ import { Rows } from './player/gl.js';
 const { ROW } = globalThis.splat4dSort;
 /// Rows of the words' texture to begin with.
 const FIRST_ROWS = 32;
-/// Longest step of a playing clock, s: a page that was hidden goes on where it was.
-const STEP_MAX = 1;
-const SPEED_RANGE = [0.1, 4];
 const AXES = { x: [1, 0, 0], y: [0, 1, 0], z: [0, 0, 1] };
 /// Stands for a clock that waits for pages: no other time can be rendered.
 const HOLD = () => null;

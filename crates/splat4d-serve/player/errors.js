@@ -12,3 +12,10 @@ export class SceneError extends Error {
 export function isAbort(error) {
   return error?.name === 'AbortError';
 }
+
+/** A file that ends before its length: an upload or a copy that broke off. */
+export function cutShort({ bytesTotal, length }, source) {
+  const where = typeof source === 'string' ? source : source?.name;
+  return new SceneError(`The file is truncated: ${bytesTotal} of ${length} bytes, some Gaussians are missing`,
+    where || 'the file', 'Copy or export the file again.');
+}

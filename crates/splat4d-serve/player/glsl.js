@@ -1,5 +1,7 @@
 // The WebGL2 backend's shaders: the twins of render/project.rs, math/sh.rs and docs/format.md.
 
+import { LOW_PASS, SH } from './constants.js';
+
 /// What an image shows; the numbers are those of the shaders.
 export const CHANNELS = { color: 0, depth: 1, alpha: 2, flow: 3 };
 /// Texels (RGBA32F) of a block in the block texture: 24 numbers of its header, then span from, span to, first row of
@@ -28,7 +30,7 @@ uniform int channel, count;
 // as a share of the long one; z in camera axes.
 struct Splat { vec4 shape, place, tint; float depth; };
 
-const float LOW_PASS = 0.3, ALPHA_MIN = 1.0 / 255.0, TAU_MARGIN = 1e-3;
+const float LOW_PASS = ${LOW_PASS}, ALPHA_MIN = 1.0 / 255.0, TAU_MARGIN = 1e-3;
 // Only an order that is older than this image can hold pages outside their span: s.
 const float SPAN_SLACK = 1e-4;
 const int BLOCK_TEXELS = ${BLOCK_TEXELS}, PALETTE_WIDTH = 2048;
@@ -43,15 +45,15 @@ vec3 signed10(uint word) {
 vec3 harmonics(vec3 d, int first, int label, int degree, vec3 ranges) {
   float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
   float basis[15];
-  basis[0] = -0.4886025119029199 * y; basis[1] = 0.4886025119029199 * z; basis[2] = -0.4886025119029199 * x;
-  basis[3] = 1.0925484305920792 * x * y; basis[4] = -1.0925484305920792 * y * z;
-  basis[5] = 0.31539156525252005 * (2.0 * zz - xx - yy);
-  basis[6] = -1.0925484305920792 * x * z; basis[7] = 0.5462742152960396 * (xx - yy);
-  basis[8] = -0.5900435899266435 * y * (3.0 * xx - yy); basis[9] = 2.890611442640554 * x * y * z;
-  basis[10] = -0.4570457994644658 * y * (4.0 * zz - xx - yy);
-  basis[11] = 0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy);
-  basis[12] = -0.4570457994644658 * x * (4.0 * zz - xx - yy); basis[13] = 1.445305721320277 * z * (xx - yy);
-  basis[14] = -0.5900435899266435 * x * (xx - 3.0 * yy);
+  basis[0] = -${SH.first} * y; basis[1] = ${SH.first} * z; basis[2] = -${SH.first} * x;
+  basis[3] = ${SH.product} * x * y; basis[4] = -${SH.product} * y * z;
+  basis[5] = ${SH.axial} * (2.0 * zz - xx - yy);
+  basis[6] = -${SH.product} * x * z; basis[7] = ${SH.difference} * (xx - yy);
+  basis[8] = -${SH.third} * y * (3.0 * xx - yy); basis[9] = ${SH.triple} * x * y * z;
+  basis[10] = -${SH.side} * y * (4.0 * zz - xx - yy);
+  basis[11] = ${SH.pole} * z * (2.0 * zz - 3.0 * xx - 3.0 * yy);
+  basis[12] = -${SH.side} * x * (4.0 * zz - xx - yy); basis[13] = ${SH.cone} * z * (xx - yy);
+  basis[14] = -${SH.third} * x * (xx - 3.0 * yy);
   int count = (degree + 1) * (degree + 1) - 1, at = first * PALETTE_WIDTH + label * count;
   vec3 sum = vec3(0);
   for (int k = 0; k < count; k++) {

@@ -2,16 +2,16 @@
 // when something has changed. `clock` runs; `time` is what the newest image shows (schedule.js).
 
 import { Camera, NEAR, bounds, clamp, datasetCamera, dot, add, firstCamera, linkText } from './camera.js';
+import { SPEED_RANGE, STEP_MAX } from './constants.js';
 import { Controls } from './controls.js';
 import { Cost, Pace } from './pace.js';
-import { SceneError } from './errors.js';
+import { SceneError, cutShort } from './errors.js';
 import { SceneFile } from './scene-file.js';
 import { advance } from './schedule.js';
 import { Stream } from './stream.js';
 import { Track } from './track.js';
 
 export const CHANNELS = ['color', 'depth', 'alpha', 'flow'];
-export const SPEED_RANGE = [0.1, 4];
 /** Where images are drawn without a GPU, the first one should not take seconds either. */
 const SCALE_SOFTWARE = 0.5;
 /**
@@ -25,8 +25,6 @@ const RATIO_MAX = 2;
 const PATIENCE = 3000;
 /** Seconds of a camera's way to a new place. */
 const GLIDE = 0.5;
-/** Longest step of the clock, s: a page that was blocked for longer goes on where it was. */
-const STEP_MAX = 1;
 /**
  * An image at rest is rendered at full resolution: with the next frame when the clock stops, so long after the camera's last
  * move, ms. Where one frame would take longer than `AT_ONCE`, a camera that may move on gets a quick one of `FIRST_STEP`
@@ -769,13 +767,6 @@ export class Player extends EventTarget {
     this.file?.close();
     this.file = null;
   }
-}
-
-/** A file that ends before its length: an upload or a copy that broke off. */
-function cutShort({ bytesTotal, length }, source) {
-  const where = typeof source === 'string' ? source : source?.name;
-  return new SceneError(`The file is truncated: ${bytesTotal} of ${length} bytes, some Gaussians are missing`,
-    where || 'the file', 'Copy or export the file again.');
 }
 
 /** Whether WebGL says that it is computed on the CPU. */

@@ -201,6 +201,12 @@ export class SceneFile {
     return this.pages.filter((p) => p.from <= t && t < p.to);
   }
 
+  /// Whether a truncated file lost pages that are drawn at `time`.
+  lacks(time) {
+    const t = this.clamp(time);
+    return this.sections.some((s) => s.kind === 'PAGE' && s.missing && s.from <= t && t < s.to);
+  }
+
   close() {
     this.#source.close();
     this.#decoder.close();

@@ -1,6 +1,7 @@
 // The player's face: bar, panels, messages and keys over one Player.
 
-import { CHANNELS, SPEED_RANGE } from './player.js';
+import { SPEED_RANGE } from './constants.js';
+import { CHANNELS } from './player.js';
 import { CHANNEL_NAMES, SPEEDS, cameraPanel, figuresCard, helpPage, readPath, viewPanel } from './panels.js';
 import { button, bytes, choice, clock, h, pick, retool, save, segments, shown, tool } from './dom.js';
 import { clamp } from './camera.js';

@@ -3,6 +3,7 @@
 // blocks, with the bits of their key masks, where the set of pages or the key times around this time change.
 
 import { NEAR } from './camera.js';
+import { LOW_PASS } from './constants.js';
 import { SceneError } from './errors.js';
 import { Flight } from './pace.js';
 import { CULL, DRAW, PROJECT, RESIDENT, SHADE, SORT } from './shaders.js';
@@ -37,7 +38,6 @@ const TIME_BYTES = 32;
 const FRAME_WORDS = 40;
 const VIEW_WORDS = 32;
 /// Constants of the renderer (CONVENTIONS.md).
-const LOW_PASS = 0.3;
 const ALPHA_MIN = 1 / 255;
 /// Workgroups along x; more go along y. WebGPU's default limit is 65,535.
 const GROUPS_X = 32768;

@@ -18,6 +18,7 @@ macro_rules! player {
 const FILES: &[(&str, &str)] = player![
     "assets.js",
     "camera.js",
+    "constants.js",
     "controls.js",
     "decode.worker.js",
     "dom.js",
