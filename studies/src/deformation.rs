@@ -255,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn a_network_of_4546_numbers_beats_standing_still_at_every_time() {
+    fn a_network_of_4546_parameters_beats_the_static_baseline_at_every_time() {
         let f = mixed();
         assert_eq!(f.parameters, 4546);
         assert!(f.worst() >= 0.39, "{:?}", f.improvements());

@@ -264,14 +264,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_model_can_be_asked_for_and_others_are_named() {
+    fn every_model_is_selectable_and_unknown_ones_are_errors() {
         assert_eq!(models(&[]).unwrap(), MODELS);
         assert_eq!(models(&["still".into()]).unwrap(), ["still"]);
         assert!(models(&["stil".into()]).unwrap_err().to_string().contains("spacetime"));
     }
 
     #[test]
-    fn a_page_takes_the_table_between_its_marks() {
+    fn a_table_replaces_the_text_between_its_marks() {
         let [before, after] = parted("a <!-- models -->old<!-- /models --> b").unwrap();
         assert_eq!((before, after), ("a <!-- models -->", "<!-- /models --> b"));
         assert!(parted("<!-- models --> only").is_err());

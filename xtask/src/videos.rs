@@ -208,7 +208,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_clap_is_heard_after_its_way() {
+    fn a_clap_arrives_after_its_travel_time() {
         let rig = rig();
         let heard = |c: usize| {
             let samples = sound(c, &rig[c]);
@@ -223,7 +223,7 @@ mod tests {
     }
 
     #[test]
-    fn the_file_says_how_long_it_is() {
+    fn the_file_header_has_its_length() {
         let file = avi(&[vec![1, 2, 3], vec![4]], &[5, 6, 7, 8]);
         let length = u32::from_le_bytes([file[4], file[5], file[6], file[7]]) as usize;
         assert_eq!((&file[..4], length), (&b"RIFF"[..], file.len() - 8));

@@ -316,7 +316,7 @@ mod tests {
     }
 
     #[test]
-    fn a_circle_goes_on_and_a_thousand_steps_stay_bounded() {
+    fn a_circle_is_continued_and_bounded_for_a_thousand_steps() {
         let model = Koopman::fit(&circle(60, 0.11, 0.0));
         for h in [20, 1000] {
             let error = error_after(&model, 0.0, 0.11, h);
@@ -331,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn noise_neither_damps_nor_hides_what_swings() {
+    fn a_noisy_oscillation_is_forecast_within_its_noise() {
         let noise = 0.1; // of a radius of 2
         let model = Koopman::fit(&circle(60, 0.11, noise));
         let error = error_after(&model, noise, 0.11, 30);

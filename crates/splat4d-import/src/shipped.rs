@@ -220,7 +220,7 @@ mod tests {
     use std::process::Command;
 
     #[test]
-    fn frames_are_extracted_once_and_incomplete_work_goes_on() {
+    fn frames_are_extracted_once_and_incomplete_extraction_continues() {
         let dir = tempfile::tempdir().unwrap();
         let root = dir.path();
         let mut poses = Vec::new();

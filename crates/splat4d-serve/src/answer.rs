@@ -278,7 +278,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn gzip_is_sent_to_who_takes_it() {
+    fn gzip_is_sent_to_clients_that_accept_it() {
         for yes in ["gzip", "br, gzip", "deflate, gzip;q=0.5", "*"] {
             assert!(accepts_gzip(yes), "{yes}");
         }

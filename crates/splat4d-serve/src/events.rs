@@ -218,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn who_joins_late_gets_the_whole_curve_and_only_the_newest_scene() {
+    fn late_clients_get_the_whole_curve_and_only_the_newest_scene() {
         let hub = Hub::new();
         for i in 0..10 * MAX_STEPS {
             hub.publish(&News::Step(json!({"iteration": i})));
@@ -259,7 +259,7 @@ mod tests {
     }
 
     #[test]
-    fn news_stay_one_line_and_bounded() {
+    fn events_are_one_line_of_bounded_length() {
         let hub = Hub::new();
         hub.publish(&News::Note(json!({"message": "two\nlines\r\n"})));
         hub.publish(&News::Note(json!({"message": "x".repeat(MAX_NEWS)})));

@@ -141,7 +141,7 @@ mod tests {
     use crate::step::tests::Made;
 
     #[test]
-    fn every_frame_comes_once_an_epoch_and_the_draw_is_a_pure_function() {
+    fn every_frame_is_sampled_once_an_epoch_by_a_pure_function() {
         let frames = Made::new(3, 5, 4);
         let line = Timeline::new(&frames);
         assert_eq!(line.times(), 5);

@@ -228,7 +228,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_compared_is_said() {
+    fn runs_that_cannot_be_compared_are_reported() {
         let views = |n| vec![ViewScore::default(); n];
         let of = |name: &str, capture: &str, n| Entry {
             name: name.into(),

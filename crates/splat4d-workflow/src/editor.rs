@@ -486,7 +486,7 @@ mod tests {
     }
 
     #[test]
-    fn shapes_drawn_over_the_image_become_text() {
+    fn shapes_on_the_image_become_selection_text() {
         let bench = Bench::new();
         let pick = |shape: &str, corners: Value, through: bool| {
             bench.ask(json!({"do": "pick", "steps": [], "shape": shape, "corners": corners, "view": view(), "t": 0.0,
@@ -515,7 +515,7 @@ mod tests {
     }
 
     #[test]
-    fn shapes_take_what_is_hidden_behind_a_surface_only_with_through() {
+    fn shapes_select_hidden_gaussians_only_with_through() {
         let folder = tempfile::tempdir().unwrap();
         let hidden = balls([[0.0; 3], [0.0, 0.0, 3.0]]);
         let editor = Editor::new(hidden, "balls".into(), &folder.path().join("edits.toml")).unwrap();

@@ -267,7 +267,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_page_names_its_scene_from_where_it_lies() {
+    fn a_page_refers_to_its_scene_relative_to_itself() {
         let folder = tempfile::tempdir().unwrap();
         std::fs::create_dir(folder.path().join("a b")).unwrap();
         let at = |name: &str| folder.path().join(name);

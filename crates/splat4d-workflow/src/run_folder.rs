@@ -576,7 +576,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_run_that_has_no_files_yet_is_named_with_its_owner() {
+    fn a_run_without_files_is_reported_with_its_owner() {
         let folder = tempfile::tempdir().unwrap();
         let (capture, run) = (folder.path().join("capture"), folder.path().join("run"));
         std::fs::create_dir(&capture).unwrap();
@@ -614,7 +614,7 @@ mod tests {
     }
 
     #[test]
-    fn taken_folders_get_a_number() {
+    fn folders_in_use_get_a_number() {
         let folder = tempfile::tempdir().unwrap();
         let wanted = folder.path().join("knight");
         assert_eq!(free_folder(&wanted), wanted);

@@ -171,7 +171,7 @@ mod tests {
 
     #[test]
     #[cfg(target_os = "linux")]
-    fn a_call_that_ends_says_how() {
+    fn the_exit_status_of_a_process_is_reported() {
         let ended = Program("/bin/false".into()).run(&[], Path::new("."), None).unwrap();
         assert_eq!(ended.code, Some(1));
     }

@@ -245,7 +245,7 @@ fn no_output_replaces_what_a_capture_reads_from_elsewhere() {
 }
 
 #[test]
-fn a_sequence_keeps_its_gaps_and_takes_over_no_tail() {
+fn a_sequence_keeps_its_gaps_and_removes_leftover_frames() {
     let work = tempfile::tempdir().unwrap();
     let at = |name: &str| work.path().join(name);
     for n in [1, 2, 4] {
@@ -269,7 +269,7 @@ fn a_sequence_keeps_its_gaps_and_takes_over_no_tail() {
 }
 
 #[test]
-fn the_machines_faults_are_one_and_the_users_two() {
+fn machine_errors_exit_with_1_and_user_errors_with_2() {
     let work = tempfile::tempdir().unwrap();
     let at = |name: &str| work.path().join(name);
     write_ply(&at("a.ply"), 0.0);

@@ -106,7 +106,7 @@ fn heard(begin: f64, seconds: f64, camera: u64) -> Vec<u8> {
 }
 
 #[test]
-fn videos_with_sound_become_a_capture_whose_clocks_were_heard() {
+fn videos_with_sound_are_synchronised_by_sound() {
     if std::process::Command::new("ffmpeg").arg("-version").output().is_err() {
         assert!(std::env::var_os("REQUIRE_FFMPEG").is_none(), "ffmpeg is missing");
         eprintln!("skipped: no ffmpeg");
@@ -261,7 +261,7 @@ fn stand_in(folder: &Path, ends: &str) {
 
 #[cfg(unix)]
 #[test]
-fn colmap_is_called_where_it_is_asked_for_and_its_model_is_taken() {
+fn colmap_runs_on_request_and_its_model_is_used() {
     use splat4d::math::quat;
     /// Decimals of the model's text, and the unit that it is in.
     const EXACT: f64 = 1e-5;

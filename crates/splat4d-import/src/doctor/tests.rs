@@ -149,7 +149,7 @@ fn blur(p: &mut Rgb8, reach: isize) {
 }
 
 #[test]
-fn a_clean_take_raises_nothing() {
+fn a_clean_capture_has_no_findings() {
     let report = says(clean(), 0.0, CAMERAS);
     let bad: Vec<_> = report.findings.iter().filter(|f| f.grade > Grade::Note).collect();
     assert!(bad.is_empty() && report.leave_out.is_empty(), "{bad:#?}");

@@ -235,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn null_space_and_singular_values_do_what_they_say() {
+    fn null_space_and_singular_values_satisfy_their_definitions() {
         let rng = Rng::new(1, "algebra", 0);
         let rows: Vec<[f64; 9]> = (0..5).map(|i| std::array::from_fn(|k| rng.normal((9 * i + k) as u64))).collect();
         let null = null_space(&rows);

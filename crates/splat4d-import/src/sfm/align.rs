@@ -204,7 +204,7 @@ mod tests {
     use splat4d::math::Rng;
 
     #[test]
-    fn cameras_that_were_held_upright_tell_which_way_is_up() {
+    fn upright_cameras_determine_the_up_direction() {
         let place = |k: usize| [k as f64, (k * k % 5) as f64, (3 * k % 7) as f64];
         let poses: Vec<Se3> = (0..6).map(|k| Se3::look_at(place(k), [2.0, 9.0, 4.0], [0.0, 0.0, 1.0])).collect();
         let up = up_of(&poses);
@@ -252,7 +252,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cloud_without_walls_keeps_what_cameras_hold_upwards() {
+    fn without_walls_the_up_direction_of_cameras_is_kept() {
         let rng = Rng::new(5, "cloud", 0);
         let points: Vec<[f64; 3]> = (0..800).map(|k| std::array::from_fn(|j| rng.normal(3 * k + j as u64))).collect();
         let up = normalize([0.2, 0.9, -0.3]);

@@ -341,7 +341,7 @@ mod tests {
     }
 
     #[test]
-    fn the_speed_of_a_point_is_what_its_pixels_say() {
+    fn the_speed_of_a_point_follows_from_its_pixels() {
         let lens = Lens::plain(150.0, 160, 120);
         let poses = [[-0.9, -0.2, -2.0], [0.8, 0.3, -1.9]].map(|e| Se3::look_at(e, [0.0; 3], [0.0, -1.0, 0.0]));
         let eyes = poses.each_ref().map(|pose| Eye { lens: &lens, pose });

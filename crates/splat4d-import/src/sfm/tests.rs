@@ -170,7 +170,7 @@ fn lenses_that_are_given_stay_while_poses_are_found() {
 }
 
 #[test]
-fn equal_lenses_are_taken_for_equal_and_others_are_not() {
+fn equal_lenses_share_parameters_and_others_do_not() {
     for (spread, within) in [(0.0, 0.003), (0.02, 0.01)] {
         let rig = rig(7, 600, 0.3, 0.2, spread);
         let mut silent = |_: &_| {};
@@ -187,7 +187,7 @@ fn equal_lenses_are_taken_for_equal_and_others_are_not() {
 }
 
 #[test]
-fn a_camera_of_another_scene_is_left_out_and_says_why() {
+fn a_camera_of_another_scene_is_left_out_with_a_reason() {
     let mut rig = rig(4, 260, 0.3, 0.1, 0.08);
     let rng = Rng::new(5, "elsewhere", 0);
     for (k, f) in rig.sights[2].features.iter_mut().enumerate() {
@@ -208,7 +208,7 @@ fn a_camera_of_another_scene_is_left_out_and_says_why() {
 }
 
 #[test]
-fn a_camera_that_films_another_time_is_known_by_what_moves() {
+fn an_unsynchronised_camera_is_recognised_by_moving_features() {
     let mut rig = rig(5, 700, 0.3, 0.1, 0.0);
     let who: Vec<_> = (0..5).map(|c| (c, None)).collect();
     let strays = |rig: &Rig| {

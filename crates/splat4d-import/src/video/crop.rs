@@ -105,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rectangle_must_lie_in_the_image_and_is_cut_out() {
+    fn a_rectangle_inside_the_image_is_cropped_and_others_refused() {
         let crop = Crop { width: 2, height: 1, x: 1, y: 1 };
         assert!(crop.check([3, 2]).is_ok());
         assert_eq!(crop.of(&[0, 1, 2, 3, 4, 5], 3, 1), [4, 5]);

@@ -302,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn time_stamps_keep_their_digits_in_long_takes() {
+    fn time_stamps_keep_their_precision_in_long_recordings() {
         let mut units = [None; 2];
         assert_eq!(
             stamp("[showinfo@kept @ 0x55] [info] config in time_base: 1/90000, frame_rate: 30/1", &mut units),

@@ -104,7 +104,7 @@ fn derived_values_are_computed_again() {
 }
 
 #[test]
-fn pictures_of_others_are_neither_taken_for_ours_nor_removed() {
+fn foreign_images_are_neither_read_nor_removed() {
     let (_folder, sources) = rig();
     let clips = clips(&sources, &Selection::default());
     let out = tempfile::tempdir().unwrap();

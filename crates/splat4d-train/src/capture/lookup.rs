@@ -524,7 +524,7 @@ mod tests {
     }
 
     #[test]
-    fn what_could_be_either_is_refused() {
+    fn ambiguous_file_names_are_refused() {
         let (_dir, there) = lookup(&["images/a.PNG", "images/A.png", "images/b.webp", "images/b.png"]);
         let refuse = |name: &str| there.image(&there.bases(), name).unwrap_err().to_string();
         assert!(refuse("a.png").contains("A.png, a.PNG") && refuse("b.jpg").contains("b.png, b.webp"));

@@ -219,7 +219,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn usual_names_of_masks_lead_to_their_images() {
+    fn masks_with_usual_names_are_matched_to_images() {
         let names = [
             "cam0/a.jpg.png",
             "cam0/a.png",

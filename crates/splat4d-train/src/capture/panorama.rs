@@ -144,7 +144,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rays_meet_the_pixels_of_colmap() {
+    fn panorama_rays_equal_colmaps() {
         // pycolmap 4.2.1, EQUIRECTANGULAR of 640x320, `img_from_cam`.
         let known = [
             ([0.1, -0.2], [330.152165578, 139.99068492]),

@@ -239,7 +239,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn cameras_of_a_rig_are_told_from_photos() {
+    fn camera_rigs_are_distinguished_from_photos() {
         let are = |names: &[&str]| are_cameras(&names.iter().map(|n| (*n).to_owned()).collect::<Vec<_>>());
         assert!(are(&["cam00", "cam_01"]) && are(&["left-camera2", "Camera 10"]));
         assert!(!are(&["cam00", "IMG_1234"]) && !are(&["webcam"]) && !are(&["20240212_003919"]) && !are(&["cam"]));

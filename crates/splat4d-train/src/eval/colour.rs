@@ -187,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn unknown_pixels_do_not_teach_colours() {
+    fn unknown_pixels_do_not_change_colour_matrices() {
         let view = noise(1);
         let (mut truth, mut known) =
             (cast(&view, &CAST), Planes { data: vec![1.0; SIDE * SIDE], ..Planes::new(1, SIDE, SIDE) });

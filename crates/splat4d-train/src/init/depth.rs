@@ -159,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn what_moves_belongs_to_its_time_and_all_else_to_all() {
+    fn depth_points_of_dynamic_regions_get_their_time_and_others_none() {
         let deep = Deep(Made::new(4, 3, 24));
         let seeds = points(&deep, 400, true, Rng::new(1, "test", 0)).unwrap();
         let moving: Vec<usize> = (0..seeds.len()).filter(|&i| seeds.times[i].is_some()).collect();

@@ -182,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn fixed_cameras_are_asked_once() {
+    fn depth_of_fixed_cameras_is_read_once() {
         let frames = crate::step::tests::Made::new(6, 2, 8);
         assert_eq!(views(&frames).len(), 6);
     }

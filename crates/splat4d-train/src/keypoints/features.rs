@@ -329,7 +329,7 @@ mod tests {
     use splat4d::math::Rng;
 
     #[test]
-    fn a_limit_leaves_out_the_weakest_and_changes_none() {
+    fn a_limit_drops_the_weakest_features_and_keeps_the_others() {
         let mut grey = Planes::<f32>::new(1, 60, 80);
         let rng = Rng::new(1, "noise", 0);
         grey.data.iter_mut().enumerate().for_each(|(i, v)| *v = rng.uniform(i as u64) as f32);

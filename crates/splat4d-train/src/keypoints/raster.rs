@@ -84,7 +84,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_ramp_is_a_ramp_between_pixels_doubled_and_blurred() {
+    fn a_ramp_stays_a_ramp_when_sampled_doubled_and_blurred() {
         let mut ramp = Planes::<f32>::new(1, 24, 32);
         for i in 0..ramp.data.len() {
             ramp.data[i] = (i % 32) as f32 + 0.5 + 2.0 * ((i / 32) as f32 + 0.5);

@@ -155,7 +155,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lines_come_back_and_those_that_lead_elsewhere_do_not() {
+    fn list_lines_round_trip_and_foreign_paths_are_dropped() {
         let folder = tempfile::tempdir().unwrap();
         let list = List::keep(folder.path()).unwrap();
         let paths = [PathBuf::from("a b/100 %.png"), PathBuf::from("ü\n.json"), PathBuf::from("test/ours_20/")];

@@ -369,7 +369,7 @@ mod tests {
     }
 
     #[test]
-    fn an_owner_elsewhere_lives_as_long_as_its_heart_beats_whatever_clocks_say() {
+    fn a_remote_owner_is_alive_while_its_heartbeat_changes() {
         let folder = tempfile::tempdir().unwrap();
         let hour = Duration::from_secs(3600);
         let take = || Owner::with_patience(folder.path(), "train", QUICK).unwrap();

@@ -112,7 +112,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_output_lies_apart_from_what_is_read() {
+    fn an_output_inside_or_around_an_input_is_refused() {
         let work = tempfile::tempdir().unwrap();
         let at = |name: &str| work.path().join(name);
         std::fs::create_dir_all(at("capture/images")).unwrap();

@@ -167,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn what_fits_the_minutes_settles() {
+    fn the_count_that_fits_the_minutes_converges() {
         // Steps cost in proportion to the Gaussians: 900 M of both fit.
         let steps = |count: usize| Ok(900_000_000 / count);
         let count = settled(500_000, 1.0, steps).unwrap();

@@ -134,7 +134,7 @@ mod tests {
     use std::sync::atomic::AtomicBool;
 
     #[test]
-    fn points_are_looked_for_once_and_belong_to_the_run() {
+    fn points_are_searched_once_and_stored_with_the_run() {
         let (place, recipe) = (Place::new(), recipe(&["init=auto", "motion=still"]));
         let run = place.run("own");
         let train = || {
@@ -174,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn who_has_few_points_or_leaves_out_a_part_of_the_images_and_no_cut_out_object_is_looked_at() {
+    fn points_are_searched_for_sparse_or_partial_clouds_but_not_for_cut_out_objects() {
         let place = Place::new();
         let wants = |sets: &[&str], spread: &dyn Fn(&Capture) -> Vec<[f64; 3]>, background: Option<[f32; 3]>| {
             let recipe = recipe(sets);
@@ -198,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn what_no_point_is_near_is_uncovered() {
+    fn pixels_without_a_near_point_are_uncovered() {
         let place = Place::new();
         let capture = Capture::clone(&place.open(&recipe(&[])));
         let camera = capture.places().next().unwrap();

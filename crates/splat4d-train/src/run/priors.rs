@@ -333,7 +333,7 @@ mod tests {
     }
 
     #[test]
-    fn maps_are_taken_in_the_unit_of_the_points_and_left_out_where_they_contradict_them() {
+    fn depth_maps_are_scaled_to_the_points_and_ignored_if_they_contradict() {
         let folder = tempfile::tempdir().unwrap();
         let recipe = Recipe::default();
         let scales = |o: &OpenCapture| -> Vec<Option<f64>> {

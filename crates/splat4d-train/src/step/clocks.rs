@@ -120,7 +120,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_least_shift_is_the_vertex_of_a_parabola_and_none_where_all_cost_the_same() {
+    fn the_best_shift_is_a_parabolas_vertex_and_zero_for_equal_costs() {
         let shifts: Vec<f64> = (-4..=4).map(|k| 0.5 * f64::from(k)).collect();
         let costs = |f: &dyn Fn(f64) -> f64| shifts.iter().map(|&s| f(s)).collect::<Vec<_>>();
         let found = least(&shifts, &costs(&|s| 3.0 + (s - 0.63).powi(2)));

@@ -155,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_emphasised_without_fixed_cameras_or_times() {
+    fn without_fixed_cameras_or_times_all_pixel_weights_are_one() {
         assert!(Emphasis::new(&Made::new(3, 5, 4), 0.0).unwrap().is_none());
         assert!(Emphasis::new(&Made::new(3, 2, 4), 1.0).unwrap().is_none(), "two moments have no median");
     }

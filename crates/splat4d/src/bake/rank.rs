@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn what_images_lack_most_comes_first() {
+    fn gaussians_with_the_largest_image_error_rank_first() {
         let pose = Se3::look_at([0.0, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
         let camera = Camera::with_fov_y(pose, 0.8, 64, 48);
         let options = Options { cameras: vec![camera], ..Options::default() };

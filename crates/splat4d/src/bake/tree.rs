@@ -145,14 +145,14 @@ mod tests {
     }
 
     #[test]
-    fn segments_last_about_as_long_as_asked() {
+    fn segments_have_about_the_requested_length() {
         let tree = Tree::new([0.0, 10.0 - 1.0 / 30.0], 30.0, 30.0, 1.0, usize::MAX).unwrap();
         assert_eq!(tree.grid, (0..=10).map(|i| 30 * i).collect::<Vec<_>>());
         assert!((tree.border(300) - 10.0).abs() < 1e-12);
     }
 
     #[test]
-    fn few_frames_a_second_are_looked_at_in_parts() {
+    fn low_frame_rates_are_sampled_between_frames() {
         for (fps, looks, parts) in
             [(10.0, 30.0, 3), (29.97, 30.0, 1), (24.0, 30.0, 2), (60.0, 30.0, 1), (10.0, 0.0, 1), (1e-6, 30.0, 32)]
         {
@@ -171,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_that_is_no_clock_is_refused() {
+    fn an_invalid_clip_range_is_refused() {
         for clip in [[0.0, f64::NAN], [1.0, 0.0], [0.0, 1e9], [f64::NEG_INFINITY, 0.0]] {
             assert!(Tree::new(clip, 30.0, 30.0, 1.0, usize::MAX).is_err(), "{clip:?}");
         }

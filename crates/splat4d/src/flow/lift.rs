@@ -187,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn euler_spirals_outwards_as_it_must_and_the_midpoint_rule_less() {
+    fn eulers_rule_spirals_outwards_more_than_the_midpoint_rule() {
         let w = 0.1;
         let field = |_: f64, x: [f64; 3]| [-w * x[1], w * x[0], 0.0];
         let radius = |rule| {

@@ -492,7 +492,7 @@ mod tests {
     }
 
     #[test]
-    fn an_offset_comes_back_exactly_and_near_scenes_say_nothing_of_it() {
+    fn an_offset_round_trips_and_near_scenes_store_none() {
         let mut s = scene();
         let near = metadata(&s).to_string();
         s.offset = [431_234.1, 5_412_345.6, -310.2];

@@ -284,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn exp_is_within_its_stated_error_and_keeps_what_is_special() {
+    fn exp_is_within_its_stated_error_and_keeps_special_values() {
         let mut worst = 0.0f64;
         // Every exponent and some thousand mantissas each, both signs, where the result is a normal number.
         for bits in (0..0x42b2_0000u32).step_by(7919) {

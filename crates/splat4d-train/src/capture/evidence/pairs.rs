@@ -217,7 +217,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rays_meet_in_front_or_behind() {
+    fn intersections_in_front_and_behind_are_distinguished() {
         let motion =
             Se3 { rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], translation: [-1.0, 0.0, 0.0] };
         // A point at (0.2, 0.1, 4) before the first camera is at (-0.8, 0.1, 4) before the second.

@@ -128,7 +128,7 @@ fn workspaces_of_colmap_are_read_and_named() {
 }
 
 #[test]
-fn what_is_no_capture_leads_to_one() {
+fn a_folder_near_a_capture_names_the_capture() {
     let sample = photos();
     assert_has(&refuse(&sample.path("images")), &["The folder that holds it is a capture"]);
     rename(&sample, "transforms.json", "transforms_all.json");

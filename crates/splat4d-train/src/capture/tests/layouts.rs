@@ -358,7 +358,7 @@ impl Center for splat4d::math::Se3 {
 }
 
 #[test]
-fn preflight_speaks_of_few_cameras() {
+fn preflight_warns_of_few_cameras() {
     let findings = open(&samples::own()).preflight();
     assert!(findings.iter().any(|f| f.severity == Severity::Warning && f.what.contains("extrapolated views")));
     assert!(findings.iter().any(|f| f.what.contains("unevenly spaced")), "offsets of 10 ms in a 100 ms grid");

@@ -212,7 +212,7 @@ fn black_borders_are_neither_trained_nor_scored() {
 }
 
 #[test]
-fn every_part_of_a_take_has_the_borders_of_the_whole() {
+fn every_part_of_a_capture_has_the_borders_of_the_whole() {
     // Six fixed cameras whose first frame has a letterbox; a bright flash fills the second.
     let sample = samples::own();
     sample.edit("capture.json", |v| {

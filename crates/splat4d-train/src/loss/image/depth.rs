@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_right_is_free_up_to_scale_and_shift() {
+    fn correct_depth_up_to_scale_and_shift_has_no_loss() {
         let p = pictures();
         let expected: Vec<f64> = p[0].data.iter().zip(&p[1].data).map(|(d, a)| d / a).collect();
         let map = |f: &dyn Fn(f64) -> f64| Planes { data: expected.iter().map(|z| f(*z)).collect(), ..p[0].clone() };

@@ -212,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn equal_images_are_free_and_the_band_grows() {
+    fn equal_images_have_no_loss_and_the_band_grows() {
         let truth = check::planes("truth", [1, 16, 16], 0.0, 1.0);
         assert!(run(&truth, &truth, 1.0, &mut Planes::new(1, 16, 16)) < 1e-12);
         // A chequerboard is the highest frequency there is: only the whole band sees it.

@@ -217,7 +217,7 @@ mod tests {
 
     /// The default score of lives whose spatial score at a time is p.
     #[test]
-    fn the_default_grows_with_life() {
+    fn the_default_score_grows_with_lifespan() {
         let score = |frames: f64| {
             let (lives, times) = life(frames);
             let at = |t: &Time| lives.instant(Temporal::InstantAbs, 0, *t) * lives.kind.eval(lives.rows[0], *t).sigma;
@@ -233,7 +233,7 @@ mod tests {
 
     /// Why the printed score is not the default.
     #[test]
-    fn the_printed_score_overflows_and_prefers_short_lives_and_its_absolute_value_says_nothing() {
+    fn the_published_score_overflows_and_prefers_short_lifespans() {
         let sum = |frames: f64, term: &dyn Fn(f64) -> f64| {
             let (lives, times) = life(frames);
             times.iter().map(|t| term(lives.kind.d2_time(lives.rows[0], *t))).sum::<f64>()
@@ -253,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn variants_that_follow_the_life_grow_with_it() {
+    fn variants_by_lifespan_grow_with_lifespan() {
         for temporal in [Temporal::Width, Temporal::ActiveFraction] {
             let scores = LIVES.map(|f| {
                 let (lives, times) = life(f);

@@ -316,7 +316,7 @@ mod tests {
     }
 
     #[test]
-    fn two_levels_lose_little_and_threads_change_nothing() {
+    fn two_levels_lose_little_and_any_threads_give_the_same_bits() {
         let points = clouds(6000, 24, 3000, 0.2);
         let weights: Vec<f32> = (0..6000).map(|i| 0.1 + (i % 7) as f32).collect();
         let run = |threads: usize| {

@@ -85,7 +85,7 @@ mod tests {
     }
 
     #[test]
-    fn planes_of_their_own_are_smaller_than_one_encoder_over_all() {
+    fn one_encoder_per_plane_is_smaller_than_one_for_all() {
         let rng = Rng::new(6, "planes", 0);
         let body: Vec<u8> = (0..32_000u64).map(|i| (rng.below(i, 1 << (i / 4000 + 1))) as u8).collect();
         let own = deflate(&body, 0, 4000, 6).len();

@@ -64,7 +64,7 @@ fn a_foreign_file_in_another_order_is_read() {
 }
 
 #[test]
-fn lies_are_errors_that_name_the_array() {
+fn inconsistent_arrays_are_errors_that_name_the_array() {
     let one = |body: &str| file(&format!("{{\"a\":{body}}}"), &[0; 8]);
     let cases = [
         (vec![1, 2, 3], "shorter"),

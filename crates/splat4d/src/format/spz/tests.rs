@@ -184,7 +184,7 @@ fn gzip_streams_end_like_any_other() {
 }
 
 #[test]
-fn files_say_which_way_is_up_but_in_version_2() {
+fn files_store_the_up_direction_except_in_version_2() {
     let written = |version, up| {
         let mut file = Vec::new();
         let said = write(&gaussians(5, 4), version, up, &mut file).unwrap().lines().join("\n");
@@ -228,7 +228,7 @@ fn sentence<'a>(said: &'a str, part: &str) -> &'a str {
 }
 
 #[test]
-fn lies_are_errors_with_a_reason() {
+fn inconsistent_headers_are_errors_with_a_reason() {
     let plain = |version, degree| [header(version, degree), vec![0], body(&OLD_ROTATION)].concat();
     let error = |file: &[u8]| read(file).unwrap_err().to_string();
     assert!(error(&gzipped(&plain(9, 1))).contains("version 9"));
