@@ -70,24 +70,26 @@ pub fn lines(series: &[Series], x_label: &str, unit: &str) -> Option<String> {
     let px = |x: f64| LEFT + (x - x0) / (x1 - x0) * (WIDTH - LEFT - RIGHT);
     let py = |y: f64| HEIGHT - BOTTOM - (y - y0) / (y1 - y0) * (HEIGHT - TOP - BOTTOM);
     let mut svg = open(HEIGHT, &format!("{unit} over {x_label}"));
-    for y in ticks(y0, y1, 5) {
-        let v = py(y);
+    let y_ticks = ticks(y0, y1, 5);
+    for (y, label) in y_ticks.iter().zip(labels(&y_ticks)) {
+        let v = py(*y);
         let _ = write!(
             svg,
             r#"<line class="grid" x1="{LEFT}" x2="{:.1}" y1="{v:.1}" y2="{v:.1}"/><text class="tick" x="{:.1}" y="{:.1}" text-anchor="end">{}</text>"#,
             WIDTH - RIGHT,
             LEFT - 7.0,
             v + 4.0,
-            short(y)
+            label
         );
     }
-    for x in ticks(x0, x1, 6) {
-        let u = px(x);
+    let x_ticks = ticks(x0, x1, 6);
+    for (x, label) in x_ticks.iter().zip(labels(&x_ticks)) {
+        let u = px(*x);
         let _ = write!(
             svg,
             r#"<text class="tick" x="{u:.1}" y="{:.1}" text-anchor="middle">{}</text>"#,
             HEIGHT - BOTTOM + 16.0,
-            short(x)
+            label
         );
     }
     let _ = write!(
@@ -172,7 +174,7 @@ pub fn file(series: &[Series], x_label: &str, unit: &str) -> Option<String> {
 pub fn bars(rows: &[(String, f64, String)], from: f64, label: &str) -> Option<String> {
     const ROW: f64 = 24.0;
     const LABEL: f64 = 128.0;
-    const VALUE: f64 = 84.0;
+    const VALUE: f64 = 112.0; // "20.48 dB (20.59)"
     let highest = rows.iter().map(|r| r.1).filter(|v| v.is_finite()).fold(f64::NEG_INFINITY, f64::max);
     if rows.is_empty() || !highest.is_finite() {
         return None;
@@ -237,6 +239,20 @@ fn ticks(lo: f64, hi: f64, count: usize) -> Vec<f64> {
     (first..).map(|i| i as f64 * step).take_while(|v| *v <= hi + 1e-9 * step).take(2 * count + 2).collect()
 }
 
+/// Labels of ticks: short, and with more decimals if two would be equal.
+fn labels(ticks: &[f64]) -> Vec<String> {
+    let short: Vec<String> = ticks.iter().map(|v| self::short(*v)).collect();
+    if short.windows(2).all(|pair| pair[0] != pair[1]) {
+        return short;
+    }
+    let step = ticks.windows(2).map(|pair| pair[1] - pair[0]).fold(f64::INFINITY, f64::min);
+    let digits = (-step.log10().floor()).clamp(0.0, MOST_DECIMALS) as usize;
+    ticks.iter().map(|v| format!("{v:.digits$}")).collect()
+}
+
+/// Decimals of a tick's label: more do not fit next to the axis.
+const MOST_DECIMALS: f64 = 6.0;
+
 /// A number as people write it on an axis.
 pub fn short(v: f64) -> String {
     let a = v.abs();
@@ -263,6 +279,8 @@ mod tests {
     fn ticks_are_round_and_inside() {
         assert_eq!(ticks(0.0, 10.0, 5), [0.0, 2.0, 4.0, 6.0, 8.0, 10.0]);
         assert!(ticks(21.37, 21.52, 5).iter().all(|t| (21.37..=21.53).contains(t)));
+        assert_eq!(labels(&[17.65, 17.7, 17.75]), ["17.65", "17.70", "17.75"], "no two ticks have one label");
+        assert_eq!(labels(&[14.0, 14.2, 14.4]), ["14", "14.2", "14.4"]);
         assert_eq!((short(30_000.0), short(0.25), short(31.0)), ("30k".into(), "0.25".into(), "31".into()));
     }
 

@@ -372,7 +372,7 @@ fn conditions(out: &mut String, run: &Run) {
         rows += &format!("<tr>{}</tr>", cells.map(|c| format!("<td>{}</td>", escape(&c))).concat());
     }
     if !rows.is_empty() {
-        let head = ["views", "background", "step", "PSNR", "corrected", "SSIM", "instructions", "device"];
+        let head = ["views", "background", "step", "PSNR, dB", "corrected, dB", "SSIM", "instructions", "device"];
         let head = head.map(|h| format!("<th>{h}</th>")).concat();
         let _ = write!(out, "<h2>Measurements</h2>\n<table><tr>{head}</tr>{rows}</table>\n");
     }
@@ -483,8 +483,9 @@ fn panels<const N: usize>(out: &mut String, title: &str, charts: [(&str, Option<
         })
         .collect();
     if !shown.is_empty() {
-        // Two columns: charts of one width have letters of one size.
-        let _ = write!(out, "<h2>{}</h2>\n<div class=\"grid2\">{shown}</div>\n", escape(title));
+        // Two columns, also for a single chart: charts of one width have letters of one size.
+        let blank = if shown.matches("class=\"panel\"").count() == 1 { "<div></div>" } else { "" };
+        let _ = write!(out, "<h2>{}</h2>\n<div class=\"grid2\">{shown}{blank}</div>\n", escape(title));
     }
 }
 
