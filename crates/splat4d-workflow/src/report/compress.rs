@@ -260,7 +260,9 @@ fn parts(file: &Path) -> Option<String> {
 
 fn stages(steps: &[Step]) -> Option<String> {
     let first = steps.first()?;
-    let mut table = String::from("<table class=\"numbers\"><tr><th>stage</th><th>steps</th><th>Gaussians</th><th>minutes</th></tr>");
+    let mut table = String::from(
+        "<table class=\"numbers\"><tr><th>stage</th><th>steps</th><th>Gaussians</th><th>minutes</th></tr>",
+    );
     for step in steps {
         let (name, minutes) = (escape(&step.name), human_seconds(step.seconds));
         let (taken, left) = (grouped(step.steps), grouped(step.gaussians));
