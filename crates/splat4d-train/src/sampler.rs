@@ -14,7 +14,7 @@ pub enum Sampler {
     /// As `Uniform`, but all views of a step at one time (Spacetime Gaussians).
     SameTime,
     /// Four of five from a window of so many distinct times that slides over the clip as the stage proceeds, the rest from
-    /// the whole take (long takes).
+    /// the whole capture (long captures).
     Window(usize),
     /// Only frames at the k-th distinct time (per-frame tracking).
     Frame(usize),
@@ -37,7 +37,7 @@ pub(crate) struct Draw {
     pub steps: usize,
 }
 
-/// Share of a window sampler's frames that come from its window; the rest replays the take.
+/// Share of a window sampler's frames that come from its window; the rest replays the capture.
 const WINDOW_SHARE: f64 = 0.8;
 
 /// Frame numbers sorted by distinct time.

@@ -35,7 +35,7 @@ fn pose(camera: usize) -> Se3 {
     Se3::look_at([3.0 * angle.sin(), 0.4, -3.0 * angle.cos()], [0.0; 3], [0.0, -1.0, 0.0])
 }
 
-/// The take of a ball in a world that `g` turned: images are the same for every `g`.
+/// The capture of a ball in a world that `g` turned: images are the same for every `g`.
 fn write_capture(folder: &Path, g: &Sim3) {
     let mut cameras = Vec::new();
     for camera in 0..CAMERAS {

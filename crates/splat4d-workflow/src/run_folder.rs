@@ -352,7 +352,7 @@ pub fn views_of(capture: &Capture) -> Vec<View> {
             held: capture.split(i) == Split::Held,
         }
     };
-    // A run may use a part of the take only: `train` and `held` say which.
+    // A run may use a part of the capture only: `train` and `held` say which.
     let mut used: Vec<usize> = capture.train.iter().chain(&capture.held).copied().collect();
     used.sort_unstable();
     used.into_iter().map(view).collect()

@@ -106,7 +106,7 @@ fn depth_maps(camera: usize) -> String {
     format!("depth/cam{camera:02}")
 }
 
-/// The share of the take at a time.
+/// The share of the capture at a time.
 fn share(moment: usize, moments: usize) -> f64 {
     moment as f64 / (moments.max(2) - 1) as f64
 }

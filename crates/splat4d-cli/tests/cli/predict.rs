@@ -5,7 +5,7 @@ use crate::{TINY, json_of, str};
 use splat4d::format::{playback, scene};
 use std::path::{Path, PathBuf};
 
-/// Frames of the take, of which seven are seen with [`SHARE`].
+/// Frames of the capture, of which seven are seen with [`SHARE`].
 const FRAMES: usize = 10;
 const SHARE: &str = "0.75";
 

@@ -41,7 +41,7 @@ pub struct Finding {
     pub grade: Grade,
     /// Which check found it: a word that stays the same.
     pub check: &'static str,
-    /// The camera; none: the whole take.
+    /// The camera; none: the whole recording.
     pub camera: Option<String>,
     /// How much, in `unit`.
     pub amount: Option<f64>,
@@ -74,7 +74,7 @@ pub struct CameraReport {
     pub sharpness: Option<f64>,
     /// Pixels (of 1920) that the background moved between the first and the last images.
     pub moved: Option<f64>,
-    /// Detail of the take's last third relative to its first.
+    /// Detail of the recording's last third relative to its first.
     pub focus: Option<f64>,
     /// Seconds from the first to the last row of an image, and their standard deviation.
     pub shutter: Option<[f64; 2]>,

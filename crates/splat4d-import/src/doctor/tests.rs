@@ -1,4 +1,4 @@
-//! Each fault drawn once, and a clean take: a room of random spots that six cameras see, and balls that move in it.
+//! Each fault drawn once, and a clean recording: a room of random spots that six cameras see, and balls that move in it.
 
 use super::clocks::clocks;
 use super::look::{CameraObservations, Stand};
@@ -118,7 +118,7 @@ fn is_found(clip: &Clip, check: &str) {
     assert_eq!(found(&report, check), [format!("c{ILL}")], "{check}: {:#?}", report.findings);
 }
 
-/// The clean take, with the ill camera's frames changed by their numbers.
+/// The clean recording, with the ill camera's frames changed by their numbers.
 fn with(change: impl Fn(usize, &mut Rgb8)) -> Clip {
     let mut clip = clean().clone();
     clip[ILL].iter_mut().enumerate().for_each(|(n, p)| change(n, p));
@@ -459,7 +459,7 @@ fn training_that_does_not_fit_into_memory_is_reported() {
     assert_eq!(told(needed / 2), [Grade::Bad]);
 }
 
-/// The clean take with faults that are smaller than what is reported, each of them as large as the names of the checks say.
+/// The clean recording with faults that are smaller than what is reported, each of them as large as the names of the checks say.
 #[test]
 fn invisible_faults_are_not_reported() {
     let mut pushed = clean().clone();

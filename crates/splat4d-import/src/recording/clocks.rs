@@ -78,7 +78,7 @@ fn heard(
 pub(super) struct Guessed {
     /// Lags that are guessed.
     pub evidence: Vec<Evidence>,
-    /// Whether anything moves in two cameras, one of them open, as far as a short take shows: then clocks matter.
+    /// Whether anything moves in two cameras, one of them open, as far as a short recording shows: then clocks matter.
     pub moves: bool,
 }
 

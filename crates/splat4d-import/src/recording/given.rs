@@ -107,7 +107,7 @@ pub(super) fn known(
     Ok(out)
 }
 
-/// Some grey images of a camera, spread over the take.
+/// Some grey images of a camera, spread over the recording.
 fn some(folder: &Path, pictures: &Pictures) -> Result<Vec<Planes<f32>>> {
     let count = pictures.shots.len();
     let look = |k: usize| {

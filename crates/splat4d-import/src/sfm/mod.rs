@@ -101,7 +101,7 @@ pub struct Solution {
     pub contradiction: Vec<Option<f64>>,
     /// Of each of [`Solution::taken`], the points that move by which its clock was found.
     pub moving: Vec<usize>,
-    /// Of each of them, whether motion in it contradicts the others: it shows another time, or another take.
+    /// Of each of them, whether motion in it contradicts the others: it shows another time, or another recording.
     pub stray: Vec<bool>,
 }
 

@@ -1,4 +1,4 @@
-//! Lags by sound: the beginnings of sounds over the whole take, then the waveform.
+//! Lags by sound: the beginnings of sounds over the whole recording, then the waveform.
 
 use super::fft::{Complex, Fft, correlate, times};
 use super::{NORMAL_MAD, Refusal, median, parabola};

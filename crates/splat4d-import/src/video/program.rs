@@ -247,7 +247,7 @@ fn version(text: &str) -> Option<(u32, u32)> {
 
 /// The time in a line of one of our two `showinfo` filters:
 /// `[showinfo@all @ 0x5] [info] n: 3 pts: 1536 pts_time:0.1 ...`. `units` are the unit of time stamps, printed before:
-/// `[showinfo@all @ 0x5] [info] config in time_base: 1/15360, ...`. (`pts_time` has six digits, too few for long takes.)
+/// `[showinfo@all @ 0x5] [info] config in time_base: 1/15360, ...`. (`pts_time` has six digits, too few for long recordings.)
 fn stamp(line: &str, units: &mut [Option<f64>; 2]) -> Option<(Stamp, Option<f64>)> {
     let rest = line.strip_prefix("[showinfo@")?;
     let which = match rest.split(' ').next()? {

@@ -21,7 +21,7 @@ const HOLD_EVERY: usize = 8;
 /// White: what transparent pixels are composited on by default (the papers' choice for D-NeRF).
 const WHITE: [f32; 3] = [1.0; 3];
 
-/// Checks a take and turns it into a capture.
+/// Checks what a reader found and makes a capture of it.
 pub(super) fn assemble(mut take: RawCapture, options: &CaptureOptions) -> Result<Capture> {
     let root = take.root.clone();
     let located = |e: Error| e.at(root.display());

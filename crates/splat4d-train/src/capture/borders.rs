@@ -7,7 +7,7 @@
 //! is anywhere in the scene, next to the object's outline it is the background again: so a border counts only if the
 //! images are mostly bright a few pixels further inside.
 //!
-//! What is looked at is the same for every part of a take: the first image of each fixed camera, and images of moving ones
+//! What is looked at is the same for every part of a capture: the first image of each fixed camera, and images of moving ones
 //! evenly. The parts of one run get what the first of them found ([`Lenses`]).
 
 use super::account::Severity;

@@ -84,7 +84,7 @@ fn opengl_pose(rows: &[[f64; 4]; 4]) -> Result<Se3> {
     Convention::NERF.read_as(pose::checked(Se3::from_rows(rows))?, Poses::STATED)
 }
 
-/// The take of some shots: of one moving camera where they have times, else as their names say.
+/// The capture of some shots: of one moving camera where they have times, else as their names say.
 fn take(root: &Path, mut shots: Vec<Shot>, said: Said, options: &CaptureOptions) -> Result<RawCapture> {
     let Said { kind, convention, fps, points, up, mut warnings, mut notes } = said;
     let fps = options.fps.or(fps).unwrap_or(DEFAULT_FPS);

@@ -33,7 +33,7 @@ pub(super) fn whole(size: [usize; 2]) -> (Intrinsics, Lens) {
     (intrinsics, Lens::Equirectangular { turn, size })
 }
 
-/// Splits the panoramas of a take; others stay.
+/// Splits the panoramas of a capture; others stay.
 pub(super) fn split(take: &mut RawCapture, hold_out: Option<&HoldOut>) -> Result<()> {
     let is_panorama = |f: &RawFrame| matches!(f.source.lens, Lens::Equirectangular { .. });
     let count = take.frames.iter().filter(|f| is_panorama(f)).count();

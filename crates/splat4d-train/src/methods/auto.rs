@@ -11,7 +11,7 @@ const LOOKS: (usize, usize) = (4, 8);
 /// A pixel that changes by more than this from frame to frame (mean of the channels, in [0, 1]) has moved: above the
 /// noise of ordinary cameras.
 const CHANGED: f32 = 0.06;
-/// Times from which on a take is long.
+/// Times from which on a capture is long.
 const LONG: usize = 600;
 
 /// The motion that a capture shows.
@@ -32,7 +32,7 @@ pub struct CaptureStats {
     pub masks: bool,
     /// Images have metric depth maps, which are read.
     pub depth: bool,
-    /// The end of the take is kept from training, to be predicted.
+    /// The end of the capture is kept from training, to be predicted.
     pub predicted: bool,
 }
 
@@ -52,7 +52,7 @@ impl CaptureStats {
         })
     }
 
-    /// Whether the take is a long one.
+    /// Whether the capture is a long one.
     pub(crate) fn is_long(&self) -> bool {
         self.times >= LONG
     }
@@ -135,7 +135,7 @@ mod tests {
         camera: Camera,
         /// Seconds by which each camera is later than the one before.
         late: f64,
-        /// Share of the take that is seen.
+        /// Share of the capture that is seen.
         observe: f64,
     }
 

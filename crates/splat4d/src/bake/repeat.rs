@@ -1,13 +1,13 @@
-//! A take played many times over: the static background for ever is kept once, all else once a round.
+//! A clip played many times over: the static background for ever is kept once, all else once a round.
 
 use super::fit::LEVEL_PIXELS;
 use super::sampling::Lookout;
 use crate::format::playback::{Node, Primitive};
 
-/// How a take is repeated.
+/// How a clip is repeated.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Rounds {
-    /// First second of the take.
+    /// First second of the clip.
     pub first: f64,
     /// Seconds of a round: from the first frame to one frame behind the last.
     pub length: f64,

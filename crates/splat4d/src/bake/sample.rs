@@ -1,6 +1,6 @@
 //! A layer looked at frame after frame: what the fit is made from.
 //!
-//! Rows come in runs that are small enough for all frames of a run to lie in memory at once, however long the take is.
+//! Rows come in runs that are small enough for all frames of a run to lie in memory at once, however long the clip is.
 
 use super::shape::Shape;
 use super::tree::{Span, Tree};

@@ -1,4 +1,4 @@
-//! Where a take is cut: evenly, moved to where least moves.
+//! Where a capture is cut: evenly, moved to where least moves.
 
 use super::{FRAMES, WHOLE};
 use crate::capture::{Capture, ImageStore};
@@ -16,7 +16,7 @@ const MOVED: f64 = 0.1;
 /// Cameras that are looked at for it.
 const LOOKED_AT: usize = 2;
 
-/// The chunks of a take. Frames are counted as the capture counts them.
+/// The chunks of a capture. Frames are counted as the capture counts them.
 #[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct ChunkPlan {
     /// The splat4d that made it.
@@ -25,7 +25,7 @@ pub struct ChunkPlan {
     pub recipe: String,
     /// Fingerprint of the capture.
     pub capture: String,
-    /// First frame of the take, and the one after its last.
+    /// First frame of the capture, and the one after its last.
     pub take: [usize; 2],
     /// Frames that neighbours share.
     pub overlap: usize,
@@ -34,7 +34,7 @@ pub struct ChunkPlan {
 }
 
 impl ChunkPlan {
-    /// The plan with even cuts; `None`: the take is learnt at once. Errors: an overlap that does not fit.
+    /// The plan with even cuts; `None`: the capture is learnt at once. Errors: an overlap that does not fit.
     pub fn even(capture: &Capture, recipe: &Recipe) -> Result<Option<Self>> {
         let settings = recipe.chunks;
         if capture.train.is_empty() {
@@ -70,7 +70,7 @@ impl ChunkPlan {
     }
 
     /// The plan with its cuts where least moves, as a few of the fixed cameras see it.
-    /// `open` lists some frames of the take.
+    /// `open` lists some frames of the capture.
     pub(super) fn at_rest(
         mut self,
         open: &dyn Fn(Range<usize>) -> Result<Capture>,
@@ -119,7 +119,7 @@ impl ChunkPlan {
         self.cuts.len() + 1
     }
 
-    /// Never: a take has one chunk at least.
+    /// Never: a capture has one chunk at least.
     pub fn is_empty(&self) -> bool {
         false
     }

@@ -1,6 +1,6 @@
 //! What chunks share: the layer of the static background all the time, and the cameras' exposures.
 //!
-//! Temporal medians of every fixed camera over parts of the take are a capture of their own, on which a still scene is trained
+//! Temporal medians of every fixed camera over parts of the capture are a capture of their own, on which a still scene is trained
 //! as any other run is. Of its Gaussians those stay that most cameras see where next to nothing ever changes: what is left out
 //! is learnt by the chunks, what would be wrong in there they could not mend.
 
@@ -36,7 +36,7 @@ pub(super) const FILE: &str = "still.safetensors";
 pub(super) const LAYER: &str = "still";
 /// Folder of the medians.
 const CAPTURE: &str = "capture";
-/// Parts of the take, each of which has a median: more than one, so that exposures can be separated from the scene.
+/// Parts of the capture, each of which has a median: more than one, so that exposures can be separated from the scene.
 const PARTS: usize = 4;
 /// Frames whose median that is.
 const MEDIAN_OF: usize = 9;
@@ -171,7 +171,7 @@ fn of_medians(recipe: &Recipe) -> Recipe {
     })
 }
 
-/// The frames of each part of a take whose median is taken.
+/// The frames of each part of a capture whose median is taken.
 fn looked_at([first, end]: [usize; 2]) -> [Vec<usize>; PARTS] {
     let border = |part: usize| first + part * (end - first) / PARTS;
     std::array::from_fn(|part| {

@@ -160,7 +160,7 @@ impl Index {
         Ok(Self::place(prefix)?.end as usize)
     }
 
-    /// Whether a file's first bytes say that it is of a take that is not finished.
+    /// Whether a file's first bytes say that it is of a clip that is not finished.
     pub fn grows(header: &[u8]) -> bool {
         header.get(..10).is_some_and(|h| h[..8] == MAGIC && h[8..] == GROWING[0].to_le_bytes())
     }
