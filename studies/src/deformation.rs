@@ -56,7 +56,7 @@ type Path = Vec<[f64; 2]>;
 pub(crate) enum Scene {
     /// A third each: sinusoids along x, straight lines, circles.
     Mixed,
-    /// Points left of x = 0 stand still, those right of it move up: the edge of an occluding object.
+    /// Points left of x = 0 are static, those right of it move up: the edge of an occluding object.
     Edge,
     /// Every second point is somewhere else from t = ½ on: something appears, something goes.
     Jump,

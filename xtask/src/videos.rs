@@ -127,7 +127,7 @@ fn sound(camera: usize, view: &Camera) -> Vec<i16> {
         let mut level = loud / metres.max(1.0);
         let mut smooth = 0.0;
         for k in 0..(2.0 * lasts * f64::from(RATE)) as u64 {
-            // Noise through a low pass: fur on the edge would be lost by what lies between samples.
+            // Noise through a low pass: fur on the edge would be lost by what is between samples.
             smooth += 0.4 * (noise(event as u64, k) - smooth);
             let at = first + k as f64;
             let (whole, part) = (at.floor(), at - at.floor());

@@ -1,6 +1,6 @@
 //! News of a live run, for pages that come, go and come back.
 //!
-//! There is no queue per client: news lie in one bounded log, and a client is a place in it. So publishing never waits,
+//! There is no queue per client: news are in one bounded log, and a client is a place in it. So publishing never waits,
 //! a slow reader costs nothing but its socket, and one that joins late or returns gets what it missed from the same log.
 
 use crate::body::Body;
@@ -21,7 +21,7 @@ const MAX_NOTES: usize = 100;
 const MAX_NEWS: usize = 16 << 10;
 /// Least time between two packets to a client: faster than a person reads, slow enough for many clients.
 const PACE: Duration = Duration::from_millis(50);
-/// Time after which an empty line says that the connection lives; proxies cut silent ones after about 30 s.
+/// Time after which an empty line states that the connection lives; proxies cut silent ones after about 30 s.
 const HEARTBEAT: Duration = Duration::from_secs(15);
 /// Milliseconds after which a browser comes back.
 const RETRY: u32 = 1000;
@@ -171,7 +171,7 @@ impl Hub {
             let _held = held;
             let mut packet = format!("retry: {RETRY}\n\n");
             loop {
-                // Marked as seen before the log is read: what comes in between is looked for again, and never missed.
+                // Marked as seen before the log is read: what comes in between is searched for again, and never missed.
                 if *newest.borrow_and_update() == CLOSED {
                     return;
                 }

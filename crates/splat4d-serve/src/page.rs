@@ -36,7 +36,7 @@ pub enum SceneIn<'a> {
 }
 
 impl Page<'_> {
-    /// The page, UTF-8. It loads nothing but a linked scene. Errors: the scene is too large to lie in a page.
+    /// The page, UTF-8. It loads nothing but a linked scene. Errors: the scene is too large to be in a page.
     pub fn html(&self) -> Result<String> {
         let modules: BTreeMap<&str, &str> = assets()
             .iter()

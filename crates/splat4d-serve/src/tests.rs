@@ -38,7 +38,7 @@ fn connect(server: &Running) -> TcpStream {
     stream
 }
 
-/// Sends bytes, perhaps says that these were all, and reads to the end of the connection.
+/// Sends bytes, perhaps states that these were all, and reads to the end of the connection.
 fn raw(server: &Running, bytes: &[u8], all: bool) -> Vec<u8> {
     let mut stream = connect(server);
     // A server that refuses early may close while this still writes.
@@ -329,7 +329,7 @@ fn malformed_requests_are_refused_and_the_server_continues() {
     assert!(reply.starts_with(b"HTTP/1.1 431") || reply.is_empty(), "{}", String::from_utf8_lossy(&reply));
 }
 
-/// Reads events until `enough` says so: pairs of id and data.
+/// Reads events until `enough` states so: pairs of id and data.
 fn listen(server: &Running, last: Option<&str>, enough: impl Fn(&[(String, Value)]) -> bool) -> Vec<(String, Value)> {
     let mut stream = connect(server);
     let last = last.map(|l| format!("last-event-id: {l}\r\n")).unwrap_or_default();

@@ -1,5 +1,5 @@
 //! A turned world needs no new training: what was learnt of a capture explains the same images of the world turned,
-//! shifted and scaled once its layer's frame says so, whatever the model. Models that see no absolute coordinates may also be
+//! shifted and scaled once its layer's frame states so, whatever the model. Models that see no absolute coordinates may also be
 //! asked in the turned world itself; the others, asked so, fail.
 
 use splat4d::layers::{Layer, Scene};

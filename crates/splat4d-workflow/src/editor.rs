@@ -1,4 +1,4 @@
-//! The work behind `view --edit`: a page asks, and a list of edits is replayed, looked at, baked and saved, by the same code
+//! The work behind `view --edit`: a page asks, and a list of edits is replayed, examined, baked and saved, by the same code
 //! as `edit`. It writes one file, the list, and reads nothing that a page names but files next to the list.
 
 use crate::baking::{Baking, pack_scene};

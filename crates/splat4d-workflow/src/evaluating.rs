@@ -180,7 +180,7 @@ impl Times {
         })
     }
 
-    /// Whether what takes `seconds` fits, and what is kept for later with it; says so in one line where it does not.
+    /// Whether what takes `seconds` fits, and what is kept for later with it; states so in one line where it does not.
     fn leaves(
         missing: &str,
         [seconds, kept]: [f64; 2],
@@ -289,7 +289,7 @@ pub fn scores(
     Ok(evaluation)
 }
 
-/// Scores one split of a run's capture on some backgrounds, says them, and writes them next to those that the run is
+/// Scores one split of a run's capture on some backgrounds, states them, and writes them next to those that the run is
 /// judged
 /// by. `backgrounds` with their names; none: the run's own.
 ///

@@ -163,7 +163,7 @@ fn ball() -> Thing {
     Thing { moves: true, ..thing(Shape::Ball(0.3), bounces, texture(3, 0.25)) }
 }
 
-/// An object: a crate, a pillar and a ball that stand still.
+/// An object: a crate, a pillar and a ball that are static.
 fn object() -> [Thing; 3] {
     [
         thing(Shape::Crate([0.4; 3]), |_| [-0.9, 0.4, -0.3], texture(1, 0.4)),

@@ -1,4 +1,4 @@
-//! A synthetic world that is looked at by casting rays: boxes and balls with textures in space, cameras at exact poses.
+//! A synthetic world that is rendered by casting rays: boxes and balls with textures in space, cameras at exact poses.
 //!
 //! Everything is built from + − × ÷ √ and integer hashes, which give the same bits on every machine.
 

@@ -29,9 +29,9 @@ use std::time::Instant;
 
 /// The form of the file; another is refused.
 const VERSION: u32 = 1;
-/// Training views are looked at so often in a run.
+/// Training views are examined so often in a run.
 const PROBES: usize = 20;
-/// Training views that are looked at, the same every time.
+/// Training views that are examined, the same every time.
 const PROBE_VIEWS: usize = 6;
 
 const EXAMPLES: &str = "\

@@ -8,7 +8,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 /// Processor time from which a call hangs: undisturbed ones take below two seconds (studies/records/2026-11-27-reliability.md). Time
-/// on the clock says nothing on a machine that is shared.
+/// on the clock states nothing on a machine that is shared.
 const BUSY: f64 = 60.0;
 /// A call that waits so long without using a processor hangs.
 const IDLE: Duration = Duration::from_secs(60);

@@ -1,4 +1,4 @@
-//! `compress` on a tiny run: what it leaves, what it says, what it refuses.
+//! `compress` on a tiny run: what it leaves, what it states, what it refuses.
 
 use crate::sample::{Capture, splat4d};
 use crate::{json_of, str, train};

@@ -1,4 +1,4 @@
-//! `--device gpu` where there is no driver: one line says so, and the CPU does the work.
+//! `--device gpu` where there is no driver: one line states so, and the CPU does the work.
 
 use super::sample::{Call, Capture, splat4d};
 use super::{TINY, str};

@@ -192,7 +192,7 @@ fn a_calibration_places_cameras_and_clocks_are_found() {
         let mask = image::GrayImage::from_fn(200, 150, |_, y| image::Luma([if y < 37 { 0 } else { 255 }]));
         mask.save(at("masks").join(format!("{name}.png"))).unwrap();
     }
-    // The second dialect says the same to the last bit, so that nothing is solved again.
+    // The second dialect states the same to the last bit, so that nothing is solved again.
     let (take, masks) = (at("take"), at("masks"));
     for calibration in [at("calibration.toml"), bundled().join("capture.json")] {
         let args = ["import", str(&films), "-o", str(&take), "--calibration", str(&calibration)];
@@ -269,7 +269,7 @@ fn colmap_runs_on_request_and_its_model_is_used() {
     let dir = tempfile::tempdir().unwrap();
     let at = |name: &str| dir.path().join(name);
     let (films, take, program) = (at("films"), at("take"), at("program"));
-    // The model says where cameras are, and the user when: few frames are enough.
+    // The model states where cameras are, and the user when: few frames are enough.
     filmed_by(&CAMERAS, 4, &films);
     std::fs::create_dir_all(program.join("model")).unwrap();
     let (mut cameras, mut images) = (String::new(), String::new());

@@ -1,4 +1,4 @@
-//! `predict` on a tiny run that did not see the end of its take: what it leaves, what it says, what it refuses.
+//! `predict` on a tiny run that did not see the end of its take: what it leaves, what it states, what it refuses.
 
 use crate::sample::{Answer, Capture, splat4d};
 use crate::{TINY, json_of, str};

@@ -66,7 +66,7 @@ fn sizes(size: [usize; 2], video: [usize; 2]) -> String {
 ///
 /// Errors: the video is of another shape than the images it was calibrated with, and neither bars nor padding explain
 /// why; the
-/// principal point lies outside.
+/// principal point is outside.
 pub fn fitted(
     camera: &Calibrated,
     video: [usize; 2],

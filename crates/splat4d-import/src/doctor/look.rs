@@ -1,4 +1,4 @@
-//! What is looked at of a camera: a few images over the recording, and some in a row.
+//! What is examined of a camera: a few images over the recording, and some in a row.
 
 use super::Options;
 use crate::Result;
@@ -38,7 +38,7 @@ pub(super) struct CameraObservations {
     /// Corners that move, by the camera's clock.
     pub(super) tracks: Vec<Track>,
     pub(super) clock: Clock,
-    /// Images that were looked at in a row.
+    /// Images that were examined in a row.
     pub(super) row: usize,
     /// Mean of 255 and detail of images in a row.
     pub(super) means: Vec<f64>,
@@ -61,7 +61,7 @@ fn halvings(view: &Camera) -> u32 {
     (0..).find(|k| (view.width >> k) * (view.height >> k) <= PIXELS).unwrap_or(0)
 }
 
-/// The view of an image as it is looked at.
+/// The view of an image as it is examined.
 fn looked(view: &Camera) -> Camera {
     view.downscaled(1 << halvings(view))
 }

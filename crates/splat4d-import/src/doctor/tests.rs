@@ -72,7 +72,7 @@ fn clean() -> &'static Clip {
     CLIP.get_or_init(|| (0..CAMERAS).map(|c| (0..FRAMES).map(|n| draw(&camera(c), n as f64 / FPS)).collect()).collect())
 }
 
-/// What the doctor says of these images, where the ill camera's pose is turned by so many radians about its own x axis.
+/// What the doctor states of these images, where the ill camera's pose is turned by so many radians about its own x axis.
 fn says(clip: &Clip, turned: f64, cameras: usize) -> Report {
     let folder = tempfile::tempdir().unwrap();
     let capture = write(folder.path(), clip, turned, cameras);

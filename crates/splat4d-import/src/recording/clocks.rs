@@ -74,7 +74,7 @@ fn heard(
     Ok(pairs.par_iter().map(of).collect())
 }
 
-/// What motion says.
+/// What motion states.
 pub(super) struct Guessed {
     /// Lags that are guessed.
     pub evidence: Vec<Evidence>,

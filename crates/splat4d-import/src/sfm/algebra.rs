@@ -36,7 +36,7 @@ pub(crate) fn roots(p: &[f64]) -> Vec<f64> {
     if p.len() == 2 {
         return vec![-p[0] / p[1]];
     }
-    // All roots lie within (Cauchy's bound).
+    // All roots are within (Cauchy's bound).
     let lead = p[p.len() - 1].abs();
     let bound = 1.0 + p[..p.len() - 1].iter().fold(0.0f64, |m, c| m.max(c.abs())) / lead;
     let slope = derivative(&p);

@@ -176,7 +176,7 @@ pub(super) fn aligned(x: [f64; 3], seen: &[ImagePoint<'_>], more: &[ImagePoint<'
     out
 }
 
-/// How pixels about a point in one image lie in another one, if it stands on a plane with this normal.
+/// How pixels about a point in one image are in another one, if it stands on a plane with this normal.
 fn warp(x: [f64; 3], normal: [f64; 3], from: &ImagePoint<'_>, to: &ImagePoint<'_>) -> Option<[[f64; 2]; 2]> {
     /// Pixels over which the slope is taken.
     const STEP: f64 = 2.0;

@@ -298,7 +298,7 @@ fn what_moves_is_seen_at_times_with_its_velocity() {
     assert!(still > 40 && moving.len() > 20, "{still} {}", moving.len());
     let near = |f: &Feature, speed: f64| (f.velocity[0] - speed).hypot(f.velocity[1]) < 8.0;
     let share = |speed: f64| moving.iter().filter(|f| near(f, speed)).count() as f64 / moving.len() as f64;
-    // The rest lies on the patch's border, where windows hold some of the wall.
+    // The rest is on the patch's border, where windows hold some of the wall.
     assert!(share(240.0) > 0.65, "{}", share(240.0));
     assert_eq!(sights[0].shown.iter().filter(|w| w.is_some()).count(), 4);
 }

@@ -6,7 +6,7 @@ use splat4d_train::capture::Rgb8;
 
 /// Pixels between corners that are followed.
 pub const APART: f64 = 8.0;
-/// Images are halved until they have no more pixels: 640x360 is looked at as it is, and a film's images at half size.
+/// Images are halved until they have no more pixels: 640x360 is examined as it is, and a film's images at half size.
 pub const PIXELS: usize = 700_000;
 /// Sizes of an image: motion of up to `RADIUS · 2^(LEVELS − 1)` pixels is followed.
 pub const LEVELS: usize = 4;
@@ -267,7 +267,7 @@ fn at_level(a: &Grey, b: &Grey, [x, y]: [f64; 2], mut moved: [f64; 2], finest: b
     Some(moved)
 }
 
-/// Follows corners through a camera's frames; where some are lost, new ones are looked for.
+/// Follows corners through a camera's frames; where some are lost, new ones are searched for.
 pub struct Tracker {
     most: usize,
     apart: f64,

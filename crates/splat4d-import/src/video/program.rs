@@ -35,7 +35,7 @@ pub struct Tools {
 }
 
 impl Tools {
-    /// Looks for the programs where the system looks for programs. Errors: not there, too old.
+    /// Looks for the programs where the system searches for programs. Errors: not there, too old.
     pub fn find() -> Result<Self> {
         Self::at(Path::new("ffmpeg"), Path::new("ffprobe"))
     }
@@ -94,7 +94,7 @@ impl Tools {
         let out = command.output().map_err(|e| Error::environment("ffprobe cannot be started", e).remedy(INSTALL))?;
         if !out.status.success() {
             let said = String::from_utf8_lossy(&out.stderr);
-            // The last line says that it did not work, the one before why.
+            // The last line states that it did not work, the one before why.
             let lines: Vec<String> = said.lines().map(|l| plain(l, path)).filter(|l| !l.is_empty()).collect();
             let last = lines[lines.len().saturating_sub(2)..].join("; ");
             let what = format!("ffmpeg cannot read it as a video, or it is damaged ({last})");

@@ -1,4 +1,4 @@
-//! JSON with named places: every error says which key of which file is wrong and, for a misspelt key, what was meant.
+//! JSON with named places: every error states which key of which file is wrong and, for a misspelt key, what was meant.
 
 use super::account::first_names;
 use super::convention::Poses;

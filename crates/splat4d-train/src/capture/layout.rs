@@ -1,4 +1,4 @@
-//! Which layout a folder has: markers in a stated order, what lies next to the one that is taken, and what to do
+//! Which layout a folder has: markers in a stated order, what is next to the one that is taken, and what to do
 //! where there
 //! is none.
 
@@ -9,7 +9,7 @@ use std::path::Path;
 /// A reader: the capture's folder and the marker file that was found, to what the files say.
 type Reader = fn(&Path, &Path, &CaptureOptions) -> Result<RawCapture>;
 
-/// Marker files (or folders) in the order in which they are looked for, with their readers.
+/// Marker files (or folders) in the order in which they are searched for, with their readers.
 const READERS: &[(&str, Reader)] = &[
     ("capture.json", own::read),
     (transforms::TRAIN, transforms::read),

@@ -197,7 +197,7 @@ pub struct Capture {
     pub name: String,
     /// The folder.
     pub root: PathBuf,
-    /// Real folders of its images, masks and maps that lie elsewhere, and such files.
+    /// Real folders of its images, masks and maps that are elsewhere, and such files.
     pub elsewhere: BTreeSet<PathBuf>,
     /// The layout it was read from.
     pub kind: CaptureKind,
@@ -236,7 +236,7 @@ pub struct Capture {
     pub labels: Vec<String>,
     /// The k of [`CaptureOptions::downscale`].
     pub downscale: usize,
-    /// What the layout says that poses are.
+    /// What the layout states that poses are.
     pub convention: Convention,
     /// What they were read as instead.
     pub poses: Poses,
@@ -276,7 +276,7 @@ struct RawCapture {
     warnings: Vec<String>,
     notes: Vec<String>,
     account: Account,
-    /// What the layout says that poses are.
+    /// What the layout states that poses are.
     convention: Convention,
 }
 

@@ -47,7 +47,7 @@ impl Capture {
             points.colors = kept.iter().map(|&i| points.colors[i]).collect();
             points.times = kept.iter().map(|&i| points.times[i]).collect();
         }
-        // Where moving cameras will stand says how large the scene is.
+        // Where moving cameras will stand states how large the scene is.
         let near = assemble::near(self, near);
         self.frames.iter_mut().for_each(|f| f.view.near = near);
         Ok(())

@@ -34,7 +34,7 @@ const FILM_WORDS: [&str; 12] =
     ["", "frame", "frames", "image", "img", "out", "output", "video", "thumb", "rgb", "color", "f"];
 /// The one that telephones and cameras write for photos.
 const PHOTO_WORD: &str = "IMG";
-/// What Nerfstudio renames every image to, photos and frames alike: a word and five digits. It says nothing of time.
+/// What Nerfstudio renames every image to, photos and frames alike: a word and five digits. It states nothing of time.
 const RENAMED: (&str, usize) = ("frame_", 5);
 /// Words before the number in the names of a rig's cameras.
 const CAMERA_WORDS: [&str; 2] = ["cam", "camera"];

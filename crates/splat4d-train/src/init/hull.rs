@@ -212,7 +212,7 @@ struct Votes {
     colors: Vec<[f32; 3]>,
 }
 
-/// The points that lie in (almost) all silhouettes that see them, with their median colour. One image at a time is
+/// The points that are in (almost) all silhouettes that see them, with their median colour. One image at a time is
 /// held.
 fn vote(silhouettes: &Silhouettes<'_>, points: &[[f64; 3]]) -> Result<Seeds> {
     let allowed = silhouettes.misses * silhouettes.count as f64;

@@ -193,7 +193,7 @@ impl AdcSettings {
             }
             if grows[r] && !splits[r] {
                 // Two halves in one place are as opaque as the whole: 1 − √(1 − o) each. Parts of a split are smaller and
-                // lie next to each other; as faint as this they let training views fall by up to 2 dB (docs/suite.md).
+                // are next to each other; as faint as this they let training views fall by up to 2 dB (docs/suite.md).
                 layer.params[GEOMETRY].set(j, OPACITY, logit(1.0 - (1.0 - old_opacity[j]).sqrt()));
             }
         }

@@ -1,4 +1,4 @@
-//! `--motion auto`: looks at the capture, and takes the first program that says why it suits.
+//! `--motion auto`: looks at the capture, and takes the first program that states why it suits.
 
 use super::{Method, TrainContext};
 use crate::Result;
@@ -6,7 +6,7 @@ use crate::capture::Agreement;
 use crate::capture::frames::{Frames, Picture};
 use splat4d::scene::Planes;
 
-/// Cameras of the rig that are looked at, and pairs of neighbouring frames of each.
+/// Cameras of the rig that are examined, and pairs of neighbouring frames of each.
 const LOOKS: (usize, usize) = (4, 8);
 /// A pixel that changes by more than this from frame to frame (mean of the channels, in [0, 1]) has moved: above the
 /// noise of ordinary cameras.
@@ -72,7 +72,7 @@ pub(crate) struct Choice {
     pub why: String,
 }
 
-/// Chooses for the training frames of a capture: the first of the programs that says why it suits.
+/// Chooses for the training frames of a capture: the first of the programs that states why it suits.
 pub(crate) fn choose(
     plan: &TrainContext,
     programs: impl IntoIterator<Item = (&'static str, Box<dyn Method>)>,

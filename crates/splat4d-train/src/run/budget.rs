@@ -103,7 +103,7 @@ impl Planner {
     /// Begins at so many seconds of the command, behind these plans.
     pub(super) fn new(budget: Budget, now: f64, replans: &[ScheduleChange]) -> Self {
         let last = replans.last().map_or(0, |row| row.at);
-        // A part that begins late in a command is looked at as often as one that begins at once.
+        // A part that begins late in a command is examined as often as one that begins at once.
         let interval = (60.0 * budget.minutes - now).max(0.0) / LOOKS;
         Self { budget, interval, looked: now, taken: [0.0; 2], slowness: None, last }
     }

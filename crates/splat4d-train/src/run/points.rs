@@ -27,10 +27,10 @@ const BARE: f64 = 0.2;
 /// Cells along an image's longer side in which that is counted; of a rig at most so many views.
 const CELLS: f64 = 16.0;
 const VIEWS: usize = 64;
-/// Of the initial Gaussians, the points that are looked for: what lies between them is laid along surfaces.
+/// Of the initial Gaussians, the points that are searched for: what is between them is laid along surfaces.
 const WANTED: f64 = 0.5;
 
-/// The capture with points from its images, where it brings too few and the recipe lets them be looked for.
+/// The capture with points from its images, where it brings too few and the recipe lets them be searched for.
 pub(super) fn complete(
     opened: OpenCapture,
     recipe: &Recipe,

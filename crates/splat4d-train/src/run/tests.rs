@@ -461,7 +461,7 @@ fn foreign_checkpoints_are_refused_with_a_reason() {
     std::fs::write(run.join("recipe.toml"), other.to_toml()).unwrap();
     let error = resume_quietly(&run).unwrap_err().to_string();
     assert!(error.contains("another recipe") && error.contains("start a new run"), "{error}");
-    // What only says how memory is spent may change.
+    // What only states how memory is spent may change.
     let run = copy("memory");
     let other = base.resolve().with(|r| {
         r.run.image_memory = 1 << 20;

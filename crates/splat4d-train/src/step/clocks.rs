@@ -16,7 +16,7 @@ use splat4d::render::{Antialias, Image, RenderConfig, Shot};
 use splat4d::scene::{Planes, Time};
 use std::collections::BTreeMap;
 
-/// Images of a camera that are looked at, spread over the capture.
+/// Images of a camera that are examined, spread over the capture.
 const LOOKS: usize = 6;
 /// Neighbouring searches look at other images: at so many places between two of them, in turn.
 const TURNS: usize = 3;

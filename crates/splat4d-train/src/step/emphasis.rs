@@ -22,7 +22,7 @@ const ROWS: usize = 16;
 pub(crate) struct Emphasis {
     /// k: how much more than others a pixel weighs that shows nothing but what moves.
     strength: f32,
-    /// By camera: its temporal median, channel by channel at the size that images are looked at in, as bytes.
+    /// By camera: its temporal median, channel by channel at the size that images are examined in, as bytes.
     still: BTreeMap<usize, [Vec<u8>; 3]>,
     /// Scratch: Σ ψ/3 by pixel at that size.
     moves: Planes<f32>,

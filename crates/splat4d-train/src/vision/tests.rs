@@ -15,7 +15,7 @@ struct Room {
     /// Length of what is one in the descriptions below.
     unit: f64,
     textured: bool,
-    /// No wall, but what lies a hundred times as far away.
+    /// No wall, but what is a hundred times as far away.
     far: bool,
     panel: bool,
     /// Frames of one moving camera, and not of a camera each.
@@ -26,7 +26,7 @@ struct Room {
 type Plane = ([f64; 3], f64);
 const WALL: Plane = ([-0.3, 0.0, 1.0], 1.0);
 const FLOOR: Plane = ([0.0, 1.0, 0.0], 1.2);
-/// What lies behind a room without a wall, and how much larger its texture is.
+/// What is behind a room without a wall, and how much larger its texture is.
 const HORIZON: Plane = ([0.0, 0.0, 1.0], 500.0);
 const LARGER: f64 = 100.0;
 /// Depth of the panel and half its edge, units.
@@ -150,7 +150,7 @@ impl Frames for Room {
     }
 }
 
-/// Share of the points that lie within a hundredth of their depth of a surface.
+/// Share of the points that are within a hundredth of their depth of a surface.
 fn share_on(room: &Room, points: &[Point], moment: Option<usize>) -> f64 {
     points.iter().filter(|p| room.off(p.place, moment) < 0.01).count() as f64 / points.len().max(1) as f64
 }

@@ -37,7 +37,7 @@ impl Transfer {
         Self { turn: mat_mul(&mat_mul(&k, &rotation), &inverse), shift: mat_vec(&k, shift) }
     }
 
-    /// Where the pixel lies in the other image at an inverse depth; nothing behind that camera.
+    /// Where the pixel is in the other image at an inverse depth; nothing behind that camera.
     pub fn at(&self, pixel: [f64; 2], inverse: f64) -> Option<[f64; 2]> {
         let q = mat_vec(&self.turn, [pixel[0], pixel[1], 1.0]);
         let q: [f64; 3] = std::array::from_fn(|k| q[k] + inverse * self.shift[k]);

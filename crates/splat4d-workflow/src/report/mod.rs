@@ -213,7 +213,7 @@ fn views(out: &mut String, run: &Run) {
         let captions = [("gt", format!("truth, {place}")), ("renders", score), ("errors", "error".into())];
         for (picture, (kind, caption)) in pictures.iter().zip(captions) {
             let image = picture.as_ref().map(|p| format!("<img alt=\"{}\" src=\"{p}\">", escape(&caption)));
-            // The file itself, as long as the page lies in its run.
+            // The file itself, as long as the page is in its run.
             let image = image.zip(place_of(kind, &view.file)).map(|(image, place)| {
                 format!("<a href=\"{}\">{image}</a>", escape(&place.to_string_lossy().replace('\\', "/")))
             });
@@ -278,7 +278,7 @@ fn scores(out: &mut String, run: &Run) {
         }
     }
     let mean = |views: &[&ViewScore]| views.iter().filter_map(|v| v.psnr).sum::<f64>() / views.len().max(1) as f64;
-    // What its colours cost a camera stands next to its score.
+    // What its colours cost a camera is next to its score.
     let label = |views: &[&ViewScore]| {
         let all: Vec<f64> = views.iter().filter_map(|v| v.corrected).collect();
         let corrected = all.iter().sum::<f64>() / all.len() as f64;

@@ -275,7 +275,7 @@ fn static_gaussians_of_repeated_rounds_are_stored_once() {
     let still = layer(&Spec::Still, LifeKind::Infinite, 50, 0.1, 1.0);
     let moving = layer(&spacetime(1, false), LifeKind::GaussHalf, 70, 0.3, 1.0);
     let one = scene(vec![still, moving], 29.0 / FPS);
-    // So strict that only what really stands still counts as still.
+    // So strict that only what really is static counts as still.
     let (once, thrice) = (baked(&one, &options(1e-6)), baked(&one, &Options { repeat: 3, ..options(1e-6) }));
     let still = 50;
     let moving = once.report.primitives - still;
@@ -365,7 +365,7 @@ fn a_file_is_as_good_and_can_be_baked_again() {
     let times: Vec<f64> = (0..57).step_by(5).map(|k| f64::from(k) / FPS).collect();
     let like = |file: &Scene<f32>| like_at(file, &times);
     let played = file(&first);
-    // A held-out view may lie before the first training frame or after the last one, where a player shows the clip's ends.
+    // A held-out view may be before the first training frame or after the last one, where a player shows the clip's ends.
     let beyond = like_at(&played, &[scene.clip[0] - 0.5, scene.clip[1] + 0.5]);
     assert!(beyond.worst_psnr > 38.0, "{beyond:?}");
     assert!(like(&played).psnr > 40.0, "{:?} {:?}", like(&played), likeness(&scene, &first));

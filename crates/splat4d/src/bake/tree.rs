@@ -11,12 +11,12 @@ const MAX_FRAMES: f64 = 1_000_000.0;
 /// Most parts of a frame: enough for a clip of one frame a second, and a bound on the work for a slower one.
 const MAX_PARTS: f64 = 32.0;
 
-/// Borders of spans lie on frames, so that a frame is shown by one node a level and by no two. Where the clip has few
+/// Borders of spans are on frames, so that a frame is shown by one node a level and by no two. Where the clip has few
 /// frames a second, what is called a frame here is a part of one: a player shows the times between them too, and a
 /// model need not be straight there.
 ///
 /// The tree halves the clip at the borders of segments, and a segment, where motion demands it, frame by frame. Its
-/// last border lies one frame of the clip behind the clip's last second, so that this second is inside.
+/// last border is one frame of the clip behind the clip's last second, so that this second is inside.
 #[derive(Clone, Debug)]
 pub(super) struct Tree {
     clip: [f64; 2],

@@ -12,7 +12,7 @@ use crate::render::RenderConfig;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::{GEOMETRY, LIFE, LifeKind, Params, Rows, SH, Space};
 
-/// A context that has one camera, one mask and one scene; nodes stand still.
+/// A context that has one camera, one mask and one scene; nodes are static.
 struct Bench {
     other: Scene<f32>,
     mask: Mask,

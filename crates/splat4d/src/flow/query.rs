@@ -2,7 +2,7 @@
 //! camera sees of it.
 //!
 //! A pixel belongs to the Gaussians that it shows: the eight heaviest α_i T_i at about the depth of the one at which half of
-//! the pixel's weight is reached (what a translucent edge lets through behind it has another motion), and its point lies on
+//! the pixel's weight is reached (what a translucent edge lets through behind it has another motion), and its point is on
 //! the pixel's ray at that depth. A place belongs to the Gaussians nearest to it. They carry the point on by their mean
 //! displacement; where half of them have died, the nearest that live on take over, so that points are followed through
 //! models with short lifespans, at the price of the drift of an integration.
@@ -68,7 +68,7 @@ impl Followed {
 pub struct PointView {
     /// Pixel position; outside of the image too.
     pub pixel: [f64; 2],
-    /// Whether it lies in the image with at least half of the light left before it.
+    /// Whether it is in the image with at least half of the light left before it.
     pub visible: bool,
 }
 

@@ -38,7 +38,7 @@ const MOST: f64 = 0.5;
 /// Of scenes of logarithms, hardly a Gaussian is as large as a quarter of the inner half of the scene; of lengths read as
 /// logarithms, e^s ≥ 1, most are wherever the scene is not far larger than a unit.
 const LARGE: f64 = 0.25;
-/// In larger scenes: lengths below a unit, read as logarithms, would all lie between 1 and e units in every direction. No
+/// In larger scenes: lengths below a unit, read as logarithms, would all be between 1 and e units in every direction. No
 /// trained scene has such sizes.
 const UNIT: f32 = 1.0;
 /// White in opacities and colours that are bytes, and in opacities that are percent.
@@ -119,7 +119,7 @@ fn alphas(of: &Spread) -> Option<String> {
     })
 }
 
-/// Evidence that base colours are RGB. Coefficients of trained scenes lie on both sides of zero, which is grey.
+/// Evidence that base colours are RGB. Coefficients of trained scenes are on both sides of zero, which is grey.
 fn rgb(of: &Spread) -> Option<String> {
     let parts = of.high <= 1.0 && of.low < of.high;
     let bytes = of.high > BRIGHTEST && of.high <= BYTE && of.middle > 1.0;

@@ -54,7 +54,7 @@ impl Stated {
             "life": l.life.name(),
             "motion": spec_to_json(&l.motion.spec()),
         });
-        // JSON knows no infinity: a side that is open is null, and a layer that is always seen says nothing.
+        // JSON knows no infinity: a side that is open is null, and a layer that is always seen states nothing.
         if l.span != ALWAYS {
             layer["span"] = json!(l.span.map(|t| t.is_finite().then_some(t)));
         }

@@ -1,4 +1,4 @@
-//! Constants of the kernels that decide how fast they are, and of what they compute nothing but, where it says so, last bits: what
+//! Constants of the kernels that decide how fast they are, and of what they compute nothing but, where it states so, last bits: what
 //! a sweep on a card varies.
 
 use super::limits::THREADS;

@@ -64,7 +64,7 @@ pub trait Real:
     fn max(self, other: Self) -> Self;
     /// Neither NaN nor infinite.
     fn is_finite(self) -> bool;
-    /// self·b + c, fused only where the instruction set has it (the caller says so by `FMA`).
+    /// self·b + c, fused only where the instruction set has it (the caller states so by `FMA`).
     fn fma<const FMA: bool>(self, b: Self, c: Self) -> Self;
     /// 2^self for self in [-126, 0]: a branch-free polynomial in f32 (relative error ≤ 5e-6, 1 only at 0), exact in
     /// f64. Below the range the result is any number.

@@ -81,7 +81,7 @@ const TIME_AXES: [[usize; 3]; 3] = [[0, 1, 3], [1, 2, 3], [0, 2, 3]];
 const POINT: usize = 4;
 /// Name of the table that holds the centre and the half side of the box of the initial cloud, scene units.
 pub const BOUNDS: &str = "deform_bounds";
-/// Share of the points that may lie outside the box on either side of an axis.
+/// Share of the points that may be outside the box on either side of an axis.
 const OUTSIDE: f64 = 0.005;
 /// The box is this much larger than what holds the points.
 const MARGIN: f64 = 1.25;

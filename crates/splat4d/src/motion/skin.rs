@@ -12,7 +12,7 @@
 //! quaternion, from the identity.
 //!
 //! Nothing is detached (the reference stops the gradient at x and p inside the blend): finite differences hold for every
-//! table. What is not learnt is which nodes are looked at: every Gaussian has a list of the nearest ones, refreshed by
+//! table. What is not learnt is which nodes are examined: every Gaussian has a list of the nearest ones, refreshed by
 //! [`Skinned::bind`] now and then; among them the weights choose again at every step, continuously.
 
 mod blend;

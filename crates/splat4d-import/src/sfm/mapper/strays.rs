@@ -6,7 +6,7 @@ use crate::sync::median;
 use rayon::prelude::*;
 
 impl Map<'_> {
-    /// Of every sight the matches that look alike, and those of them that lie on epipolar lines; of the static
+    /// Of every sight the matches that look alike, and those of them that are on epipolar lines; of the static
     /// background and of what moves.
     pub(super) fn agreement(&self, links: &[Link]) -> Vec<[[usize; 2]; 2]> {
         let known: Vec<Option<tracks::Known>> =

@@ -12,7 +12,7 @@ const RATIO: f64 = 0.8;
 pub(super) const STRICT: f64 = 0.7;
 /// Distance from an epipolar line, pixels of the small image.
 const NEAR: f64 = 1.5;
-/// Angle between rays below which nothing says which side of the cameras they meet on, radians.
+/// Angle between rays below which nothing states which side of the cameras they meet on, radians.
 const PARALLEL: f64 = 0.006;
 /// Of the cameras' spread: cameras nearer to one another have the same position.
 const ONE_PLACE: f64 = 1e-6;

@@ -244,7 +244,7 @@ fn masks_that_exclude_everything() {
 fn missing_files_of_a_layout_are_named() {
     let sample = samples::n3dv();
     std::fs::remove_dir_all(sample.path("cam01")).unwrap();
-    // With numbers in names the rows are known, and what is missing is noted; without, nothing says whose poses are whose.
+    // With numbers in names the rows are known, and what is missing is noted; without, nothing states whose poses are whose.
     std::fs::rename(sample.path("cam00"), sample.path("front")).unwrap();
     assert_says(&message(&sample), &["2 cameras", "1 folders"]);
     sample.write("cam01.mp4", b"");

@@ -107,7 +107,7 @@ fn resized_images_scale_their_intrinsics_and_cropped_ones_are_refused() {
     assert!(says(&capture.warnings, &["9 images", "cam00.png is 24x16, not 48x32"]), "{:?}", capture.warnings);
     sample.edit("transforms.json", |v| v["h"] = json!(2 * HEIGHT + 6));
     assert_says(&refuse(&sample), &["cam00", "24x16", "48x38"]);
-    // Any image is looked at, not only the first.
+    // Any image is examined, not only the first.
     let sample = samples::photos(9, cam, None);
     sample.save("images/cam07.png", image::ImageBuffer::from_fn(16, 24, |_, _| image::Luma([9u8])));
     assert_says(&refuse(&sample), &["cam07.png", "16x24", "24x16"]);

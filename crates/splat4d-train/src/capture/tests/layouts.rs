@@ -203,7 +203,7 @@ fn nerfstudio() {
     let store = ImageStore::new(Arc::clone(&capture), 1 << 20);
     assert!(store.load(0).unwrap().to_picture().mask.is_some());
     assert!(store.load(1).unwrap().to_picture().mask.is_none());
-    // The corner ray of the pinhole image lies inside the barrel-distorted one, so all pixels are valid, and the
+    // The corner ray of the pinhole image is inside the barrel-distorted one, so all pixels are valid, and the
     // corner shows what was nearer the middle.
     let picture = store.load(2).unwrap().to_picture();
     assert!(picture.valid.is_none() && picture.color.get(0, 0, 0) > 0.02, "{}", picture.color.get(0, 0, 0));

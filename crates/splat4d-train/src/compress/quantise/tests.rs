@@ -63,7 +63,7 @@ fn begun(rows: usize, depths: Depths) -> (Arc<Quantised>, Scene<f32>, Pages) {
     (codec, scene, pages)
 }
 
-/// Gradients as if the rows alive at t had been looked at.
+/// Gradients as if the rows alive at t had been examined.
 fn gradients(scene: &Scene<f32>, t: Time, seed: u64) -> Vec<Grads<f32>> {
     let mut ids = Vec::new();
     let one = |(l, layer): (usize, &Layer<f32>)| {

@@ -2,8 +2,8 @@
 //! and its variants.
 //!
 //! The paper's S^TV = Σ_t 1/(½ tanh p''(t) + ½), p the life, summed over the whole clip, ranks the other way round than
-//! its text says: a term is 1 + exp(−2p''), so that it overflows at the peak of a short life, and a time at which
-//! the Gaussian is not there counts 2, the most that |p''| could give. The reading that does what the text says takes
+//! its text states: a term is 1 + exp(−2p''), so that it overflows at the peak of a short life, and a time at which
+//! the Gaussian is not there counts 2, the most that |p''| could give. The reading that does what the text states takes
 //! the product with the spatial score time by time: absent times vanish, and each present one weighs 1
 //! (flickers) to 2 (lasts). That is [`Temporal::InstantAbs`], the default; the others are kept for comparison.
 
@@ -46,7 +46,7 @@ pub enum Spatial {
     /// Σ over pixels and channels of the squared change that its removal alone would make. Neighbours of one colour
     /// stand in for each other, and may all go.
     Change,
-    /// The geometric mean of both in each view: neither what covers nor what differs from what lies behind goes first.
+    /// The geometric mean of both in each view: neither what covers nor what differs from what is behind goes first.
     Both,
     /// Opacity at every time at which a view shows it (3DGS).
     Opacity,
@@ -225,7 +225,7 @@ mod tests {
         };
         let scores = LIVES.map(score);
         assert!(scores.windows(2).all(|w| w[0] < w[1]), "{scores:?}");
-        // Computed apart from this code, from the formula; where a short life lies between frames matters by 3 %.
+        // Computed apart from this code, from the formula; where a short life is between frames matters by 3 %.
         for (s, expected) in scores.iter().zip([2.5, 7.5, 18.2, 41.8, 106.0, 296.0, 545.0]) {
             assert!((s / expected - 1.0).abs() < 0.04, "{scores:?}");
         }

@@ -51,7 +51,7 @@ pub struct Seams {
     pub across: f64,
     /// In the middle of chunks.
     pub inside: f64,
-    /// Cuts that were looked at.
+    /// Cuts that were examined.
     pub cuts: usize,
     /// Whether cameras looked that training never saw.
     pub held_out: bool,
@@ -158,7 +158,7 @@ impl Chunked {
         Ok(whole)
     }
 
-    /// What all chunks share; none: nothing stands still. Errors: the file cannot be read.
+    /// What all chunks share; none: nothing is static. Errors: the file cannot be read.
     pub fn still(&self) -> Result<Option<Layer<f32>>> {
         Ok(shared::read(&self.folder(Part::Shared))?.still)
     }

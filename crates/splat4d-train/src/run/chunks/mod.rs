@@ -45,7 +45,7 @@ const WHOLE: usize = 300;
 const POLL: Duration = Duration::from_secs(1);
 /// Folder of the chunks in a run.
 const FOLDER: &str = "chunks";
-/// Folder in it whose lock says who writes the playback file.
+/// Folder in it whose lock states who writes the playback file.
 const FILM: &str = "film";
 /// Time between two looks whether it may be written.
 const TURNS: Duration = Duration::from_millis(200);
@@ -101,7 +101,7 @@ impl Chunked {
     ) -> Result<Option<Self>> {
         let Some(even) = ChunkPlan::even(capture, recipe)? else { return Ok(None) };
         let mut listen = listen;
-        // What is looked at before the first step is the capture's beginning, however much of it the caller has listed.
+        // What is examined before the first step is the capture's beginning, however much of it the caller has listed.
         let first = Arc::new(beginning(capture, &even));
         let recipe = chosen(&first, recipe.clone(), &mut listen)?;
         recipe.check()?;

@@ -13,7 +13,7 @@ use std::sync::Arc;
 
 /// Share of a chunk's frames by which a cut is moved, at most.
 const MOVED: f64 = 0.1;
-/// Cameras that are looked at for it.
+/// Cameras that are examined for it.
 const LOOKED_AT: usize = 2;
 
 /// The chunks of a capture. Frames are counted as the capture counts them.

@@ -30,7 +30,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-/// The file whose being there says that the part is done: the layer, or a scene without layers.
+/// The file whose being there states that the part is done: the layer, or a scene without layers.
 pub(super) const FILE: &str = "still.safetensors";
 /// Name of the layer.
 pub(super) const LAYER: &str = "still";
@@ -43,14 +43,14 @@ const MEDIAN_OF: usize = 9;
 /// A pixel that differs by more from the median (mean of the channels, in [0, 1]) has changed: above the noise of ordinary
 /// cameras.
 const CHANGED: f32 = 0.06;
-/// A pixel is calm where at most this share of the frames that are looked at has changed.
+/// A pixel is calm where at most this share of the frames that are examined has changed.
 const CALM: f64 = 0.1;
 /// Steps of the layer, in those of a chunk: every chunk shows it and none can mend it (docs/scale.md has the figures).
 pub(super) const STEPS: usize = 4;
 /// A Gaussian stays where at least this share of the cameras that look at it finds it calm.
 const AGREED: f64 = 0.5;
 
-/// What a finished part says.
+/// What a finished part states.
 pub(super) struct Shared {
     /// The static background, as it was learnt; none: nothing does.
     pub still: Option<Layer<f32>>,

@@ -136,7 +136,7 @@ fn short_captures_are_not_cut_and_long_ones_at_rest() {
     let capture = place.open(&recipe);
     let even = ChunkPlan::even(&capture, &recipe).unwrap().unwrap();
     assert_eq!((even.cuts.clone(), even.frames(0), even.frames(1), even.shared(0)), (vec![10], 0..11, 9..20, 9..11));
-    // The ball stands still from frame 10 to 11 only.
+    // The ball is static from frame 10 to 11 only.
     for camera in 0..4 {
         let picture = |k: usize| capture.root.join(format!("images/{camera}/{k:04}.png"));
         std::fs::copy(picture(10), picture(11)).unwrap();

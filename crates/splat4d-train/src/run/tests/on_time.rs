@@ -89,7 +89,7 @@ fn a_resumed_run_keeps_its_time_limit_and_history() {
     };
     let whole = saved(&place, "whole").run.replans;
     assert!(whole.rows()[0].at < 100, "{whole:?}");
-    // A clock that stands still asks for no plan of its own.
+    // A clock that is static asks for no plan of its own.
     let run = crashed("crashed");
     let options = TrainOptions { clock: Stopwatch::of(|| 0.0), ..TrainOptions::default() };
     resume_with(&run, &options, &AtomicBool::new(false), &mut |_| {}).unwrap();

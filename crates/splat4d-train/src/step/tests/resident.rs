@@ -172,7 +172,7 @@ fn a_number_that_is_not_finite_is_found_and_named() {
     resumed.step().unwrap().unwrap();
 }
 
-/// What a device that fails says, and one that has no room.
+/// What a device that fails states, and one that has no room.
 const GONE: &str = "the driver is gone";
 const FULL: &str = "too many for one buffer";
 /// As often as it is called.

@@ -1,4 +1,4 @@
-//! Every switch of the recipe in real training: each must do what it says, and the scene must still learn.
+//! Every switch of the recipe in real training: each must do what it states, and the scene must still learn.
 
 use super::bed::{Bed, Ran, bytes, places};
 use crate::loss::graph::{Graph, Weigh};

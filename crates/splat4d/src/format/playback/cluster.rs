@@ -17,7 +17,7 @@ const ONE_LEVEL: usize = 256;
 const COARSE: f64 = 0.7;
 /// Rounds of the coarse level, which only has to divide the work.
 const COARSE_ROUNDS: usize = 4;
-/// Coarse clusters in which every point looks for its entry finally.
+/// Coarse clusters in which every point searches for its entry finally.
 const NEAREST: usize = 3;
 /// Points a task assigns.
 const TASK: usize = 1024;

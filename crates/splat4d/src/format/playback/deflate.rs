@@ -1,4 +1,4 @@
-//! Deflates byte planes one by one: each gets codes of its own, and the way of looking for repetitions that suits it.
+//! Deflates byte planes one by one: each gets codes of its own, and the way of searching for repetitions that suits it.
 //!
 //! Planes of one section differ: the low bits of positions are noise, a label's high byte is nearly constant. One encoder
 //! over all of them begins blocks anywhere; blocks that begin with planes made the pages of the bundled capture 4 % and

@@ -152,7 +152,7 @@ fn check_row(at: [Normal; 3], w: &Normal, fusion: Fusion, predictor: Predictor, 
     usize::from(f.open > 0.0 && f.open < trust)
 }
 
-/// Means that a table of frames says, linear in between: tracked balls.
+/// Means that a table of frames states, linear in between: tracked balls.
 struct Watched {
     frames: Vec<[f64; 3]>,
 }
@@ -233,7 +233,7 @@ fn noise_around_a_steady_path_is_calmed_and_an_onset_is_not_lagged() {
     let raw = rmse(&seen, &truth);
     let calm = followed(seen.clone(), |s| (s.baseline, s.history, s.gain) = (4, 24, 0.4));
     assert!(rmse(&calm, &truth) < 0.7 * raw, "{} of {raw}", rmse(&calm, &truth));
-    // As published, from what the model says two frames back: extrapolation doubles the noise, so that less is won.
+    // As published, from what the model states two frames back: extrapolation doubles the noise, so that less is won.
     let short = followed(seen, |s| s.gain = 5.0 / 6.0);
     assert!(rmse(&short, &truth) < 0.98 * raw, "{} of {raw}", rmse(&short, &truth));
 

@@ -66,7 +66,7 @@ fn the_coarse_stage_is_static_and_trains_no_plane() {
     assert_ne!(splats(&p, &model, 3.0), splats(&p, &Still, 3.0));
 }
 
-/// A finished scene's file says nothing of phases; files from before said both numbers always.
+/// A finished scene's file states nothing of phases; files from before said both numbers always.
 #[test]
 fn files_hold_a_phase_only_while_training_is_not_over() {
     let (_, model) = cloud::<f64>(spec(), 20);

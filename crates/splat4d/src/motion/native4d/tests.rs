@@ -394,7 +394,7 @@ fn splits_keep_the_distribution_and_resizing_keeps_velocity_and_life() {
     assert!((mean - own[0]).abs() < 0.1 * before.width && (spread / before.width - 1.0).abs() < 0.05);
     for s in &parts {
         assert!((s.width * SPLIT_SHRINK / before.width - 1.0).abs() < 1e-9);
-        // Each part lies on the parent's path.
+        // Each part is on the parent's path.
         for k in 0..3 {
             let on = before.mean[k] + before.velocity[k] * (s.time - before.time);
             assert!((s.mean[k] - on).abs() < 1e-9 * (1.0 + on.abs()));

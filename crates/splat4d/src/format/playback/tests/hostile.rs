@@ -1,4 +1,4 @@
-//! Files that lie: never a panic, never an allocation that the bytes do not bear out, and a reason in words.
+//! Files with false claims: never a panic, never an allocation that the bytes do not bear out, and a reason in words.
 
 use super::*;
 use crate::format::mutate::mutants;
