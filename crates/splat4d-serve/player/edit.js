@@ -471,7 +471,7 @@ export class Editing {
     if (!told) return this.say('');
     const n = x => x.toLocaleString('en-GB');
     const counts = told.seen.map(([, count]) => count);
-    const over = counts.length > 1 ? ` Visible over the clip: ${counts.map(n).join(', ')}.` : '';
+    const over = counts.length > 1 ? ` Active over the clip: ${counts.map(n).join(', ')}.` : '';
     const psnr = told.psnr ? ` ${told.pictures} held-out images: ${told.psnr[0].toFixed(2)} dB with, ${told.psnr[1].toFixed(2)} dB without.` : '';
     this.say(`${n(told.gaussians)} of ${n(told.of)} Gaussians selected, ${n(told.now)} visible now.${psnr || over}`);
   }
