@@ -137,7 +137,7 @@ fn page(run: &str, told: &Summary, films: &[(String, PathBuf)]) -> String {
 }
 
 /// A number with that many decimals; zero has no sign.
-fn rounded(x: f64, digits: usize) -> String {
+pub fn rounded(x: f64, digits: usize) -> String {
     let text = format!("{x:.digits$}");
     match text.strip_prefix('-') {
         Some(plain) if plain.bytes().all(|b| matches!(b, b'0' | b'.')) => plain.to_owned(),
