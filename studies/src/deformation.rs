@@ -56,7 +56,7 @@ type Path = Vec<[f64; 2]>;
 pub(crate) enum Scene {
     /// A third each: sinusoids along x, straight lines, circles.
     Mixed,
-    /// Points left of x = 0 stand still, those right of it move up: the edge of an occluding object.
+    /// Points left of x = 0 are static, those right of it move up: the edge of an occluding object.
     Edge,
     /// Every second point is somewhere else from t = ½ on: something appears, something goes.
     Jump,
@@ -255,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn a_network_of_4546_numbers_beats_standing_still_at_every_time() {
+    fn a_network_of_4546_parameters_beats_the_static_baseline_at_every_time() {
         let f = mixed();
         assert_eq!(f.parameters, 4546);
         assert!(f.worst() >= 0.39, "{:?}", f.improvements());

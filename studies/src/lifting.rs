@@ -1,4 +1,4 @@
-//! E01: scene flow lifted from optical flow. A sphere moves along x, a cube turns about y, a wall stands still; exact flow
+//! E01: scene flow lifted from optical flow. A sphere moves along x, a cube turns about y, a wall is static; exact flow
 //! of 20 frames is lifted with the depth of one frame and added up. It beats repeating frame 0 by far, and drifts: turning
 //! moves points along the viewing direction, which flow with one depth does not see.
 

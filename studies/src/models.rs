@@ -20,7 +20,7 @@ use std::time::{Duration, Instant};
 
 /// Minutes of training a cell.
 const MINUTES: f64 = 3.0;
-/// How often a cell that trains is looked at.
+/// How often a cell that trains is examined.
 const GLANCE: Duration = Duration::from_millis(100);
 /// Cost of a cell in addition to its minutes (probes, evaluation, baking, playing), minutes; for the time that is left.
 const OVERHEAD: f64 = 0.6;
@@ -155,7 +155,7 @@ fn models(only: &[String]) -> splat4d::Result<Vec<&'static str>> {
     Ok(all.filter(|m| only.is_empty() || only.iter().any(|o| o == m)).collect())
 }
 
-/// Trains one cell in a process of its own, so that its peak of memory is its own; says why where it refuses.
+/// Trains one cell in a process of its own, so that its peak of memory is its own; states why where it refuses.
 fn train(capture: &Path, model: &str, folder: &Path, args: &Args, stop: &AtomicBool) -> anyhow::Result<Option<String>> {
     let own = std::env::current_exe().context("this program does not know where it lies")?;
     let log = args.output.join(format!("{}.log", folder.file_name().unwrap_or_default().to_string_lossy()));
@@ -264,14 +264,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_model_can_be_asked_for_and_others_are_named() {
+    fn every_model_is_selectable_and_unknown_ones_are_errors() {
         assert_eq!(models(&[]).unwrap(), MODELS);
         assert_eq!(models(&["still".into()]).unwrap(), ["still"]);
         assert!(models(&["stil".into()]).unwrap_err().to_string().contains("spacetime"));
     }
 
     #[test]
-    fn a_page_takes_the_table_between_its_marks() {
+    fn a_table_replaces_the_text_between_its_marks() {
         let [before, after] = parted("a <!-- models -->old<!-- /models --> b").unwrap();
         assert_eq!((before, after), ("a <!-- models -->", "<!-- /models --> b"));
         assert!(parted("<!-- models --> only").is_err());

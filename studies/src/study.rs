@@ -141,7 +141,7 @@ mod tests {
     }
 
     #[test]
-    fn a_study_goes_on_where_it_was_stopped() {
+    fn a_stopped_study_continues() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("e03.json");
         let cells = Grid::quick(5).cells();

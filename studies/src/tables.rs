@@ -175,7 +175,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn tables_and_curves_show_what_exists() {
+    fn tables_and_curves_skip_missing_cells() {
         let grid = Grid::full(1000);
         let empty = Findings { name: "knight".into(), ..Findings::default() };
         let page = markdown(&empty, &grid);

@@ -33,7 +33,7 @@ impl Camera {
         v3(self.axes[0].dot(d), self.axes[1].dot(d), self.axes[2].dot(d))
     }
 
-    /// Pixel position and depth of a world point; the point must lie in front of the camera.
+    /// Pixel position and depth of a world point; the point must be in front of the camera.
     pub(crate) fn project(&self, point: V3) -> ([f64; 2], f64) {
         let c = self.to_camera_axes(point);
         ([self.focal * c.x / c.z + 0.5 * self.width as f64, self.focal * c.y / c.z + 0.5 * self.height as f64], c.z)

@@ -223,7 +223,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_committed_images_are_what_this_code_draws() {
+    fn the_committed_images_equal_rendered_ones() {
         check(&bundled_folder(), &[(8, 14)]).expect("same bytes");
     }
 

@@ -120,7 +120,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_take_has_its_frames_and_what_moves_stays_among_the_cameras() {
+    fn a_capture_has_its_frames_and_moving_objects_stay_between_the_cameras() {
         let folder = tempfile::tempdir().unwrap();
         command("0.07", folder.path()).unwrap();
         let text = std::fs::read_to_string(folder.path().join("capture.json")).unwrap();

@@ -13,7 +13,7 @@ use anyhow::{Context, Result};
 use std::ops::Range;
 use std::path::Path;
 
-/// Frames of the take.
+/// Frames of the capture.
 pub(crate) const FRAMES: usize = 30;
 /// Frames per second.
 pub(crate) const FPS: f64 = 30.0;

@@ -299,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn the_bind_pose_leaves_skinned_vertices_where_they_are() {
+    fn the_bind_pose_does_not_move_skinned_vertices() {
         let knight = knight();
         let mut mesh = Mesh::default();
         let skinned = knight.draw(&knight.rest, &Affine::IDENTITY, 0, 1, &mut mesh);

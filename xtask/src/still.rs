@@ -137,7 +137,7 @@ fn hemisphere(mesh: &Mesh, views: usize, size: usize) -> Vec<Camera> {
     let (low, high) = (fold(f64::min, f64::INFINITY), fold(f64::max, f64::NEG_INFINITY));
     let target = (v3(low[0], low[1], low[2]) + v3(high[0], high[1], high[2])) * 0.5;
     let radius = mesh.positions.iter().map(|p| (*p - target).length()).fold(0.0, f64::max);
-    // The sphere's silhouette lies on the cone of sin = radius/distance; its tangent is to be FILL/2 image heights.
+    // The sphere's silhouette is on the cone of sin = radius/distance; its tangent is to be FILL/2 image heights.
     let tangent = 0.5 * FILL / FOCAL;
     let distance = radius * (1.0 + tangent * tangent).sqrt() / tangent;
     let camera = |i: usize| {

@@ -18,7 +18,7 @@ pub(crate) const DEPTH_SCALE: f64 = 2048.0;
 pub(crate) const FLOW_SCALE: f64 = 64.0;
 /// Vertex tracks.
 pub(crate) const TRACKS: usize = 200;
-/// A vertex counts as seen when it lies at most this far behind what its pixel shows, scene units.
+/// A vertex counts as seen when it is at most this far behind what its pixel shows, scene units.
 const SEEN_TOLERANCE: f64 = 0.03;
 /// Points of the sparse cloud.
 const CLOUD_POINTS: usize = 3000;

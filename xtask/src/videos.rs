@@ -127,7 +127,7 @@ fn sound(camera: usize, view: &Camera) -> Vec<i16> {
         let mut level = loud / metres.max(1.0);
         let mut smooth = 0.0;
         for k in 0..(2.0 * lasts * f64::from(RATE)) as u64 {
-            // Noise through a low pass: fur on the edge would be lost by what lies between samples.
+            // Noise through a low pass: fur on the edge would be lost by what is between samples.
             smooth += 0.4 * (noise(event as u64, k) - smooth);
             let at = first + k as f64;
             let (whole, part) = (at.floor(), at - at.floor());
@@ -208,7 +208,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_clap_is_heard_after_its_way() {
+    fn a_clap_arrives_after_its_travel_time() {
         let rig = rig();
         let heard = |c: usize| {
             let samples = sound(c, &rig[c]);
@@ -223,7 +223,7 @@ mod tests {
     }
 
     #[test]
-    fn the_file_says_how_long_it_is() {
+    fn the_file_header_has_its_length() {
         let file = avi(&[vec![1, 2, 3], vec![4]], &[5, 6, 7, 8]);
         let length = u32::from_le_bytes([file[4], file[5], file[6], file[7]]) as usize;
         assert_eq!((&file[..4], length), (&b"RIFF"[..], file.len() - 8));

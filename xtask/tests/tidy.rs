@@ -17,7 +17,7 @@ mod words;
 const LONG_FILES: [(&str, &str); 0] = [];
 const MAX_LINES: usize = 800;
 
-/// Files that may say `unsafe`, in order, and why. ARCHITECTURE.md says the same sentence.
+/// Files that may say `unsafe`, in order, and why. ARCHITECTURE.md states the same sentence.
 const UNSAFE_FILES: [(&str, &str); 3] = [
     ("crates/splat4d/src/nn/matmul.rs", "matrix products take pointers"),
     ("crates/splat4d/src/simd.rs", "dispatch to SIMD instructions"),

@@ -457,7 +457,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn machines_are_told_the_ends_of_a_phase_and_little_between() {
+    fn json_output_has_the_ends_of_a_phase_and_few_events_between() {
         let console = Console::keeping_objects();
         (0..=100).for_each(|done| console.phase("baking", done, 100));
         console.phase("writing", 0, 0);
@@ -468,7 +468,7 @@ mod tests {
     }
 
     #[test]
-    fn phases_tell_their_time_left_once_they_have_a_pace() {
+    fn phases_print_the_time_left_once_the_pace_is_known() {
         assert_eq!(time_left(Duration::from_secs(10), 2, 6), Some(30.0));
         for (seconds, done, left) in [(1, 2, 6), (10, 0, 6), (10, 6, 0)] {
             assert_eq!(time_left(Duration::from_secs(seconds), done, left), None);
@@ -487,7 +487,7 @@ mod tests {
     }
 
     #[test]
-    fn json_lines_hold_nothing_that_a_terminal_obeys() {
+    fn json_lines_contain_no_terminal_escapes() {
         let value = json!({"title": "a\u{1b}]0;x\u{7}\u{9b}2J\u{202e}\n"});
         let line = one_json_line(&value);
         assert!(!line.contains(text::acts), "{line}");

@@ -110,7 +110,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn work_that_does_not_ask_is_ended_soon_and_other_work_is_not() {
+    fn an_interrupt_ends_work_that_never_polls_it_and_waits_for_other_work() {
         let state = |last: Option<&str>, embedded| State {
             raised: false,
             first: "stopping".into(),

@@ -266,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn errors_of_the_users_data_are_two_and_failures_one() {
+    fn user_errors_exit_with_2_and_failures_with_1() {
         assert_eq!(exit_code(&Error::input("x").into()), 2);
         assert_eq!(exit_code(&Error::new(ErrorKind::Unsupported, "x").into()), 2);
         assert_eq!(exit_code(&Error::new(ErrorKind::Diverged, "x").into()), 1);

@@ -288,7 +288,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_paused_run_waits_without_using_its_time_and_goes_on_or_stops() {
+    fn a_paused_run_stops_its_clock_and_can_continue_or_stop() {
         let stop = Arc::new(AtomicBool::new(false));
         let control = Control::new(stop.clone());
         let ask = |what: &str| control.answer(&json!({ "do": what })).map(|a| a.told["state"].clone());

@@ -52,7 +52,7 @@ fn json_of(path: &Path) -> Value {
 }
 
 #[test]
-fn help_teaches_and_completions_complete() {
+fn help_has_examples_and_completions_complete() {
     let help = splat4d(&["--help"]).run().ok();
     for verb in [
         "import",
@@ -284,7 +284,7 @@ fn a_stopped_run_continues_and_a_foreign_checkpoint_does_not() {
 }
 
 #[test]
-fn a_plain_file_is_drawn_as_computed_by_hand() {
+fn a_plain_file_renders_as_computed_by_hand() {
     let work = tempfile::tempdir().unwrap();
     let file = work.path().join("one.ply");
     // One round Gaussian on the axis at z = 4, deviation 0.5, opacity 0.6, colour (1, 0.5, 0).
@@ -574,7 +574,7 @@ fn unwritable_places_are_refused() {
 }
 
 #[test]
-fn a_default_folder_that_is_taken_gets_a_number() {
+fn a_default_folder_in_use_gets_a_number() {
     let work = tempfile::tempdir().unwrap();
     let capture = Capture::new(work.path()).write();
     for folder in ["runs/capture", "runs/capture-2"] {
@@ -591,7 +591,7 @@ fn a_default_folder_that_is_taken_gets_a_number() {
 
 #[test]
 #[cfg(unix)]
-fn an_interrupt_saves_and_says_how_to_continue() {
+fn an_interrupt_saves_and_prints_how_to_continue() {
     use std::io::{BufRead, BufReader, Read};
     let work = tempfile::tempdir().unwrap();
     let capture = Capture::new(work.path()).write();

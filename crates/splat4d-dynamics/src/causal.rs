@@ -333,7 +333,7 @@ mod tests {
     const ACTION: [f64; 4] = [0.3, -0.2, 0.9, 0.5];
 
     #[test]
-    fn a_turned_and_moved_past_goes_on_turned() {
+    fn forecasts_are_equivariant_to_rigid_motion_of_the_past() {
         let (mut net, p, state) = made(5);
         let run = |net: &CausalNet, r: &[[f64; 3]; 3], shift: [f64; 3]| {
             let mut hidden = vec![0.0; net.memory() * 5];

@@ -92,7 +92,7 @@ fn carried(
     let spacing = mean_square_distance(&places);
     let radius = |k: usize| if spacing[k] > 0.0 { 0.5 * f64::from(spacing[k]).ln() } else { 0.0 };
     let pose = |k: usize, key: usize| if key == 0 { rest[k] } else { moments[key - 1][k] };
-    // The hemisphere of the quaternion does not matter to what it turns, but to what lies between two keys.
+    // The hemisphere of the quaternion does not matter to what it turns, but to what is between two keys.
     let turn = |k: usize, key: usize, c: usize| {
         let q = pose(k, key).q;
         let sign = if q[0] < 0.0 { -1.0 } else { 1.0 };

@@ -64,7 +64,7 @@ impl Default for GraphSpec {
     }
 }
 
-/// The network. Weights lie in a [`Params`].
+/// The network. Weights are in a [`Params`].
 #[derive(Clone, Debug)]
 pub struct GraphNet {
     spec: GraphSpec,

@@ -3,7 +3,7 @@
 //!
 //! Poses of all nodes at a tick are one vector y: positions, and rotation matrices times a length, so that a turn weighs as what
 //! it moves; what turns evenly has the frequency that its places have, where its quaternion would have half of it. The model is
-//! y(t) = b + Σ_j e^(−a_j² t) (c_j cos ω_j t + s_j sin ω_j t): every eigenvalue e^(−a² ± iω) lies within the unit circle, so that
+//! y(t) = b + Σ_j e^(−a_j² t) (c_j cos ω_j t + s_j sin ω_j t): every eigenvalue e^(−a² ± iω) is within the unit circle, so that
 //! no rollout grows. Decays and frequencies are fitted to all observed ticks at once by variable projection (Golub and Pereyra
 //! 1973, with Kaufman's Jacobian 1975) on the principal components of y, pair by pair, each from the frequency that explains most
 //! of what is left. Regression from tick to tick, with delays or without, is biased towards decay by noise (Dawson et al. 2016),
@@ -316,7 +316,7 @@ mod tests {
     }
 
     #[test]
-    fn a_circle_goes_on_and_a_thousand_steps_stay_bounded() {
+    fn a_circle_is_continued_and_bounded_for_a_thousand_steps() {
         let model = Koopman::fit(&circle(60, 0.11, 0.0));
         for h in [20, 1000] {
             let error = error_after(&model, 0.0, 0.11, h);
@@ -331,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn noise_neither_damps_nor_hides_what_swings() {
+    fn a_noisy_oscillation_is_forecast_within_its_noise() {
         let noise = 0.1; // of a radius of 2
         let model = Koopman::fit(&circle(60, 0.11, noise));
         let error = error_after(&model, noise, 0.11, 30);

@@ -42,7 +42,7 @@ impl<F: Real> State<F> {
 /// What acts on a copy, scaled: vectors \[3 each], then scalars.
 pub type Action<F> = Vec<F>;
 
-/// A network whose weights lie in a [`Params`].
+/// A network whose weights are in a [`Params`].
 pub trait Network: Clone {
     /// What a step's backward needs.
     type Tape<F: Real>: Default;
@@ -154,7 +154,7 @@ pub(crate) struct Window<F> {
 
 impl<N: Network> Learnt<N> {
     /// Learns from observed paths, and from the actions on them, with the network that `make` makes for scales, numbers of
-    /// vectors and scalars of an action, and a seed. Nothing after the last tick is looked at.
+    /// vectors and scalars of an action, and a seed. Nothing after the last tick is examined.
     ///
     /// Errors: fewer than [`LEAST_TICKS`] ticks; those of `make`.
     pub(crate) fn fit(
@@ -182,7 +182,7 @@ impl<N: Network> Learnt<N> {
         let (net, params) = make(scales, [columns.0.len(), columns.1.len()], training.seed)?;
         let units = actions.map_or_else(Vec::new, |a| units(a, &columns, ticks));
         let mut model = Self { net, params, units, columns, steepest, loss: 0.0 };
-        // What stood still needs no force to do so, and gives nothing to learn.
+        // What was static needs no force, and gives nothing to learn.
         if rms(&speeds) > least {
             model.train(paths, actions, training);
         }

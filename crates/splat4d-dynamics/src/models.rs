@@ -19,7 +19,7 @@ pub enum Model {
     Velocity,
     /// B2: acceleration that fades.
     Acceleration,
-    /// B3: what the motion model of the scene says of later times.
+    /// B3: what the motion model of the scene states of later times.
     Extrapolate,
     /// M1: linear, with delays, stable by construction.
     Koopman,

@@ -23,19 +23,19 @@ pub const MAX_NODES: usize = 128;
 const MEMBERS: usize = 24;
 /// Fainter Gaussians carry nothing.
 const OPAQUE: f32 = 0.1;
-/// What is slower than this share of the scene's size a second stands still: Gaussians of even surfaces drift unseen.
+/// What is slower than this share of the scene's size a second is static: Gaussians of even surfaces drift unseen.
 const SPEED: f64 = 0.03;
 /// Of the opaque Gaussians: how many make up the scene's size.
 const CORE: f64 = 0.9;
 /// Share of its members' weight at which a node takes new ones.
 const WORN: f32 = 0.5;
-/// Weight of the rotation before, of the members' covariance: decides where these lie on a line.
+/// Weight of the rotation before, of the members' covariance: decides where these are on a line.
 const KEEP: f64 = 1e-3;
 /// A Gaussian farther from its neighbours than this multiple of the median carries no node: it floats alone.
 const LONELY: f32 = 3.0;
 /// Gaussians that were opaque at fewer ticks have no speed to speak of.
 const SEEN: u32 = 3;
-/// Neighbours whose majority says whether a Gaussian moves.
+/// Neighbours whose majority states whether a Gaussian moves.
 const VOTERS: usize = 8;
 
 /// Everything that is known at the last observed time.
@@ -118,7 +118,7 @@ pub fn follow(scene: &Scene<f32>, start: &Moment, ticks: &[f64]) -> Vec<Moment> 
     let first = look(scene, ticks[0]);
     let mut fast = moving(scene, ticks, &first, extent(&first).1).0;
     if !fast.contains(&true) {
-        // Then all stand still together.
+        // Then all are static together.
         fast.fill(true);
     }
     follow_among(scene, start, ticks, &fast)

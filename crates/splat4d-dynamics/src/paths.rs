@@ -114,7 +114,7 @@ pub struct Neighbours(Vec<Vec<usize>>);
 
 /// Neighbours that determine a node's rotation.
 const FRAME_NEIGHBOURS: usize = 6;
-/// Weight of the rotation before, of the neighbours' covariance: decides where these lie on a line.
+/// Weight of the rotation before, of the neighbours' covariance: decides where these are on a line.
 const KEEP: f64 = 1e-3;
 
 impl Neighbours {

@@ -91,7 +91,7 @@ mod tests {
     use splat4d::math::Rng;
 
     #[test]
-    fn skill_of_the_baseline_is_exactly_nothing() {
+    fn the_baseline_has_zero_skill() {
         for error in [0.0, 1e-300, 0.1, 7.3] {
             assert_eq!(skill(error, error), 0.0);
         }

@@ -73,7 +73,7 @@ mod tests {
     use splat4d::math::Rng;
 
     #[test]
-    fn noise_goes_and_parabolas_stay() {
+    fn smoothing_removes_noise_and_keeps_parabolas() {
         let truth = |t: f64| [(0.2 * t).sin(), 0.01 * t * t - 0.3 * t, 1.0];
         let rng = Rng::new(1, "noise", 0);
         let path = |noise: f64| Paths {

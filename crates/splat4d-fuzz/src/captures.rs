@@ -84,7 +84,7 @@ thread_local! {
     static FOLDERS: RefCell<BTreeMap<&'static str, TempDir>> = const { RefCell::new(BTreeMap::new()) };
 }
 
-/// Opens the capture of this layout in which one file has other bytes, and reads its first image with what lies next
+/// Opens the capture of this layout in which one file has other bytes, and reads its first image with what is next
 /// to.
 fn open(layout: &'static str, file: &str, bytes: &[u8]) {
     FOLDERS.with_borrow_mut(|folders| {
@@ -349,7 +349,7 @@ fn record3d() -> String {
     .to_string()
 }
 
-/// A capture with everything that may lie next to its first image.
+/// A capture with everything that may be next to its first image.
 fn beside() -> String {
     let files = "\"masks\":[\"mask.png\",\"mask.png\"],\"labels\":[\"labels.png\",\"labels.png\"],\
                  \"features\":[\"features.npy\",\"features.npy\"],\"tracks\":\"tracks.csv\",\"name\"";

@@ -190,7 +190,7 @@ fn gzip(bytes: &[u8]) -> Vec<u8> {
     zip.finish().expect("memory takes all bytes")
 }
 
-/// What lies inside the gzip streams of versions 2 and 3: damage reaches it past the checksum.
+/// What is inside the gzip streams of versions 2 and 3: damage reaches it past the checksum.
 fn spz_bodies() -> Vec<Vec<u8>> {
     let inside = |file: Vec<u8>| {
         let mut body = Vec::new();

@@ -176,7 +176,7 @@ fn run(
     Ok((count, out.status.success(), String::from_utf8_lossy(&out.stderr).into_owned()))
 }
 
-/// Finds the input that failed, keeps it and says where it is and what happened.
+/// Finds the input that failed, keeps it and states where it is and what happened.
 fn again(reader: &Reader, options: &Options, from: u64, words: &str) -> Result<String> {
     let folder = std::env::current_exe()?.parent().context("a program lies in a folder")?.join("fuzz");
     std::fs::create_dir_all(&folder)?;

@@ -1,5 +1,5 @@
 //! Captures that are shipped as a video per camera and their poses: Neural 3D Video (`cam00.mp4` …, `poses_bounds.npy`).
-//! Frames are extracted once, below the capture, where its reader looks for them.
+//! Frames are extracted once, below the capture, where its reader searches for them.
 
 use crate::video::{self, Info, Selection, Source};
 use crate::write::{self, Clip, Format};
@@ -220,7 +220,7 @@ mod tests {
     use std::process::Command;
 
     #[test]
-    fn frames_are_extracted_once_and_incomplete_work_goes_on() {
+    fn frames_are_extracted_once_and_incomplete_extraction_continues() {
         let dir = tempfile::tempdir().unwrap();
         let root = dir.path();
         let mut poses = Vec::new();

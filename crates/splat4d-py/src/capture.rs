@@ -218,7 +218,7 @@ pub(crate) struct Frame {
     camera: Camera,
     /// Seconds.
     time: f64,
-    /// Frame number in the take.
+    /// Frame number in the capture.
     index: usize,
     /// `train`, `test`, `val` or `future`.
     split: &'static str,

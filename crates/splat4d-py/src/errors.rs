@@ -68,7 +68,7 @@ pub(crate) fn warn(py: Python<'_>, messages: &[String]) -> PyResult<()> {
 /// Words of the command in remedies, and what says the same in Python.
 const WORDS: [(&str, &str); 5] = [
     ("`train --resume`", "splat4d.resume"),
-    ("--resume", "splat4d.resume"),
+    (RESUME, "splat4d.resume"),
     ("--force", "force=True"),
     ("with -o", "as `out`"),
     ("--motion ", "motion="),
@@ -76,6 +76,31 @@ const WORDS: [(&str, &str); 5] = [
 
 /// The error of training as an exception that speaks of Python's arguments.
 pub(crate) fn in_python(error: &splat4d::Error) -> PyErr {
-    let text = WORDS.iter().fold(error.to_string(), |text, (word, other)| text.replace(word, other));
-    exception(&text, Some(error.kind()))
+    exception(&python_words(&error.to_string()), Some(error.kind()))
+}
+
+/// The option that continues a run.
+const RESUME: &str = "--resume";
+
+fn python_words(text: &str) -> String {
+    WORDS.iter().fold(resume_calls(text), |text, (word, other)| text.replace(word, other))
+}
+
+/// `--resume RUN` and `splat4d train --resume RUN` as calls: `splat4d.resume("RUN")`.
+fn resume_calls(text: &str) -> String {
+    let Some((before, after)) = text.split_once(&format!("{RESUME} ")) else { return text.to_owned() };
+    let (run, rest) = match after.strip_prefix('\'') {
+        // As a shell needs it: in quotes.
+        Some(quoted) => quoted.split_once('\'').unwrap_or((quoted, "")),
+        None => {
+            let word = after.find(char::is_whitespace).map_or(after, |end| &after[..end]);
+            let run = word.trim_end_matches(['.', ',', ';', ':', '`']);
+            (run, &after[run.len()..])
+        }
+    };
+    let before = before.trim_end_matches("train ").trim_end_matches("splat4d ");
+    if run.is_empty() {
+        return text.to_owned();
+    }
+    format!("{before}splat4d.resume({run:?}){}", resume_calls(rest))
 }

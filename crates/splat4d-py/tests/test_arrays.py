@@ -267,7 +267,7 @@ class Motions(InFolder):
 
     def test_a_run_can_be_replaced_and_says_how(self):
         self.train("a", "spacetime", iterations=2)
-        with self.assertRaisesRegex(splat4d.Error, "force=True"):
+        with self.assertRaisesRegex(splat4d.Error, r'splat4d\.resume\("[^"]+"\), replace it with force=True'):
             self.train("a", "spacetime", iterations=2)
         self.train("a", "still", iterations=2, force=True)
 

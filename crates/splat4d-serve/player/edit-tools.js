@@ -3,7 +3,7 @@
 
 import { add, cross, normalize, quatAbout, quatMul, quatTurn } from './camera.js';
 
-/** Pixels: length of a move's arrows, of its rings' radius and of the way to its scale setting, of a dot, of a node. */
+/** Pixels: length of a move's arrows, of its rings' radius and of the distance to its scale handle, of a dot, of a node. */
 const ARROW = 84, RING = 62, KNOB = 56, DOT = 1.6, NODE = 3.2;
 /** How near a pointer must come, pixels: a mouse, a finger. */
 const NEAR = { mouse: 9, pen: 12, touch: 20 };
@@ -13,7 +13,7 @@ const TAP = 5;
 const CORNERS = 48, CORNER_STEP = 5;
 /** Segments of a ring. */
 const SEGMENTS = 48;
-/** Pixels of the scale setting for a factor of e. */
+/** Pixels of the scale handle for a factor of e. */
 const SCALE_PIXELS = 120;
 const AXES = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
 const COLORS = ['#e5484d', '#46a758', '#3b82f6'];
@@ -181,7 +181,7 @@ export class Overlay extends EventTarget {
     this.#emit('drawn', { shape: this.tool, corners: this.corners(path) });
   }
 
-  /** The handles of a move: centre, arrows, rings, setting. */
+  /** The handles of a move: centre, arrows, rings, scale. */
   #gizmo() {
     if (!this.place) return null;
     const center = add(this.place.about, this.place.shift), view = this.view, c = this.project(center, view);

@@ -38,7 +38,6 @@ const STYLE = `
 .edit .row{gap:.35em;flex-wrap:wrap}
 .edit textarea{width:100%;font:.85em/1.45 ui-monospace,"DejaVu Sans Mono",monospace;color:inherit;background:var(--raised);
  border:1px solid var(--line);border-radius:.6em;padding:.5em .6em;resize:vertical;min-height:3.6em}
-.edit [aria-label=Box] input{width:4.4em}
 .edit textarea:focus-visible{outline:2px solid var(--accent);outline-offset:1px}
 .edit .said{min-height:1.3em;overflow-wrap:anywhere}
 .edit .said.bad{color:var(--bad)}
@@ -52,6 +51,8 @@ const STYLE = `
 .edit .props{display:flex;flex-direction:column;gap:.5em;border-left:2px solid var(--accent);padding-left:.8em}
 .edit .props[hidden]{display:none}
 .edit input[type=number]{width:5.4em;background:var(--raised);border:0;padding:.3em .1em .3em .5em;border-radius:.5em}
+.edit .boxed{display:grid;grid-template-columns:auto 1fr 1fr;gap:.35em .6em;align-items:center}.edit .boxed[hidden]{display:none}
+.edit .boxed span{display:contents}.edit .boxed input{width:100%}
 .edit input[type=range]{flex:1;min-width:7em;accent-color:var(--accent)}
 .edit input[type=color]{width:3em;height:2em;padding:0;border:0;background:none}
 .edit label.check{display:inline-flex;align-items:center;gap:.4em;color:var(--muted);font-size:.9em}
@@ -183,10 +184,10 @@ export class Editing {
       if (v) this.#pick(v);
       this.more.value = '';
     });
-    this.area = h('textarea', { 'aria-label': 'Selection as text', rows: 2, spellcheck: 'false',
+    this.area = h('textarea', { 'aria-label': 'Selection as text', rows: 3, spellcheck: 'false',
       placeholder: 'Draw over the image, or type: box(…) and not layer(sky)',
       onchange: () => { this.text = this.area.value; this.#changedSelection(); } });
-    this.boxed = h('div', { class: 'row', role: 'group', 'aria-label': 'Box', hidden: true }, ...'xyz'.split('').map((axis, k) => h('span', {},
+    this.boxed = h('div', { class: 'boxed', role: 'group', 'aria-label': 'Box', hidden: true }, ...'xyz'.split('').map((axis, k) => h('span', {},
       `${axis} `, ...['low', 'high'].map((end, i) => number(`Box ${axis} ${['from', 'to'][i]}`, 0, v => {
         const box = boxOf(this.text);
         if (box) this.#setBox({ ...box, [end]: box[end].map((x, j) => (j === k ? v : x)) });
@@ -212,7 +213,7 @@ export class Editing {
         ...PLAIN.map(([words, text, title]) => button(text, () => this.#pick(words), { title })), this.more), h('div', { class: 'row choose' }, this.hows,
         check(this.through, 'Through', 'Also select Gaussians behind the visible surface'),
         this.about.moving ? check(this.now, 'Now', 'Select by positions at this time. Otherwise: by positions at most times of the lifespan') : null),
-      this.area, this.boxed, this.said, this.acts, this.list, this.props);
+      this.area, this.said, this.acts, this.boxed, this.list, this.props);
     ui.dock.insertBefore(this.panel, ui.bar);
     ui.help.querySelector('dl')?.append(...[['Edit', 'X'], ['Undo, redo', 'Ctrl + Z', 'Y'], ['Save the edits', 'Ctrl + S'], ['Delete the selection', 'Del']]
       .map(([what, ...keys]) => h('div', { class: 'pair' }, h('dt', {}, what), h('dd', {}, ...keys.map(k => h('kbd', {}, k))))));
@@ -470,7 +471,7 @@ export class Editing {
     if (!told) return this.say('');
     const n = x => x.toLocaleString('en-GB');
     const counts = told.seen.map(([, count]) => count);
-    const over = counts.length > 1 ? ` Over the clip: ${counts.map(n).join(', ')}.` : '';
+    const over = counts.length > 1 ? ` Active over the clip: ${counts.map(n).join(', ')}.` : '';
     const psnr = told.psnr ? ` ${told.pictures} held-out images: ${told.psnr[0].toFixed(2)} dB with, ${told.psnr[1].toFixed(2)} dB without.` : '';
     this.say(`${n(told.gaussians)} of ${n(told.of)} Gaussians selected, ${n(told.now)} visible now.${psnr || over}`);
   }

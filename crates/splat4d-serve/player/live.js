@@ -7,6 +7,8 @@ import { icon } from './icons.js';
 const RETRY = [500, 8000];
 /** Snapshots within this time, ms, are one update. */
 const TOGETHER = 30;
+/** In place of the figures before the first step: a large capture is read for minutes. */
+const FIRST = 'The capture is read and the first Gaussians are placed. The render appears with the first snapshot.';
 /** Points of the curve that are kept; beyond it every second one goes. */
 const CURVE_MAX = 2000;
 
@@ -164,6 +166,7 @@ export class Training {
     this.stop.disabled = at === 'stopping';
     this.state.textContent = at === 'stopped' || (!over && words) ? words : over ? 'Training finished'
       : { connecting: this.last ? 'Reconnecting' : 'Connecting', live: 'Training', away: 'Reconnecting' }[state];
+    if (!this.last && !over) this.figures.replaceChildren(h('small', { class: 'wait' }, FIRST));
   }
 
   /** The server may end with the run: the page keeps the scene, and asks for nothing more. */

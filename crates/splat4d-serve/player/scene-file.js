@@ -141,7 +141,7 @@ export class SceneFile {
   pages = [];
   /// Whether the file was cut short.
   truncated = false;
-  /// Whether it is of a take that is not finished: there may be more of it later.
+  /// Whether it is of a clip that is not finished: there may be more of it later.
   growing = false;
   #source;
   #where;

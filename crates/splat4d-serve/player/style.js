@@ -120,10 +120,10 @@ h3{font-size:.8em;margin:.2em 0 -.4em;font-weight:600;color:var(--muted);letter-
 .live .high{top:0}.live .low{bottom:0}
 .live .area .psnr{left:0}.live .area .loss{right:0}
 .live small.psnr{color:var(--accent)}
-.live .figures{display:flex;justify-content:space-between;gap:.8em;font-variant-numeric:tabular-nums;
+.live .figures{display:grid;grid-template-columns:1fr 1fr;gap:.5em .8em;font-variant-numeric:tabular-nums;
  white-space:nowrap}
 .live small{color:var(--muted);font-size:.85em}
-.live .figures small{display:block}
+.live .figures small{display:block}.live .wait{grid-column:1/-1;white-space:normal}
 .live .acts{display:flex;gap:.45em;flex-wrap:wrap}
 .frusta{position:absolute;inset:0;width:100%;height:100%;pointer-events:none}
 .photo{position:absolute;inset:0 0 0 50%;margin:0;background:var(--page);display:grid;place-items:center}

@@ -211,7 +211,7 @@ fn scene(shared: &Shared, request: &Parts) -> Response<Body> {
     if headers.get(header::IF_NONE_MATCH).is_some_and(|tags| matches(tags, &version.etag)) {
         return with(Body::empty(), StatusCode::NOT_MODIFIED, &common);
     }
-    // A range counts for GET only (RFC 9110), and only of the state that the client knows, where it says which. No date
+    // A range counts for GET only (RFC 9110), and only of the state that the client knows, where it states which. No date
     // is ever given out, so that a date matches nothing.
     let fresh = headers.get(header::IF_RANGE).is_none_or(|tag| tag.as_bytes() == version.etag.as_bytes());
     let range = headers.get(header::RANGE).filter(|_| fresh && request.method == Method::GET);
@@ -278,7 +278,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn gzip_is_sent_to_who_takes_it() {
+    fn gzip_is_sent_to_clients_that_accept_it() {
         for yes in ["gzip", "br, gzip", "deflate, gzip;q=0.5", "*"] {
             assert!(accepts_gzip(yes), "{yes}");
         }

@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn gzip_comes_back() {
+    fn gzip_round_trips() {
         for asset in assets() {
             let mut text = String::new();
             std::io::Read::read_to_string(&mut flate2::read::GzDecoder::new(&asset.gzip[..]), &mut text).unwrap();

@@ -1,6 +1,6 @@
 //! News of a live run, for pages that come, go and come back.
 //!
-//! There is no queue per client: news lie in one bounded log, and a client is a place in it. So publishing never waits,
+//! There is no queue per client: news are in one bounded log, and a client is a place in it. So publishing never waits,
 //! a slow reader costs nothing but its socket, and one that joins late or returns gets what it missed from the same log.
 
 use crate::body::Body;
@@ -21,7 +21,7 @@ const MAX_NOTES: usize = 100;
 const MAX_NEWS: usize = 16 << 10;
 /// Least time between two packets to a client: faster than a person reads, slow enough for many clients.
 const PACE: Duration = Duration::from_millis(50);
-/// Time after which an empty line says that the connection lives; proxies cut silent ones after about 30 s.
+/// Time after which an empty line states that the connection lives; proxies cut silent ones after about 30 s.
 const HEARTBEAT: Duration = Duration::from_secs(15);
 /// Milliseconds after which a browser comes back.
 const RETRY: u32 = 1000;
@@ -171,7 +171,7 @@ impl Hub {
             let _held = held;
             let mut packet = format!("retry: {RETRY}\n\n");
             loop {
-                // Marked as seen before the log is read: what comes in between is looked for again, and never missed.
+                // Marked as seen before the log is read: what comes in between is searched for again, and never missed.
                 if *newest.borrow_and_update() == CLOSED {
                     return;
                 }
@@ -218,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn who_joins_late_gets_the_whole_curve_and_only_the_newest_scene() {
+    fn late_clients_get_the_whole_curve_and_only_the_newest_scene() {
         let hub = Hub::new();
         for i in 0..10 * MAX_STEPS {
             hub.publish(&News::Step(json!({"iteration": i})));
@@ -259,7 +259,7 @@ mod tests {
     }
 
     #[test]
-    fn news_stay_one_line_and_bounded() {
+    fn events_are_one_line_of_bounded_length() {
         let hub = Hub::new();
         hub.publish(&News::Note(json!({"message": "two\nlines\r\n"})));
         hub.publish(&News::Note(json!({"message": "x".repeat(MAX_NEWS)})));

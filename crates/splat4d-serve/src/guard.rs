@@ -68,7 +68,7 @@ impl Guard {
                 return Err(refusal(StatusCode::FORBIDDEN, "pages of other origins may not read from here"));
             }
         }
-        // Where the browser says so itself: a foreign page that embeds something of ours without CORS. Following a link
+        // Where the browser states so itself: a foreign page that embeds something of ours without CORS. Following a link
         // to the page is fine.
         let fetch = |name: &str| request.headers.get(name).and_then(|v| v.to_str().ok());
         if fetch("sec-fetch-site") == Some("cross-site") && fetch("sec-fetch-mode") != Some("navigate") {

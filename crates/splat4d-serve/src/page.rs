@@ -36,7 +36,7 @@ pub enum SceneIn<'a> {
 }
 
 impl Page<'_> {
-    /// The page, UTF-8. It loads nothing but a linked scene. Errors: the scene is too large to lie in a page.
+    /// The page, UTF-8. It loads nothing but a linked scene. Errors: the scene is too large to be in a page.
     pub fn html(&self) -> Result<String> {
         let modules: BTreeMap<&str, &str> = assets()
             .iter()
@@ -247,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_in_a_page_ends_a_script_early_and_all_comes_back() {
+    fn embedded_data_cannot_close_its_script_and_round_trips() {
         let scene: Vec<u8> = (0..2 * LINE + 5).map(|i| (i * 7) as u8).collect();
         let page = Page { title: "a </title><script>\"'& \u{202e}\u{9b}TITLE", scene: SceneIn::Inside(&scene) };
         let html = page.assemble(SAMPLE, &sample()).unwrap();
@@ -269,13 +269,13 @@ mod tests {
     }
 
     #[test]
-    fn a_linked_scene_is_an_address_and_nothing_more() {
+    fn a_linked_scene_is_stored_as_its_address_alone() {
         let html = Page { title: "t", scene: SceneIn::Linked("a%20b.s4d") }.assemble(SAMPLE, &sample()).unwrap();
         assert!(html.contains("\"scene\":\"a%20b.s4d\"") && !html.contains("splat4d-scene\">"));
     }
 
     #[test]
-    fn the_players_own_page_can_be_written_and_loads_nothing() {
+    fn the_written_player_page_loads_no_other_file() {
         let html = Page { title: "t", scene: SceneIn::Inside(b"x") }.html().unwrap();
         for tag in [" src=\"", " href=\"http", " href=\"/", " href=\"./"] {
             assert!(!html.contains(tag), "{tag}");

@@ -38,7 +38,7 @@ pub(crate) fn parse(header: &str, length: u64) -> Wanted {
     if start < end { Wanted::Part { start, end } } else { Wanted::Nothing }
 }
 
-/// A number of plain digits. One too large for u64 lies behind the end of every file, and so does `u64::MAX`.
+/// A number of plain digits. One too large for u64 is behind the end of every file, and so is `u64::MAX`.
 fn number(text: &str) -> Option<u64> {
     let plain = !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
     plain.then(|| text.parse().unwrap_or(u64::MAX))

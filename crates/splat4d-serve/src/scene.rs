@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_file_is_named() {
+    fn a_missing_file_is_named_in_the_error() {
         let folder = tempfile::tempdir().unwrap();
         for path in [folder.path().to_owned(), folder.path().join("none.s4d")] {
             let error = Scene::new(Content::File(path.clone())).unwrap_err().to_string();
@@ -225,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_grows_is_as_long_as_it_has_become() {
+    fn the_length_of_a_growing_file_is_its_current_length() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("growing");
         std::fs::write(&path, [1, 2, 3]).unwrap();

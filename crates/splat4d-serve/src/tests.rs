@@ -38,7 +38,7 @@ fn connect(server: &Running) -> TcpStream {
     stream
 }
 
-/// Sends bytes, perhaps says that these were all, and reads to the end of the connection.
+/// Sends bytes, perhaps states that these were all, and reads to the end of the connection.
 fn raw(server: &Running, bytes: &[u8], all: bool) -> Vec<u8> {
     let mut stream = connect(server);
     // A server that refuses early may close while this still writes.
@@ -230,7 +230,7 @@ fn a_scene_elsewhere_is_named_and_its_origin_allowed() {
 }
 
 #[test]
-fn paths_lead_nowhere_else() {
+fn paths_outside_the_folder_are_refused() {
     let server = of_bytes(b"x");
     for target in [
         "/..",
@@ -314,7 +314,7 @@ fn broken_requests() -> Vec<Vec<u8>> {
 }
 
 #[test]
-fn broken_requests_break_nothing() {
+fn malformed_requests_are_refused_and_the_server_continues() {
     let server = of_bytes(b"scene");
     for request in broken_requests() {
         let reply = raw(&server, &request, true);
@@ -329,7 +329,7 @@ fn broken_requests_break_nothing() {
     assert!(reply.starts_with(b"HTTP/1.1 431") || reply.is_empty(), "{}", String::from_utf8_lossy(&reply));
 }
 
-/// Reads events until `enough` says so: pairs of id and data.
+/// Reads events until `enough` states so: pairs of id and data.
 fn listen(server: &Running, last: Option<&str>, enough: impl Fn(&[(String, Value)]) -> bool) -> Vec<(String, Value)> {
     let mut stream = connect(server);
     let last = last.map(|l| format!("last-event-id: {l}\r\n")).unwrap_or_default();
@@ -350,7 +350,7 @@ fn listen(server: &Running, last: Option<&str>, enough: impl Fn(&[(String, Value
 }
 
 #[test]
-fn news_reach_those_who_come_early_late_and_again() {
+fn events_reach_early_late_and_reconnecting_clients() {
     let server = start(Config { live: true, ..Config::default() });
     let step = |i: u32| server.publish(&News::Step(json!({"iteration": i, "loss": 0.5})));
     (0..3).for_each(step);
@@ -378,7 +378,7 @@ fn news_reach_those_who_come_early_late_and_again() {
 }
 
 #[test]
-fn news_arrive_while_one_listens() {
+fn events_arrive_while_a_client_listens() {
     let server = start(Config { live: true, ..Config::default() });
     std::thread::scope(|scope| {
         let heard = scope.spawn(|| listen(&server, None, |e| e.len() == 30));
@@ -466,7 +466,7 @@ fn a_live_scene_is_replaced_whole() {
 }
 
 #[test]
-fn a_taken_port_is_an_error_or_the_next_one() {
+fn a_port_in_use_is_an_error_or_the_next_port_is_used() {
     let first = Server::start(Config::default()).unwrap();
     let second = Server::start(Config::default()).unwrap();
     assert_ne!(first.address().port(), second.address().port());
@@ -591,7 +591,7 @@ fn edits_need_token_and_origin() {
 }
 
 #[test]
-fn without_leave_nothing_can_be_sent() {
+fn posts_are_refused_unless_editing_is_enabled() {
     let server = of_bytes(&bytes(10));
     assert_eq!(post(&server, "/edit", &[], br#"{"do": "x"}"#).status, 405);
     let config: Value = serde_json::from_slice(&get(&server, "/config.json").body).unwrap();
@@ -621,7 +621,7 @@ fn a_run_is_controlled_by_the_rules_of_edits() {
 }
 
 #[test]
-fn photos_are_found_by_camera_and_time_and_nothing_else_is_read() {
+fn photos_are_served_by_camera_and_time_and_no_other_file() {
     let photos = Photos::new(|wanted| {
         (wanted.view < 2).then(|| Photo { jpeg: vec![wanted.view as u8, wanted.side as u8], time: wanted.time + 0.25 })
     });

@@ -117,7 +117,7 @@ mod tests {
     use std::io::Read;
 
     #[test]
-    fn a_client_that_takes_nothing_is_cut_off() {
+    fn a_client_that_reads_nothing_is_disconnected() {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         runtime.block_on(async {
             let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();

@@ -14,7 +14,7 @@ pub enum Sampler {
     /// As `Uniform`, but all views of a step at one time (Spacetime Gaussians).
     SameTime,
     /// Four of five from a window of so many distinct times that slides over the clip as the stage proceeds, the rest from
-    /// the whole take (long takes).
+    /// the whole capture (long captures).
     Window(usize),
     /// Only frames at the k-th distinct time (per-frame tracking).
     Frame(usize),
@@ -37,7 +37,7 @@ pub(crate) struct Draw {
     pub steps: usize,
 }
 
-/// Share of a window sampler's frames that come from its window; the rest replays the take.
+/// Share of a window sampler's frames that come from its window; the rest replays the capture.
 const WINDOW_SHARE: f64 = 0.8;
 
 /// Frame numbers sorted by distinct time.
@@ -141,7 +141,7 @@ mod tests {
     use crate::step::tests::Made;
 
     #[test]
-    fn every_frame_comes_once_an_epoch_and_the_draw_is_a_pure_function() {
+    fn every_frame_is_sampled_once_an_epoch_by_a_pure_function() {
         let frames = Made::new(3, 5, 4);
         let line = Timeline::new(&frames);
         assert_eq!(line.times(), 5);

@@ -241,7 +241,7 @@ mod tests {
     use splat4d::scene::GEOMETRY;
 
     #[test]
-    fn stats_count_what_was_drawn() {
+    fn stats_count_rendered_gaussians() {
         let s = scene(20);
         let mut stats = Stats::new(&s);
         let ids = [4, 9];
@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn every_way_to_change_a_learner_is_noted_for_what_it_is() {
+    fn every_change_of_a_learner_is_recorded_by_kind() {
         let mut train_state = TrainState::new(scene(20));
         assert_eq!(train_state.take_touched(), Touched::Values, "nothing has been copied of a new one");
         assert_eq!(train_state.take_touched(), Touched::Nothing);
@@ -280,7 +280,7 @@ mod tests {
     }
 
     #[test]
-    fn moments_of_a_layer_outlive_a_rebuild_and_those_of_another_do_not() {
+    fn moments_survive_a_rebuild_of_their_own_layer_only() {
         let mut train_state = TrainState::new(scene(20));
         train_state.tables_mut().1[0].table_mut(GEOMETRY).fill(2.0);
         train_state.rebuild(&|_, _| true, |_| Ok(())).unwrap();

@@ -24,7 +24,7 @@ pub struct Training<'a> {
 }
 
 impl<'a> Training<'a> {
-    /// Opens a capture (a folder or its marker file) as the recipe says: scale, split, frames.
+    /// Opens a capture (a folder or its marker file) as the recipe states: scale, split, frames.
     ///
     /// Errors: the folder is no capture; files that are missing or broken; a recipe out of range.
     pub fn open(capture: impl AsRef<Path>, recipe: Recipe) -> Result<Self> {
@@ -100,5 +100,5 @@ impl Trained {
     }
 }
 
-/// Memory for decoded images while they are measured: each is looked at once.
+/// Memory for decoded images while they are measured: each is examined once.
 const STORE_BYTES: usize = 64 << 20;

@@ -110,7 +110,7 @@ impl Engine for Counting {
 }
 
 #[test]
-fn an_engine_of_ones_own_takes_all_steps_and_makes_the_same_bits() {
+fn a_custom_engine_runs_all_steps_with_the_same_bits() {
     let steps = Arc::<AtomicUsize>::default();
     let [mut own, mut usual] = [trainer(None), trainer(None)];
     let inner = CpuEngine::new(Box::new(Renderer::new(RenderConfig::default())));
@@ -154,7 +154,7 @@ impl Maintenance for Whiten {
 
 /// An operation runs, is in checkpoints, and goes on where it was.
 #[test]
-fn an_operation_of_ones_own_runs_and_resumes_to_the_bit() {
+fn a_custom_operation_runs_and_resumes_bit_for_bit() {
     let start = || trainer(Some(Whiten { next: 0 }));
     let mut whole = start();
     let mut kept = Vec::new();

@@ -2,7 +2,7 @@
 //! them and their playback files against a table of hashes, a line for each named tensor.
 //!
 //! A change of behaviour on purpose records the table again (`UPDATE_GOLDEN=1 cargo test -p splat4d-train --test
-//! same_bits`) and says in its commit why. SIMD levels round differently, so that each has lines of its own: the machine's
+//! same_bits`) and states in its commit why. SIMD levels round differently, so that each has lines of its own: the machine's
 //! own level a line a tensor, the levels below it one line a run, of models without networks (whose matrix products choose
 //! their instructions themselves). Runs for which a level has no line are passed over. Loss values, clocks and metadata
 //! are not part of the table.

@@ -128,7 +128,7 @@ fn trainer() -> Result<Trainer<'static>> {
 }
 
 #[test]
-fn a_steady_step_allocates_next_to_nothing() {
+fn a_steady_step_stays_within_its_allocation_limit() {
     let mut trainer = trainer().unwrap();
     let mut steps = |count: usize| {
         for _ in 0..count {

@@ -1,5 +1,5 @@
 //! A turned world needs no new training: what was learnt of a capture explains the same images of the world turned,
-//! shifted and scaled once its layer's frame says so, whatever the model. Models that see no absolute coordinates may also be
+//! shifted and scaled once its layer's frame states so, whatever the model. Models that see no absolute coordinates may also be
 //! asked in the turned world itself; the others, asked so, fail.
 
 use splat4d::layers::{Layer, Scene};
@@ -35,7 +35,7 @@ fn pose(camera: usize) -> Se3 {
     Se3::look_at([3.0 * angle.sin(), 0.4, -3.0 * angle.cos()], [0.0; 3], [0.0, -1.0, 0.0])
 }
 
-/// The take of a ball in a world that `g` turned: images are the same for every `g`.
+/// The capture of a ball in a world that `g` turned: images are the same for every `g`.
 fn write_capture(folder: &Path, g: &Sim3) {
     let mut cameras = Vec::new();
     for camera in 0..CAMERAS {

@@ -24,7 +24,7 @@ use splat4d::scene::{Camera, GEOMETRY, Time};
 use splat4d::{Error, Result};
 use std::path::Path;
 
-/// Cameras that stand still and times at which baked and model are compared; every one costs two renders.
+/// Cameras that are static and times at which baked and model are compared; every one costs two renders.
 const COMPARED_CAMERAS: usize = 4;
 const COMPARED_TIMES: usize = 6;
 /// The same of poses of a camera that moves, each at its own time; and of fixed cameras next to it.
@@ -117,7 +117,7 @@ pub struct Packed {
     pub baked: bake::Baked,
     summary: playback::Summary,
     antialias: bool,
-    /// The price of a segment, and what the curve says of it: primitives and error.
+    /// The price of a segment, and what the curve states of it: primitives and error.
     at: Option<(f64, [f64; 2])>,
 }
 
@@ -260,7 +260,7 @@ pub fn bake(from: &Path, out: &Path, report: Option<&Path>, baking: &Baking, lis
     Ok(value)
 }
 
-/// Bakes into the file `out` and says how well; returns the report. The options' cameras are the source's.
+/// Bakes into the file `out` and states how well; returns the report. The options' cameras are the source's.
 pub fn bake_into(source: &Source, title: &str, out: &Path, baking: &Baking, console: &dyn Listener) -> Result<Value> {
     let started = baking.deadline.now();
     let Cooked { packed, likeness, needs } = bake_like(source, title, baking, console)?;
@@ -445,7 +445,7 @@ fn compare(
     })
 }
 
-/// Compares what a file shows with what its scene shows, until `go_on` says no; it is given how many renders are done, of how many.
+/// Compares what a file shows with what its scene shows, until `go_on` states no; it is given how many renders are done, of how many.
 pub fn likeness(
     scene: &Scene<f32>,
     played: &Scene<f32>,
@@ -489,7 +489,7 @@ fn shots(scene: &Scene<f32>, stage: &Stage, views: &[View]) -> Vec<(f64, Camera)
     shots
 }
 
-/// Cameras that stand still, each once, and the poses of cameras that move, by time.
+/// Cameras that are static, each once, and the poses of cameras that move, by time.
 #[derive(Debug)]
 struct Cameras<'a> {
     still: Vec<&'a View>,

@@ -93,7 +93,7 @@ pub fn parse(text: &str) -> Result<(Camera, Option<[f32; 3]>)> {
     Ok((Camera { cam_from_world, intrinsics, lens: Lens::Pinhole, width, height, near }, background))
 }
 
-/// Parses JSON; the error says what is usually wrong.
+/// Parses JSON; the error states what is usually wrong.
 pub fn json(text: &str) -> Result<Value> {
     serde_json::from_str(text).map_err(|e| {
         let remedy = if text.contains("NaN") || text.contains("Infinity") {

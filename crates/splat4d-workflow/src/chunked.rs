@@ -59,7 +59,7 @@ pub fn in_words(outlook: &ChunkEstimate) -> String {
     words
 }
 
-/// Does what is wanted of a take, and appends what is finished to its playback file, within the options' minutes. `None`: nothing
+/// Does what is wanted of a capture, and appends what is finished to its playback file, within the options' minutes. `None`: nothing
 /// was to do.
 pub fn work(
     run: &Path,

@@ -18,6 +18,9 @@ pub const SCORES: [(&str, usize, bool); 8] = [
     ("flicker", 3, false),
 ];
 
+/// Columns of the table that are words, not numbers.
+pub const WORDS: [&str; 2] = ["run", "motion"];
+
 /// One row of the comparison.
 #[derive(Clone, Debug, Default)]
 pub struct Entry {
@@ -162,8 +165,11 @@ pub fn differences(entries: &[Entry]) -> Vec<String> {
     out
 }
 
-/// The place of the best row in each column of [`SCORES`] that at least two rows have.
+/// The place of the best row in each column of [`SCORES`] that at least two rows have; none if the rows cannot be compared.
 pub fn best(entries: &[Entry]) -> Vec<Option<usize>> {
+    if !differences(entries).is_empty() {
+        return vec![None; SCORES.len()];
+    }
     let of = |(i, (_, _, more)): (usize, &(&str, usize, bool))| {
         let mut all: Vec<(usize, f64)> = (0..entries.len()).filter_map(|e| Some((e, entries[e].score(i)?))).collect();
         if all.len() < 2 {
@@ -179,8 +185,8 @@ pub fn best(entries: &[Entry]) -> Vec<Option<usize>> {
 pub fn table(entries: &[Entry]) -> (Vec<String>, Vec<Vec<String>>) {
     let number = |n: Option<usize>| n.map(|n| n.to_string()).unwrap_or_default();
     let mut columns: Vec<(String, Vec<String>)> = vec![
-        ("run".into(), entries.iter().map(|e| e.name.clone()).collect()),
-        ("motion".into(), entries.iter().map(|e| e.motion.clone().unwrap_or_default()).collect()),
+        (WORDS[0].into(), entries.iter().map(|e| e.name.clone()).collect()),
+        (WORDS[1].into(), entries.iter().map(|e| e.motion.clone().unwrap_or_default()).collect()),
         ("steps".into(), entries.iter().map(|e| number(e.steps)).collect()),
         ("Gaussians".into(), entries.iter().map(|e| number(e.gaussians)).collect()),
         ("seconds".into(), entries.iter().map(|e| number(e.seconds.map(|s| s.round() as usize))).collect()),
@@ -228,7 +234,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_compared_is_said() {
+    fn runs_that_cannot_be_compared_are_reported() {
         let views = |n| vec![ViewScore::default(); n];
         let of = |name: &str, capture: &str, n| Entry {
             name: name.into(),
@@ -237,8 +243,11 @@ mod tests {
             ..Entry::default()
         };
         assert!(differences(&[of("a", "x", 3), of("b", "x", 3)]).is_empty());
-        let told = differences(&[of("a", "x", 3), of("b", "y", 4)]);
-        assert_eq!(told.len(), 2, "{told:?}");
+        let mut two = [of("a", "x", 3), of("b", "y", 4)];
+        let found = differences(&two);
+        assert_eq!(found.len(), 2, "{found:?}");
+        two.iter_mut().for_each(|e| e.scores = vec![Some(30.0); SCORES.len()]);
+        assert!(best(&two).iter().all(Option::is_none), "no row is the best of what cannot be compared");
         let folder = tempfile::tempdir().unwrap();
         let none = written(folder.path(), "none", r#"{"speed": 3}"#);
         assert!(Entry::open(&none).unwrap_err().to_string().contains("none of the scores"));

@@ -33,7 +33,7 @@ const MOST_TRIES: usize = 3;
 /// The guard takes back this share of the pruning.
 const GENTLER: f64 = 0.5;
 
-/// Settings that the user asked for; they lie in [`ORDER`], so that an interrupted compression knows them.
+/// Settings that the user asked for; they are in [`ORDER`], so that an interrupted compression knows them.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CompressJob {

@@ -423,7 +423,7 @@ fn rotated(camera: Camera, r: &[[f64; 3]; 3]) -> Camera {
     Camera { cam_from_world: Se3 { rotation, ..camera.cam_from_world }, ..camera }
 }
 
-/// A scene that stands still as `scene` does at `time`.
+/// A scene that is static as `scene` is at `time`.
 fn one_moment(scene: &Scene<f32>, time: f64) -> Result<Scene<f32>> {
     layers::moment(scene, Time(time)).map(|params| standing(scene, params))
 }
@@ -440,7 +440,7 @@ struct Writer {
 }
 
 impl Writer {
-    /// A scene as a file; where the format holds one time, the scene stands still.
+    /// A scene as a file; where the format holds one time, the scene is static.
     fn bytes(&self, scene: &Scene<f32>) -> Result<(Vec<u8>, Warnings)> {
         let mut out = Vec::new();
         let warnings = match self.target {

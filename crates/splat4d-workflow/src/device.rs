@@ -46,7 +46,7 @@ mod tests {
     use std::cell::Cell;
 
     #[test]
-    fn only_a_gpu_that_was_demanded_is_missed_aloud() {
+    fn only_an_explicit_gpu_request_warns_if_unsupported() {
         let headed = Wanted { head: true, ..Wanted::default() };
         for (device, wanted, warnings) in [
             (Device::Cpu, headed, 0),

@@ -276,7 +276,7 @@ impl<'a> Painter<'a> {
     /// Draws the means of the channel's numbers into `field`.
     fn draw_field(&mut self, camera: &Camera, time: f64) {
         let scene = self.scene;
-        // As players do: what lies beyond the clip of spans is its end.
+        // As players do: what is beyond the clip of spans is its end.
         let spans = scene.layers.iter().any(|l| l.span != ALWAYS);
         let t = Time(if spans { time.max(scene.clip[0]).min(scene.clip[1]) } else { time });
         scene.at(t, &mut self.instant);

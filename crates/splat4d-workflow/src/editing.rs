@@ -27,7 +27,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::SystemTime;
 
-/// Masks of images that are looked at for the subject, at most: each costs a look at the whole scene.
+/// Masks of images that are examined for the subject, at most: each costs a look at the whole scene.
 const MOST_MASKS: usize = 120;
 /// Held-out images that are compared before and after floaters are removed.
 const COMPARED: usize = 40;

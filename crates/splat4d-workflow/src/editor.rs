@@ -1,4 +1,4 @@
-//! The work behind `view --edit`: a page asks, and a list of edits is replayed, looked at, baked and saved, by the same code
+//! The work behind `view --edit`: a page asks, and a list of edits is replayed, examined, baked and saved, by the same code
 //! as `edit`. It writes one file, the list, and reads nothing that a page names but files next to the list.
 
 use crate::baking::{Baking, pack_scene};
@@ -486,7 +486,7 @@ mod tests {
     }
 
     #[test]
-    fn shapes_drawn_over_the_image_become_text() {
+    fn shapes_on_the_image_become_selection_text() {
         let bench = Bench::new();
         let pick = |shape: &str, corners: Value, through: bool| {
             bench.ask(json!({"do": "pick", "steps": [], "shape": shape, "corners": corners, "view": view(), "t": 0.0,
@@ -515,7 +515,7 @@ mod tests {
     }
 
     #[test]
-    fn shapes_take_what_is_hidden_behind_a_surface_only_with_through() {
+    fn shapes_select_hidden_gaussians_only_with_through() {
         let folder = tempfile::tempdir().unwrap();
         let hidden = balls([[0.0; 3], [0.0, 0.0, 3.0]]);
         let editor = Editor::new(hidden, "balls".into(), &folder.path().join("edits.toml")).unwrap();

@@ -174,13 +174,13 @@ impl Times {
             orbit_seconds(scene.clip[1] - scene.clip[0]) * if have_ffmpeg() { ORBIT_FPS } else { ORBIT_FPS_PNG };
         Ok(Self {
             scores: step * HELD_STEPS * held as f64,
-            // That of a long take is made by then.
+            // That of a long capture is made by then.
             playback: if Chunked::is(&run.path) { 0.0 } else { step * BAKE_STEPS },
             film: step * FILM_STEPS * frames,
         })
     }
 
-    /// Whether what takes `seconds` fits, and what is kept for later with it; says so in one line where it does not.
+    /// Whether what takes `seconds` fits, and what is kept for later with it; states so in one line where it does not.
     fn leaves(
         missing: &str,
         [seconds, kept]: [f64; 2],
@@ -210,7 +210,7 @@ pub fn playback(run: &Path, console: &dyn Listener) -> Result<()> {
 /// The same, within a time.
 pub fn playback_by(run: &Path, deadline: &Deadline, console: &dyn Listener) -> Result<()> {
     // The file of a compression is what was learnt: baking again would lose its codes, palette and masks.
-    // That of a long take was made chunk by chunk.
+    // That of a long capture was made chunk by chunk.
     if run.join(ORDER).is_file() || Chunked::is(run) {
         return Ok(());
     }
@@ -289,7 +289,7 @@ pub fn scores(
     Ok(evaluation)
 }
 
-/// Scores one split of a run's capture on some backgrounds, says them, and writes them next to those that the run is
+/// Scores one split of a run's capture on some backgrounds, states them, and writes them next to those that the run is
 /// judged
 /// by. `backgrounds` with their names; none: the run's own.
 ///

@@ -44,10 +44,10 @@ pub enum Event<'a> {
     },
     /// An event of training or evaluation. Its warnings come as [`Warning`](Self::Warning).
     Training(&'a Training),
-    /// From here on the workflow polls its stop flag; the sentence says what it does when the flag is raised.
+    /// From here on the workflow polls its stop flag; the sentence states what it does when the flag is raised.
     StopPolled(&'a str),
     /// From here on the workflow does not poll its stop flag. Ending the process loses nothing, because files are renamed into
-    /// place; the sentence says what is kept and how to continue.
+    /// place; the sentence states what is kept and how to continue.
     StopNotPolled(&'a str),
 }
 

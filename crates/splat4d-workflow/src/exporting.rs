@@ -214,7 +214,7 @@ pub fn page(path: &Path, out: &Path, link: Option<&Path>, listener: &dyn Listene
             .at(link.display())
             .remedy("Use option `link` NAME.s4d."));
     }
-    // A playback file may lie next to its page as it is.
+    // A playback file may be next to its page as it is.
     let is_read = |link: &&Path| link.canonicalize().ok().is_some_and(|l| path.canonicalize().is_ok_and(|p| p == l));
     if let Some(link) = link.filter(|link| !is_read(link)) {
         keep(path, run.as_ref(), link, &[])?;
@@ -267,7 +267,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_page_names_its_scene_from_where_it_lies() {
+    fn a_page_refers_to_its_scene_relative_to_itself() {
         let folder = tempfile::tempdir().unwrap();
         std::fs::create_dir(folder.path().join("a b")).unwrap();
         let at = |name: &str| folder.path().join(name);

@@ -1,4 +1,4 @@
-//! The playback file of a long take: parts are appended as they are finished, so that it plays as far as it goes; at the end it
+//! The playback file of a long capture: parts are appended as they are finished, so that it plays as far as it goes; at the end it
 //! is written again as any other file.
 
 use crate::baking::{self, Baking, Outline, bake_like, poster};
@@ -18,7 +18,7 @@ use std::io::Read;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-/// Name of the file that is made of the parts of a take whose file is finished already.
+/// Name of the file that is made of the parts of a capture whose file is finished already.
 const AGAIN: &str = ".scene.again.s4d";
 
 /// Appends all parts that are finished and not in the file yet. Nothing happens to a file that is finished.
@@ -47,7 +47,7 @@ pub fn complete(
 ) -> Result<u64> {
     let _turn = chunked.turn(stop)?;
     let path = run.join(FILE);
-    // Of a take that was joined before, chunks may have been trained again.
+    // Of a capture that was joined before, chunks may have been trained again.
     let again = path.is_file() && !grows(&path)?;
     let growing = if again { run.join(AGAIN) } else { path.clone() };
     let done = complete_from(&growing, &path, run, chunked, deadline, console);

@@ -55,7 +55,7 @@ pub fn import(request: &Request, check: bool, stop: &AtomicBool, console: &dyn L
     let folder = &request.folder;
     check_ours(folder)?;
     let read = request.inputs.iter().chain(&request.masks).map(|v| Input::new(v, "what is imported,"));
-    // A capture may lie next to the videos, in the folder of their calibration.
+    // A capture may be next to the videos, in the folder of their calibration.
     let calibration = request.calibration.iter().map(|c| Input { may_hold: true, ..Input::new(c, "the calibration") });
     check_apart(folder, &read.chain(calibration).collect::<Vec<_>>())?;
     // Before videos are read, which takes a while.

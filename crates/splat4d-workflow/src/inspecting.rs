@@ -140,7 +140,7 @@ fn of_capture(path: &Path, options: &InspectOptions, console: &dyn Listener) -> 
     if let Some(found) = shipped::contents(path)? {
         return Ok(of_shipped(path, &found));
     }
-    // What lies next to images is noted even where this recipe does not use it.
+    // What is next to images is noted even where this recipe does not use it.
     let all = recipe.clone().with(|r| (r.loss.depth, r.loss.flow, r.loss.tracks) = (1.0, 1.0, 1.0));
     let mut capture = open_capture(path, &all)?;
     let priors = priors(&capture);
@@ -302,7 +302,7 @@ fn in_short(names: &[&str]) -> String {
     }
 }
 
-/// What lies next to the images, in words.
+/// What is next to the images, in words.
 fn priors(capture: &Capture) -> Vec<String> {
     let count = |has: fn(&Frame) -> bool| capture.frames.iter().filter(|f| has(f)).count();
     type Has = fn(&Frame) -> bool;

@@ -19,7 +19,7 @@ const SEEN: f32 = 0.5;
 const MARGIN: f64 = 0.05;
 /// Distance of colours that look alike, 0 to 1.
 const ALIKE: f64 = 0.12;
-/// Farther than this nothing is looked for, scene units.
+/// Farther than this nothing is searched for, scene units.
 const ENDLESS: f64 = 1e6;
 /// Most corners that a page may draw.
 const CORNERS: usize = 256;
@@ -77,7 +77,7 @@ pub(crate) fn there(scene: &Scene<f32>, t: f64, which: impl Fn(usize, usize) -> 
 pub(crate) struct Drawn<'a> {
     pub shape: Shape,
     pub corners: &'a [[f64; 2]],
-    /// Whether all that lies behind is meant as well.
+    /// Whether all that is behind is meant as well.
     pub through: bool,
 }
 

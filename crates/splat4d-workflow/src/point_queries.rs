@@ -255,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn mistakes_are_reported_with_their_line() {
+    fn mistakes_in_a_points_file_are_reported_with_their_line() {
         for (text, words) in [
             ("", "empty"),
             ("camera,x,y,time\n", "contains no points"),

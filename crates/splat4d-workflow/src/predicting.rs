@@ -363,7 +363,7 @@ impl Work {
 
 /// The figures in the terminal.
 fn say(told: &Summary, console: &dyn Listener) {
-    let number = |x: Option<f64>, digits: usize| x.map_or("–".to_owned(), |x| format!("{x:.digits$}"));
+    let number = |x: Option<f64>, digits: usize| x.map_or("–".to_owned(), |x| report::predict::rounded(x, digits));
     console.say("model          PSNR  dynamic regions     skill over freeze  over velocity");
     for m in told.models.iter().chain(&told.assimilated).chain(&told.oracle) {
         console.say(&format!(

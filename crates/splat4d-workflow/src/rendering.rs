@@ -19,7 +19,7 @@ use std::time::{Duration, Instant};
 
 /// Frames a second of films by default.
 const FPS: f64 = 30.0;
-/// Shots that are looked at to find the range of a channel.
+/// Shots that are examined to find the range of a channel.
 const PROBES: usize = 8;
 /// Range of a film in which nothing is to be seen, or of a channel that needs none.
 const NO_RANGE: [f32; 2] = [1.0, 2.0];

@@ -352,7 +352,7 @@ pub fn views_of(capture: &Capture) -> Vec<View> {
             held: capture.split(i) == Split::Held,
         }
     };
-    // A run may use a part of the take only: `train` and `held` say which.
+    // A run may use a part of the capture only: `train` and `held` say which.
     let mut used: Vec<usize> = capture.train.iter().chain(&capture.held).copied().collect();
     used.sort_unstable();
     used.into_iter().map(view).collect()
@@ -576,7 +576,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_run_that_has_no_files_yet_is_named_with_its_owner() {
+    fn a_run_without_files_is_reported_with_its_owner() {
         let folder = tempfile::tempdir().unwrap();
         let (capture, run) = (folder.path().join("capture"), folder.path().join("run"));
         std::fs::create_dir(&capture).unwrap();
@@ -614,7 +614,7 @@ mod tests {
     }
 
     #[test]
-    fn taken_folders_get_a_number() {
+    fn folders_in_use_get_a_number() {
         let folder = tempfile::tempdir().unwrap();
         let wanted = folder.path().join("knight");
         assert_eq!(free_folder(&wanted), wanted);

@@ -110,7 +110,7 @@ fn part(name: &OsStr, from: usize, to: usize) -> Option<OsString> {
     Some(name.to_str()?.get(from..to)?.into())
 }
 
-/// What is read of a command that writes frames: none of it may be the folder of the frames. Renders may lie in their run.
+/// What is read of a command that writes frames: none of it may be the folder of the frames. Renders may be in their run.
 pub struct Read<'a> {
     /// The scene.
     pub path: &'a Path,
@@ -310,7 +310,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn patterns_name_files_and_know_them_again() {
+    fn file_patterns_format_and_parse_names() {
         let os = OsStr::new;
         let p = Pattern::of(Path::new("out/f_%04d.spz")).unwrap();
         assert_eq!(p.file(7), Path::new("out/f_0007.spz"));
@@ -344,7 +344,7 @@ mod tests {
     }
 
     #[test]
-    fn a_gap_is_named_and_keeps_its_time() {
+    fn a_missing_frame_is_reported_and_keeps_its_time() {
         let folder = tempfile::tempdir().unwrap();
         for n in [1, 2, 4, 9] {
             std::fs::write(folder.path().join(format!("f{n}.ply")), b"").unwrap();
@@ -362,7 +362,7 @@ mod tests {
     }
 
     #[test]
-    fn steps_of_a_training_are_no_frames() {
+    fn training_steps_in_names_are_not_frames() {
         let newest = |names: &[&str]| {
             let folder = tempfile::tempdir().unwrap();
             names.iter().for_each(|name| std::fs::write(folder.path().join(name), b"").unwrap());

@@ -39,7 +39,7 @@ pub struct Source {
     pub ply: Option<PlyInfo>,
     /// The start of the playback file, where it is one.
     pub playback: Option<Index>,
-    /// Where the playback file comes from, where it says so; written along into playback files that are made of it.
+    /// Where the playback file comes from, where it states so; written along into playback files that are made of it.
     pub provenance: Option<Provenance>,
     /// Whose format it is, where it is not our own.
     pub dialect: Option<Dialect>,

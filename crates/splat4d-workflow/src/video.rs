@@ -16,7 +16,7 @@ const ENDINGS: &str =
     "Use .mp4, .mkv or .mov (needs ffmpeg), .png (animated), or a name without extension for a folder of images.";
 /// Remedy where ffmpeg is missing.
 const INSTEAD: &str = "Install ffmpeg, or write an animated .png or a folder of images instead (option `output` NAME.png, option `output` FOLDER).";
-/// Most bytes kept of what ffmpeg says.
+/// Most bytes kept of what ffmpeg states.
 const STDERR_BYTES: usize = 64 << 10;
 
 /// Whether the `ffmpeg` program can be called.
@@ -36,7 +36,7 @@ pub enum Film {
         child: Child,
         /// Where frames go.
         pipe: Option<ChildStdin>,
-        /// Collects what ffmpeg says.
+        /// Collects what ffmpeg states.
         words: Option<std::thread::JoinHandle<Vec<u8>>>,
     },
     /// Animated PNG.

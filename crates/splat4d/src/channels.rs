@@ -117,7 +117,7 @@ pub fn lifetimes(scene: &Scene<f32>) -> Vec<Vec<f32>> {
     scene.layers.iter().map(|l| l.spans().into_iter().map(length).collect()).collect()
 }
 
-/// An image that says where Gaussians are.
+/// An image that states where Gaussians are.
 #[derive(Clone, Copy, Debug)]
 pub struct Witness<'a> {
     /// From where.
@@ -131,7 +131,7 @@ pub struct Witness<'a> {
 /// ([`Sensitivity::fisher`](crate::render::Sensitivity::fisher)), σ `PIXEL_NOISE` and ρ `reach`, how far a Gaussian may be
 /// from where it is when no image shows it. Each witness stands for `share` images. Other Gaussians are taken for
 /// known,
-/// so that it says too little where several could explain a pixel.
+/// so that it states too little where several could explain a pixel.
 ///
 /// Source: the Fisher blocks of PUP 3D-GS (Hanson et al. 2025), read as the precision of a Laplace approximation with a
 /// Gaussian prior as in Bayes' Rays (Goli et al. 2024).
@@ -253,7 +253,7 @@ mod tests {
         };
         let (none, one, both) = (of(&[]), of(&[(&front, 0.5)]), of(&[(&front, 0.5), (&side, 0.5)]));
         assert!((none[0] - 10.0).abs() < 1e-4 && (none[1] - 10.0).abs() < 1e-4);
-        // One image says little of the depth, a second from the side says it.
+        // One image states little of the depth, a second from the side states it.
         assert!(one[0] < none[0] && one[0] > 2.0 * both[0], "{one:?} {both:?}");
         // What lives for a moment is not known better by an image of another time.
         let late = of(&[(&front, 0.5), (&side, 0.0)]);

@@ -1,4 +1,4 @@
-//! The device that draws: the GPU where there is one that can, else the CPU, and a sentence that says why.
+//! The device that draws: the GPU where there is one that can, else the CPU, and a sentence that states why.
 
 mod resident;
 #[cfg(test)]

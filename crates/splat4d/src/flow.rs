@@ -82,7 +82,7 @@ pub fn velocity_columns<F: Real>(scene: &Scene<F>, instant: &Evaluation<F>) -> T
 
 /// 2D flow in pixels, [2, h, w] (x right, y down): F(p) = Σ w_i [π_to(μ_i(t_to)) − π_from(μ_i(t_from))] / Σ w_i.
 ///
-/// The rows alive at `from.t` are followed to `to.t`, whatever their life says there. With the same camera twice it is
+/// The rows alive at `from.t` are followed to `to.t`, whatever their life states there. With the same camera twice it is
 /// the flow of objects alone, else the camera's motion is in it. A splat that is behind a camera has no vector.
 /// Source: "F_simple" of rendered optical flow, Σ w Δμ_2D, as in Gao et al. 2024 (GaussianFlow) §3.2 without its
 /// covariance term.

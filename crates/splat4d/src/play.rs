@@ -93,7 +93,7 @@ impl Alive {
         }
     }
 
-    /// The same with masks: only rows whose bit is set are looked at, so that masks make the lookup faster.
+    /// The same with masks: only rows whose bit is set are examined, so that masks make the lookup faster.
     fn masked(&self, t: f64, masks: &KeyMasks, ids: &mut Vec<u32>) {
         let [left, right] = masks.words_at(t);
         for (b, _) in self.blocks.iter().enumerate().filter(|(_, [from, to])| *from <= t && t <= *to) {
@@ -206,7 +206,7 @@ impl<'a> Player<'a> {
             if needed <= have as u64 {
                 break;
             }
-            // Beyond the end nothing is asked for: what is there says what is wrong with it.
+            // Beyond the end nothing is asked for: what is there states what is wrong with it.
             let want = needed.min(length) as usize;
             if want <= have {
                 break;

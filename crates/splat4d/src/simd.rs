@@ -3,7 +3,7 @@
 //! A kernel is one `#[inline(always)]` body over fixed-size lane arrays. It is compiled three times, inside functions
 //! that enable nothing, AVX2 with FMA, and AVX-512; LLVM turns the lane loops into that level's vectors. Levels differ in
 //! the rounding of fused multiply-adds (the scalar level) and of what steps from row to row (the blend under AVX-512). On ARM the baseline has NEON and fused multiply-add already.
-//! Everything that is fast goes through here: this is the one file of the workspace that says `unsafe`.
+//! Everything that is fast goes through here: this is the one file of the workspace that states `unsafe`.
 #![allow(unsafe_code)] // calling a function that enables a target feature, after that feature was found present
 
 use std::sync::atomic::{AtomicU8, Ordering};
@@ -71,7 +71,7 @@ impl Simd {
 pub trait Kernel {
     /// Its result.
     type Out;
-    /// Does the work; `FMA` says whether fused multiply-add is an instruction here.
+    /// Does the work; `FMA` states whether fused multiply-add is an instruction here.
     fn run<const FMA: bool>(self) -> Self::Out;
     /// The same where a register holds sixteen numbers and there are 32 of them; `#[inline(always)]` too.
     #[inline(always)]
@@ -93,7 +93,7 @@ pub trait Pass {
     type Into: ?Sized;
     /// Its result.
     type Out;
-    /// Does the work; `FMA` says whether fused multiply-add is an instruction here.
+    /// Does the work; `FMA` states whether fused multiply-add is an instruction here.
     fn run<const FMA: bool>(&self, scratch: &mut Self::Scratch, into: &mut Self::Into) -> Self::Out;
 }
 

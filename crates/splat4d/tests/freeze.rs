@@ -34,7 +34,7 @@ fn scene() -> Scene<f32> {
 }
 
 #[test]
-fn a_frozen_time_looks_like_the_scene_then() {
+fn a_frozen_scene_renders_as_the_scene_at_that_time() {
     let scene = scene();
     let pose = splat4d::math::Se3::look_at([0.0, 0.0, -4.0], [0.0; 3], [0.0, -1.0, 0.0]);
     let camera = Camera::with_fov_y(pose, 0.9, 48, 40);

@@ -159,7 +159,7 @@ pub(super) fn measure(
     Ok(rows)
 }
 
-/// Trains still scenes as other programs do whose runs lie in a folder, and leaves there what they need for it.
+/// Trains still scenes as other programs do whose runs are in a folder, and leaves there what they need for it.
 pub(super) fn other_programs(
     scenes: &[Pinned],
     folder: &Path,

@@ -3,7 +3,7 @@
 //!
 //! The image stays the same. More Gaussians are those of the trained scene split, fewer are every so many-th of them
 //! widened, so that together they cover what they covered before: a Gaussian of n children of one parent has √(1/n) of
-//! its scales, and lies where chance puts it inside the parent. All have the default recipe's model: one velocity each
+//! its scales, and is where chance puts it inside the parent. All have the default recipe's model: one velocity each
 //! and a Gaussian life.
 
 use super::rows::Row;

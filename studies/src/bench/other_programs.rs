@@ -163,7 +163,7 @@ fn apart(ours: &Ran, theirs: &Ran) -> Option<String> {
     })
 }
 
-/// What is to be said of all other programs whose runs lie in a scene's folder.
+/// What is to be said of all other programs whose runs are in a scene's folder.
 fn verdicts(ours: &Ran, folder: &Path) -> Result<Vec<String>> {
     let unread = |e: std::io::Error| Error::io("the folder cannot be read", e).at(folder.display());
     let mut paths: Vec<_> = std::fs::read_dir(folder).map_err(unread)?.flatten().map(|entry| entry.path()).collect();

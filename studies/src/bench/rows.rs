@@ -281,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn the_table_has_a_line_a_stage_and_says_what_the_second_core_gains() {
+    fn the_table_has_one_line_per_stage_with_the_gain_of_the_second_core() {
         let rows = [row("blend", 1, 2.0), row("step", 1, 5.0), row("blend", 2, 1.0), row("step", 2, 4.0)];
         let text = table(&rows);
         let lines: Vec<&str> = text.lines().collect();
@@ -300,7 +300,7 @@ mod tests {
     }
 
     #[test]
-    fn what_grew_has_a_line_a_size_and_memory_a_line_a_place() {
+    fn growth_tables_have_one_line_per_size_and_memory_one_per_allocation() {
         let grown = |stage: &str, x: f64, ms: f64| Row { scene: "pixels".into(), x: Some(x), ..row(stage, 2, ms) };
         let place = Row { scene: "memory".into(), bytes: Some(3 << 20), ..grown("parameters", 1e6, 0.0) };
         let rows = [place, grown("step", 1e4, 5.0), grown("rest", 1e4, 2.0), grown("step", 4e4, 9.0)];

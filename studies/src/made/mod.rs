@@ -62,7 +62,7 @@ pub(crate) fn write(name: &str, folder: &Path) -> anyhow::Result<()> {
     Ok(files::write(&folder.join("capture.json"), (text + "\n").as_bytes())?)
 }
 
-/// Depth and flow of the images to train on. Flow lies in `truth/`: it is measured with, not listed.
+/// Depth and flow of the images to train on. Flow is in `truth/`: it is measured with, not listed.
 fn write_truth(scene: &Scene, folder: &Path) -> anyhow::Result<()> {
     let training = scene.viewers.iter().enumerate().filter(|(_, v)| !v.held);
     for (c, viewer) in training {
@@ -106,7 +106,7 @@ fn depth_maps(camera: usize) -> String {
     format!("depth/cam{camera:02}")
 }
 
-/// The share of the take at a time.
+/// The share of the capture at a time.
 fn share(moment: usize, moments: usize) -> f64 {
     moment as f64 / (moments.max(2) - 1) as f64
 }

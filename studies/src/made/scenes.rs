@@ -153,7 +153,7 @@ fn bounces(at: f64) -> V3 {
     [-1.3 + 2.6 * at, 0.3 + 2.4 * half * (1.0 - half), 0.6]
 }
 
-/// Above all images until half time, on the floor at nine tenths of the take.
+/// Above all images until half time, on the floor at nine tenths of the capture.
 fn falls(at: f64) -> V3 {
     let fall = ((at - 0.5) / 0.4).clamp(0.0, 1.0);
     [-0.1, 3.2 - 2.85 * fall, 0.9]
@@ -163,7 +163,7 @@ fn ball() -> Thing {
     Thing { moves: true, ..thing(Shape::Ball(0.3), bounces, texture(3, 0.25)) }
 }
 
-/// An object: a crate, a pillar and a ball that stand still.
+/// An object: a crate, a pillar and a ball that are static.
 fn object() -> [Thing; 3] {
     [
         thing(Shape::Crate([0.4; 3]), |_| [-0.9, 0.4, -0.3], texture(1, 0.4)),

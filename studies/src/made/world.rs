@@ -1,4 +1,4 @@
-//! A synthetic world that is looked at by casting rays: boxes and balls with textures in space, cameras at exact poses.
+//! A synthetic world that is rendered by casting rays: boxes and balls with textures in space, cameras at exact poses.
 //!
 //! Everything is built from + − × ÷ √ and integer hashes, which give the same bits on every machine.
 
@@ -115,7 +115,7 @@ pub(crate) enum Shape {
 pub(crate) struct Thing {
     pub shape: Shape,
     pub texture: Texture,
-    /// Its origin at a share of the take, from 0 to 1.
+    /// Its origin at a share of the capture, from 0 to 1.
     pub place: fn(f64) -> V3,
     pub moves: bool,
 }
@@ -169,7 +169,7 @@ pub(crate) struct Seen {
 }
 
 impl World {
-    /// Where the point of a thing that was seen at a share of the take is at another one.
+    /// Where the point of a thing that was seen at a share of the capture is at another one.
     pub(crate) fn later(&self, seen: &Seen, at: f64, then: f64) -> V3 {
         let place = self.things[seen.thing].place;
         add(sub(seen.point, place(at)), place(then))
@@ -183,7 +183,7 @@ pub(crate) struct World {
 }
 
 impl World {
-    /// What a ray (of length 1) from `eye` meets first at a share of the take.
+    /// What a ray (of length 1) from `eye` meets first at a share of the capture.
     pub(crate) fn look(&self, eye: V3, ray: V3, at: f64) -> Option<Seen> {
         let mut first: Option<(f64, V3, usize)> = None;
         for (i, thing) in self.things.iter().enumerate() {
@@ -232,7 +232,7 @@ impl Pinhole {
         (p[2] > 0.0 && inside).then_some(at)
     }
 
-    /// The image at a share of the take, sRGB in 8 bits; `gain` multiplies every value.
+    /// The image at a share of the capture, sRGB in 8 bits; `gain` multiplies every value.
     pub(crate) fn picture(&self, world: &World, at: f64, gain: f64) -> Vec<u8> {
         let eye = self.center();
         let mut out = Vec::with_capacity(3 * self.size[0] * self.size[1]);

@@ -196,7 +196,7 @@ impl Entry {
 }
 
 /// Copies a capture (by links to the same files where the disk allows it), but for its cloud: `.ply` files, and what
-/// `capture.json` says of them.
+/// `capture.json` states of them.
 fn copy_without_points(from: &Path, to: &Path) -> Result<()> {
     files::make_folder(to)?;
     let mut entries: Vec<PathBuf> = std::fs::read_dir(from)

@@ -29,9 +29,9 @@ use std::time::Instant;
 
 /// The form of the file; another is refused.
 const VERSION: u32 = 1;
-/// Training views are looked at so often in a run.
+/// Training views are examined so often in a run.
 const PROBES: usize = 20;
-/// Training views that are looked at, the same every time.
+/// Training views that are examined, the same every time.
 const PROBE_VIEWS: usize = 6;
 
 const EXAMPLES: &str = "\
@@ -401,7 +401,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_stands_still_is_what_the_rest_leaves() {
+    fn static_pixels_are_the_rest_of_the_dynamic_ones() {
         // Half the pixels are wrong by 0.1, the others by 0.01.
         let psnr = |mse: f64| -10.0 * mse.log10();
         let still = elsewhere(Some(psnr(0.5 * (0.01 + 0.0001))), Some(psnr(0.01)), Some(0.5)).unwrap();

@@ -1,4 +1,4 @@
-//! `bench` measures what is there, skips what is not, and says so; its JSON is one array.
+//! `bench` measures what is there, skips what is not, and states so; its JSON is one array.
 
 use crate::sample::splat4d;
 use serde_json::{Value, json};

@@ -31,7 +31,7 @@ impl Disturbance {
     pub(super) const ALL: [Self; 5] = [Self::Kill, Self::Full, Self::TwoOwners, Self::Clock, Self::ReadOnly];
 }
 
-/// Disturbs a command, and says how that ended.
+/// Disturbs a command, and states how that ended.
 pub(super) fn disturb(
     kind: Disturbance,
     program: &Program,

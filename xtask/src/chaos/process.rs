@@ -8,7 +8,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 /// Processor time from which a call hangs: undisturbed ones take below two seconds (studies/records/2026-11-27-reliability.md). Time
-/// on the clock says nothing on a machine that is shared.
+/// on the clock states nothing on a machine that is shared.
 const BUSY: f64 = 60.0;
 /// A call that waits so long without using a processor hangs.
 const IDLE: Duration = Duration::from_secs(60);
@@ -171,7 +171,7 @@ mod tests {
 
     #[test]
     #[cfg(target_os = "linux")]
-    fn a_call_that_ends_says_how() {
+    fn the_exit_status_of_a_process_is_reported() {
         let ended = Program("/bin/false".into()).run(&[], Path::new("."), None).unwrap();
         assert_eq!(ended.code, Some(1));
     }

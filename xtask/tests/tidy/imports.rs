@@ -400,7 +400,7 @@ impl Crate {
         out
     }
 
-    /// Imports that lie on or between circles, as text.
+    /// Imports that are on or between circles, as text.
     fn circles(&self) -> Vec<String> {
         let mut edges = self.edges();
         // What nothing imports, and what imports nothing, is on no circle.

@@ -1,4 +1,4 @@
-//! `join`: the finished chunks of a long take become one scene and one file.
+//! `join`: the finished chunks of a long capture become one scene and one file.
 
 use crate::console::Console;
 use crate::interrupt;

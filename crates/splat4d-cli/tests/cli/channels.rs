@@ -99,7 +99,7 @@ fn a_label_is_exported_alone() {
 }
 
 #[test]
-fn masks_teach_a_run_its_labels_and_points_are_followed() {
+fn masks_label_a_run_and_points_are_tracked() {
     let work = tempfile::tempdir().unwrap();
     let root = Capture::new(work.path()).write();
     let mut about = json_of(&root.join("capture.json"));

@@ -1,4 +1,4 @@
-//! `compress` on a tiny run: what it leaves, what it says, what it refuses.
+//! `compress` on a tiny run: what it leaves, what it states, what it refuses.
 
 use crate::sample::{Capture, splat4d};
 use crate::{json_of, str, train};
@@ -82,7 +82,7 @@ fn a_size_is_kept_or_refused_with_the_smallest_that_is_possible() {
 }
 
 #[test]
-fn wrong_orders_are_refused_before_any_work() {
+fn invalid_options_are_refused_before_any_work() {
     let work = tempfile::tempdir().unwrap();
     let run = work.path().join("run");
     let capture = Capture::new(work.path()).write();

@@ -56,7 +56,7 @@ fn open(path: &Path) -> Scene<f32> {
 }
 
 #[test]
-fn a_moving_scene_goes_everywhere() {
+fn a_dynamic_scene_converts_to_every_format() {
     let work = tempfile::tempdir().unwrap();
     let at = |name: &str| work.path().join(name);
     let mut bytes = Vec::new();
@@ -104,7 +104,7 @@ fn a_moving_scene_goes_everywhere() {
 }
 
 #[test]
-fn a_scene_with_a_head_is_drawn_and_nothing_else_is_made_of_it() {
+fn a_scene_with_a_head_renders_and_does_not_convert() {
     let work = tempfile::tempdir().unwrap();
     let write = |name: &str, scene: &Scene<f32>| {
         let mut bytes = Vec::new();
@@ -233,7 +233,7 @@ fn other_axes_rotate_every_model_as_a_whole() {
 }
 
 #[test]
-fn plain_files_keep_their_bits_and_orders_that_cannot_be_are_refused() {
+fn plain_files_keep_their_bits_and_impossible_options_are_refused() {
     let work = tempfile::tempdir().unwrap();
     let mut params = Params::new(3, 16, &[]);
     for row in 0..3 {

@@ -1,4 +1,4 @@
-//! `--device gpu` where there is no driver: one line says so, and the CPU does the work.
+//! `--device gpu` where there is no driver: one line states so, and the CPU does the work.
 
 use super::sample::{Call, Capture, splat4d};
 use super::{TINY, str};
@@ -10,7 +10,7 @@ fn without_drivers(args: &[&str]) -> Call {
 
 #[test]
 #[cfg(all(feature = "gpu", target_os = "linux"))]
-fn without_a_driver_every_verb_says_so_in_one_line_and_goes_on() {
+fn without_a_driver_every_verb_warns_once_and_continues() {
     let work = tempfile::tempdir().unwrap();
     let capture = Capture::new(work.path()).write();
     let (run, small, film) = (work.path().join("run"), work.path().join("small"), work.path().join("film"));

@@ -12,7 +12,7 @@ fn write(path: &Path, title: &str) {
     std::fs::write(path, bytes).unwrap();
 }
 
-/// A call that works and says all of this.
+/// A call that works and states all of this.
 fn says(call: Call, words: &[&str]) {
     let told = call.run().all();
     words.iter().for_each(|word| assert!(told.contains(word), "{word} is not in {told}"));

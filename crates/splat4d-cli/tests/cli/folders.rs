@@ -137,7 +137,7 @@ fn no_output_replaces_what_is_read() {
         splat4d(words).run().refused();
         assert!(std::fs::read(&ply).unwrap() == before && !at("a.s4d").exists(), "{words:?}");
     }
-    // An ending says what is wanted, and a file may be replaced that is not read.
+    // An ending states what is wanted, and a file may be replaced that is not read.
     splat4d(&["export", str(&ply), "-o", str(&page)]).run().ok();
     assert!(std::fs::read(&page).unwrap().starts_with(b"<!doctype html>"), "a page");
     splat4d(&["convert", str(&ply), str(&at("frames/1.ply"))]).run().ok();
@@ -154,7 +154,7 @@ fn no_output_replaces_what_is_read() {
     }
 }
 
-/// A capture whose images, points and a mask lie elsewhere: they are as safe as those in its folder.
+/// A capture whose images, points and a mask are elsewhere: they are as safe as those in its folder.
 #[test]
 fn no_output_replaces_what_a_capture_reads_from_elsewhere() {
     let work = tempfile::tempdir().unwrap();
@@ -245,7 +245,7 @@ fn no_output_replaces_what_a_capture_reads_from_elsewhere() {
 }
 
 #[test]
-fn a_sequence_keeps_its_gaps_and_takes_over_no_tail() {
+fn a_sequence_keeps_its_gaps_and_removes_leftover_frames() {
     let work = tempfile::tempdir().unwrap();
     let at = |name: &str| work.path().join(name);
     for n in [1, 2, 4] {
@@ -269,7 +269,7 @@ fn a_sequence_keeps_its_gaps_and_takes_over_no_tail() {
 }
 
 #[test]
-fn the_machines_faults_are_one_and_the_users_two() {
+fn machine_errors_exit_with_1_and_user_errors_with_2() {
     let work = tempfile::tempdir().unwrap();
     let at = |name: &str| work.path().join(name);
     write_ply(&at("a.ply"), 0.0);

@@ -106,7 +106,7 @@ fn heard(begin: f64, seconds: f64, camera: u64) -> Vec<u8> {
 }
 
 #[test]
-fn videos_with_sound_become_a_capture_whose_clocks_were_heard() {
+fn videos_with_sound_are_synchronised_by_sound() {
     if std::process::Command::new("ffmpeg").arg("-version").output().is_err() {
         assert!(std::env::var_os("REQUIRE_FFMPEG").is_none(), "ffmpeg is missing");
         eprintln!("skipped: no ffmpeg");
@@ -192,7 +192,7 @@ fn a_calibration_places_cameras_and_clocks_are_found() {
         let mask = image::GrayImage::from_fn(200, 150, |_, y| image::Luma([if y < 37 { 0 } else { 255 }]));
         mask.save(at("masks").join(format!("{name}.png"))).unwrap();
     }
-    // The second dialect says the same to the last bit, so that nothing is solved again.
+    // The second dialect states the same to the last bit, so that nothing is solved again.
     let (take, masks) = (at("take"), at("masks"));
     for calibration in [at("calibration.toml"), bundled().join("capture.json")] {
         let args = ["import", str(&films), "-o", str(&take), "--calibration", str(&calibration)];
@@ -261,7 +261,7 @@ fn stand_in(folder: &Path, ends: &str) {
 
 #[cfg(unix)]
 #[test]
-fn colmap_is_called_where_it_is_asked_for_and_its_model_is_taken() {
+fn colmap_runs_on_request_and_its_model_is_used() {
     use splat4d::math::quat;
     /// Decimals of the model's text, and the unit that it is in.
     const EXACT: f64 = 1e-5;
@@ -269,7 +269,7 @@ fn colmap_is_called_where_it_is_asked_for_and_its_model_is_taken() {
     let dir = tempfile::tempdir().unwrap();
     let at = |name: &str| dir.path().join(name);
     let (films, take, program) = (at("films"), at("take"), at("program"));
-    // The model says where cameras are, and the user when: few frames are enough.
+    // The model states where cameras are, and the user when: few frames are enough.
     filmed_by(&CAMERAS, 4, &films);
     std::fs::create_dir_all(program.join("model")).unwrap();
     let (mut cameras, mut images) = (String::new(), String::new());

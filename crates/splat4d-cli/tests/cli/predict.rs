@@ -1,11 +1,11 @@
-//! `predict` on a tiny run that did not see the end of its take: what it leaves, what it says, what it refuses.
+//! `predict` on a tiny run that did not see the end of its take: what it leaves, what it states, what it refuses.
 
 use crate::sample::{Answer, Capture, splat4d};
 use crate::{TINY, json_of, str};
 use splat4d::format::{playback, scene};
 use std::path::{Path, PathBuf};
 
-/// Frames of the take, of which seven are seen with [`SHARE`].
+/// Frames of the capture, of which seven are seen with [`SHARE`].
 const FRAMES: usize = 10;
 const SHARE: &str = "0.75";
 

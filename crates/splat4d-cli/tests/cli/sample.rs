@@ -177,7 +177,7 @@ impl Call {
         self
     }
 
-    /// Programs are looked for in these folders alone.
+    /// Programs are searched for in these folders alone.
     #[cfg(unix)]
     pub(crate) fn path(self, folders: &str) -> Self {
         self.with("PATH", folders)

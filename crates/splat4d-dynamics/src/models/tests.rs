@@ -42,7 +42,7 @@ fn on_a_pendulum_linear_and_trained_models_are_three_times_better_than_a_straigh
 }
 
 #[test]
-fn nothing_that_stands_still_is_moved() {
+fn static_points_are_forecast_static() {
     let world = World::new("circle").unwrap();
     let paths = Paths::of_points(&vec![world.nodes(0); 40]);
     let size = paths.extent();

@@ -45,7 +45,7 @@ fn ticks() -> Vec<f64> {
 }
 
 #[test]
-fn nodes_are_on_what_moves_and_follow_it_though_no_gaussian_lasts() {
+fn nodes_follow_moving_regions_of_short_lived_gaussians() {
     for lives in [false, true] {
         let scene = scene(lives);
         let seen = observe(&scene, &ticks(), 12).unwrap();
@@ -71,7 +71,7 @@ fn nodes_are_on_what_moves_and_follow_it_though_no_gaussian_lasts() {
 }
 
 #[test]
-fn a_model_is_followed_into_its_own_future() {
+fn a_model_is_evaluated_after_its_clip() {
     let scene = scene(false);
     let seen = observe(&scene, &ticks(), 6).unwrap();
     let later: Vec<f64> = (15..=25).map(|i| f64::from(i) / FPS).collect();
@@ -81,7 +81,7 @@ fn a_model_is_followed_into_its_own_future() {
 }
 
 #[test]
-fn a_predicted_scene_is_the_scene_and_then_goes_on() {
+fn a_predicted_scene_equals_the_scene_and_then_continues() {
     let scene = scene(true);
     let seen = observe(&scene, &ticks(), 12).unwrap();
     let moments =

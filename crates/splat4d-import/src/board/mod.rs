@@ -93,7 +93,7 @@ impl FromStr for Board {
 pub(crate) struct Tag {
     /// Its number in its family.
     pub id: usize,
-    /// Pixels of the dark square's corners: from the first bit's on, as the hands of a clock go when the tag is looked at.
+    /// Pixels of the dark square's corners: from the first bit's on, as the hands of a clock go when the tag is examined.
     pub corners: [[f64; 2]; 4],
 }
 
@@ -182,7 +182,7 @@ struct Square {
 }
 
 impl Square {
-    /// (Heckbert 1989, "Fundamentals of texture mapping and image warping", section 2.2.3.) None: three of them lie on a line.
+    /// (Heckbert 1989, "Fundamentals of texture mapping and image warping", section 2.2.3.) None: three of them are on a line.
     fn new(&[a, b, c, d]: &[[f64; 2]; 4]) -> Option<Self> {
         let (e, f) = ([b[0] - c[0], b[1] - c[1]], [d[0] - c[0], d[1] - c[1]]);
         let sum = [a[0] - b[0] + c[0] - d[0], a[1] - b[1] + c[1] - d[1]];

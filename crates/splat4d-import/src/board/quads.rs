@@ -10,7 +10,7 @@ const TILE: usize = 4;
 const PLAIN: f32 = 0.04;
 /// Pixels of a tag's shorter side at least: two for each bit and border of the smallest family.
 const SMALLEST: f64 = 12.0;
-/// How far the outline may lie from the four edges, pixels and of the perimeter (OpenCV's polygons: 3 %).
+/// How far the outline may be from the four edges, pixels and of the perimeter (OpenCV's polygons: 3 %).
 const BENT: [f64; 2] = [1.5, 0.012];
 
 /// Corners of all such regions, as the hands of a clock go.
@@ -154,7 +154,7 @@ fn outline(members: &[usize], w: usize) -> Option<Vec<[f64; 2]>> {
     Some(out)
 }
 
-/// How far a point lies to the right of the line from a to b, pixels (y down: outside of corners that go like a clock is left).
+/// How far a point is to the right of the line from a to b, pixels (y down: outside of corners that go like a clock is left).
 fn beside(a: [f64; 2], b: [f64; 2], p: [f64; 2]) -> f64 {
     let d = [b[0] - a[0], b[1] - a[1]];
     (d[0] * (p[1] - a[1]) - d[1] * (p[0] - a[0])) / d[0].hypot(d[1]).max(1e-12)
@@ -235,7 +235,7 @@ fn laid(picture: &Planes<f32>, quad: &[[f64; 2]; 4]) -> Option<[[f64; 2]; 4]> {
     }
     let mut corners = [[0.0; 2]; 4];
     for (k, corner) in corners.iter_mut().enumerate() {
-        // Corner k lies between the edge before it and its own.
+        // Corner k is between the edge before it and its own.
         let (l, m) = (lines[(k + 3) % 4], lines[k]);
         let det = l[0] * m[1] - l[1] * m[0];
         if det.abs() < 1e-6 {

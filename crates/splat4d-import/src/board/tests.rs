@@ -122,7 +122,7 @@ fn the_same_number_twice_in_an_image_is_left_out() {
 }
 
 #[test]
-fn a_board_is_written_in_a_word() {
+fn a_board_is_parsed_from_one_word() {
     let board: Board = "36h11:0.16:floor".parse().expect("it is right");
     assert_eq!((board.family.name, board.side, board.lies), ("36h11", 0.16, Some(Lies::Floor)));
     assert_eq!("4x4: 0.03".parse::<Board>().expect("it is right").lies, None);
@@ -135,7 +135,7 @@ fn a_board_is_written_in_a_word() {
 }
 
 #[test]
-fn no_two_patterns_of_a_family_are_taken_for_each_other() {
+fn no_two_patterns_of_a_family_are_confused() {
     for family in FAMILIES {
         let codes = family.codes();
         let n = family.side;
@@ -159,7 +159,7 @@ fn no_two_patterns_of_a_family_are_taken_for_each_other() {
 }
 
 #[test]
-fn a_homography_takes_corners_to_corners() {
+fn a_homography_maps_corners_to_corners() {
     let corners = [[10.0, 12.0], [90.0, 20.0], [80.0, 95.0], [5.0, 70.0]];
     let square = Square::new(&corners).expect("it is one");
     for (unit, corner) in [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]].into_iter().zip(corners) {

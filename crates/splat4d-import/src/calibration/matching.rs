@@ -3,7 +3,7 @@
 use super::{Calibrated, Calibration, same_name};
 use splat4d::{Error, Result};
 
-/// A video that a camera is looked for.
+/// A video that a camera is searched for.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Video<'a> {
     /// Its name.

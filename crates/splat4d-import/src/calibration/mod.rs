@@ -45,7 +45,7 @@ pub struct Calibrated {
 /// The unit of a calibration's lengths.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Unit {
-    /// Metres, for the format says so.
+    /// Metres, for the format states so.
     Metre,
     /// Whatever it was made with.
     #[default]
@@ -73,7 +73,7 @@ struct Text {
     tree: Tree,
 }
 
-/// What a file says of a camera; two files may share what there is to say.
+/// What a file states of a camera; two files may share what there is to say.
 #[derive(Clone, Debug, Default)]
 struct Part {
     names: Vec<String>,
@@ -82,7 +82,7 @@ struct Part {
     pose: Option<Se3>,
 }
 
-/// What a file says.
+/// What a file states.
 #[derive(Default)]
 struct Said {
     parts: Vec<Part>,
@@ -103,9 +103,9 @@ struct Dialect {
 const DIALECTS: [Dialect; 5] =
     [qualisys::DIALECT, capture::DIALECT, transforms::DIALECT, easymocap::DIALECT, opencv::DIALECT];
 
-/// Longest file that is looked at, bytes: those of a hundred cameras have some hundred thousand.
+/// Longest file that is examined, bytes: those of a hundred cameras have some hundred thousand.
 const MAX_BYTES: u64 = 64 << 20;
-/// Files of a folder that are looked at, at most.
+/// Files of a folder that are examined, at most.
 const MAX_FILES: usize = 1000;
 
 /// Reads a calibration: a file, or a folder with one, with a file for each camera, or with a COLMAP reconstruction.
@@ -129,7 +129,7 @@ pub fn read(path: &Path) -> Result<Calibration> {
     for file in files {
         let text = match Text::read(&file) {
             Ok(text) => text,
-            // Other files may lie in the folder; a file that was named is meant.
+            // Other files may be in the folder; a file that was named is meant.
             Err(e) if there.is_dir() => {
                 refused.push(e.to_string());
                 continue;

@@ -437,7 +437,7 @@ fn transforms_captures_and_colmap_are_read_without_images() {
 }
 
 #[test]
-fn nothing_that_is_cut_off_or_changed_makes_it_panic() {
+fn truncated_and_mutated_calibrations_never_panic() {
     let truth = truth();
     let texts = [
         opencv_yaml(&truth[0]),
@@ -523,7 +523,7 @@ fn intrinsics_follow_the_size_and_other_shapes_are_refused() {
 }
 
 #[test]
-fn bars_and_padding_are_seen_through() {
+fn bars_and_padding_are_undone() {
     let camera = &truth()[0];
     let k = camera.intrinsics;
     // 1280x720 made to fit 1080 wide (607.5 high), in the middle of 640 pixels; stored at half the size.

@@ -18,7 +18,7 @@ const FRAMES: [f64; 2] = [0.01, 0.05];
 const CLIPPED: f64 = 0.6;
 /// Mean below which an image is too dark, of 255.
 const DARK: f64 = 20.0;
-/// How much larger steps across blocks are, of 255. Images of two takes that look sound have 0.9 to 1.4.
+/// How much larger steps across blocks are, of 255. Images of two recordings that look sound have 0.9 to 1.4.
 const BLOCKS: [f64; 2] = [2.5, 5.0];
 
 /// What a camera's own images say.

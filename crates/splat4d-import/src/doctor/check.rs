@@ -54,7 +54,7 @@ pub(super) fn all(
     }
 }
 
-/// Makes one finding of the same fault of most cameras: the worst one's, which says how many there are.
+/// Makes one finding of the same fault of most cameras: the worst one's, which states how many there are.
 fn gather(report: &mut Report, cameras: usize) {
     let mut out: Vec<Finding> = Vec::new();
     for f in std::mem::take(&mut report.findings) {
@@ -85,7 +85,7 @@ fn gather(report: &mut Report, cameras: usize) {
     }
 }
 
-/// What the whole rig says.
+/// What the whole rig states.
 fn take(capture: &Capture, seen: &[CameraObservations], report: &mut Report) {
     let fixed: Vec<usize> =
         (0..seen.len()).filter(|&c| capture.cameras[c].fixed && !seen[c].stands.is_empty()).collect();

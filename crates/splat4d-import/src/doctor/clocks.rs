@@ -22,7 +22,7 @@ pub(super) const SHUTTER: [f64; 2] = [0.004, 0.010];
 const SHUTTER_SIGMAS: f64 = 4.0;
 /// Neighbours with which a camera's clock is compared.
 const NEIGHBOURS: usize = 3;
-/// Frames that a clock is looked for within, and the part of those that were looked at: right lags are recognized by standing out of
+/// Frames that a clock is searched for within, and the part of those that were examined: right lags are recognized by standing out of
 /// many.
 const WITHIN: f64 = 10.0;
 const WITHIN_PART: f64 = 1.0 / 3.0;

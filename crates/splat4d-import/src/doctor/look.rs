@@ -1,4 +1,4 @@
-//! What is looked at of a camera: a few images over the take, and some in a row.
+//! What is examined of a camera: a few images over the recording, and some in a row.
 
 use super::Options;
 use crate::Result;
@@ -10,7 +10,7 @@ use splat4d::math::median_by;
 use splat4d::scene::{Camera, Planes};
 use splat4d_train::capture::{Capture, ImageStore, Rgb8};
 
-/// Images over the take whose median is the static background.
+/// Images over the recording whose median is the static background.
 const SPREAD: usize = 15;
 /// From so many on a median knows the static background.
 const MEDIAN_FROM: usize = 3;
@@ -38,7 +38,7 @@ pub(super) struct CameraObservations {
     /// Corners that move, by the camera's clock.
     pub(super) tracks: Vec<Track>,
     pub(super) clock: Clock,
-    /// Images that were looked at in a row.
+    /// Images that were examined in a row.
     pub(super) row: usize,
     /// Mean of 255 and detail of images in a row.
     pub(super) means: Vec<f64>,
@@ -49,9 +49,9 @@ pub(super) struct CameraObservations {
     pub(super) blocks: f64,
     /// Pixels that the background moved.
     pub(super) moved: Option<f64>,
-    /// Detail of the take's last third relative to its first.
+    /// Detail of the recording's last third relative to its first.
     pub(super) focus: Option<f64>,
-    /// The cells, row by row, in which something moves, of images evenly over the take.
+    /// The cells, row by row, in which something moves, of images evenly over the recording.
     pub(super) motion: Vec<Vec<bool>>,
     pub(super) sizes: Vec<[usize; 2]>,
 }
@@ -61,7 +61,7 @@ fn halvings(view: &Camera) -> u32 {
     (0..).find(|k| (view.width >> k) * (view.height >> k) <= PIXELS).unwrap_or(0)
 }
 
-/// The view of an image as it is looked at.
+/// The view of an image as it is examined.
 fn looked(view: &Camera) -> Camera {
     view.downscaled(1 << halvings(view))
 }

@@ -41,7 +41,7 @@ pub struct Finding {
     pub grade: Grade,
     /// Which check found it: a word that stays the same.
     pub check: &'static str,
-    /// The camera; none: the whole take.
+    /// The camera; none: the whole recording.
     pub camera: Option<String>,
     /// How much, in `unit`.
     pub amount: Option<f64>,
@@ -62,7 +62,7 @@ pub struct Finding {
 pub struct CameraReport {
     /// Its name.
     pub name: String,
-    /// Whether it stands still.
+    /// Whether it is static.
     pub fixed: bool,
     /// Distance of matches from their epipolar lines, pixels of an image 1920 wide.
     pub epipolar: Option<f64>,
@@ -74,7 +74,7 @@ pub struct CameraReport {
     pub sharpness: Option<f64>,
     /// Pixels (of 1920) that the background moved between the first and the last images.
     pub moved: Option<f64>,
-    /// Detail of the take's last third relative to its first.
+    /// Detail of the recording's last third relative to its first.
     pub focus: Option<f64>,
     /// Seconds from the first to the last row of an image, and their standard deviation.
     pub shutter: Option<[f64; 2]>,
@@ -107,7 +107,7 @@ pub struct PairReport {
     pub cameras: [String; 2],
     /// Features that both see.
     pub matches: usize,
-    /// How far those lie from their epipolar lines, pixels of an image 1920 wide.
+    /// How far those are from their epipolar lines, pixels of an image 1920 wide.
     pub epipolar: f64,
     /// Stops by which the second is brighter: red, green, blue.
     pub gain: [f64; 3],
@@ -165,7 +165,7 @@ impl Default for Options {
     }
 }
 
-/// Bytes of decoded images that are kept at once: each is looked at once or twice, so that more gains nothing.
+/// Bytes of decoded images that are kept at once: each is examined once or twice, so that more gains nothing.
 const STORE: usize = 64 << 20;
 
 /// Bytes of memory that the machine has, or less where it is a container that may take less; none: it does not report

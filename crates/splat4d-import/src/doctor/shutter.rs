@@ -34,7 +34,7 @@ struct Sighting {
 
 /// Seconds between the first and the last row of each camera's images with their standard deviations; None where too
 /// few
-/// tracks show. Shutters that all cameras share alike show less than their differences, which the deviation says.
+/// tracks show. Shutters that all cameras share alike show less than their differences, which the deviation states.
 ///
 /// Of one event the cameras a and b have the times t and s with `s − t = lag + r_a·ρ_a − r_b·ρ_b` (r: seconds over
 /// the image,

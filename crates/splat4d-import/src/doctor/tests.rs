@@ -1,4 +1,4 @@
-//! Each fault drawn once, and a clean take: a room of random spots that six cameras see, and balls that move in it.
+//! Each fault drawn once, and a clean recording: a room of random spots that six cameras see, and balls that move in it.
 
 use super::clocks::clocks;
 use super::look::{CameraObservations, Stand};
@@ -72,7 +72,7 @@ fn clean() -> &'static Clip {
     CLIP.get_or_init(|| (0..CAMERAS).map(|c| (0..FRAMES).map(|n| draw(&camera(c), n as f64 / FPS)).collect()).collect())
 }
 
-/// What the doctor says of these images, where the ill camera's pose is turned by so many radians about its own x axis.
+/// What the doctor states of these images, where the ill camera's pose is turned by so many radians about its own x axis.
 fn says(clip: &Clip, turned: f64, cameras: usize) -> Report {
     let folder = tempfile::tempdir().unwrap();
     let capture = write(folder.path(), clip, turned, cameras);
@@ -118,7 +118,7 @@ fn is_found(clip: &Clip, check: &str) {
     assert_eq!(found(&report, check), [format!("c{ILL}")], "{check}: {:#?}", report.findings);
 }
 
-/// The clean take, with the ill camera's frames changed by their numbers.
+/// The clean recording, with the ill camera's frames changed by their numbers.
 fn with(change: impl Fn(usize, &mut Rgb8)) -> Clip {
     let mut clip = clean().clone();
     clip[ILL].iter_mut().enumerate().for_each(|(n, p)| change(n, p));
@@ -149,7 +149,7 @@ fn blur(p: &mut Rgb8, reach: isize) {
 }
 
 #[test]
-fn a_clean_take_raises_nothing() {
+fn a_clean_capture_has_no_findings() {
     let report = says(clean(), 0.0, CAMERAS);
     let bad: Vec<_> = report.findings.iter().filter(|f| f.grade > Grade::Note).collect();
     assert!(bad.is_empty() && report.leave_out.is_empty(), "{bad:#?}");
@@ -459,7 +459,7 @@ fn training_that_does_not_fit_into_memory_is_reported() {
     assert_eq!(told(needed / 2), [Grade::Bad]);
 }
 
-/// The clean take with faults that are smaller than what is reported, each of them as large as the names of the checks say.
+/// The clean recording with faults that are smaller than what is reported, each of them as large as the names of the checks say.
 #[test]
 fn invisible_faults_are_not_reported() {
     let mut pushed = clean().clone();

@@ -100,7 +100,7 @@ mod tests {
     use std::cell::Cell;
 
     #[test]
-    fn what_is_made_of_the_same_is_made_once() {
+    fn equal_inputs_are_computed_once() {
         let dir = tempfile::tempdir().unwrap();
         let cache = Cache::of(dir.path());
         let made = Cell::new(0);
@@ -125,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pair_is_known_whoever_else_is_there() {
+    fn a_cached_pair_is_reused_with_other_cameras_present() {
         let dir = tempfile::tempdir().unwrap();
         let cache = Cache::of(dir.path());
         let asked = Cell::new(0);

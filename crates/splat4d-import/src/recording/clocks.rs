@@ -74,11 +74,11 @@ fn heard(
     Ok(pairs.par_iter().map(of).collect())
 }
 
-/// What motion says.
+/// What motion states.
 pub(super) struct Guessed {
     /// Lags that are guessed.
     pub evidence: Vec<Evidence>,
-    /// Whether anything moves in two cameras, one of them open, as far as a short take shows: then clocks matter.
+    /// Whether anything moves in two cameras, one of them open, as far as a short recording shows: then clocks matter.
     pub moves: bool,
 }
 

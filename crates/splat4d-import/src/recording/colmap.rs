@@ -62,7 +62,7 @@ const STEPS: [Step; 3] = [
     },
 ];
 
-/// Lenses and places of all cameras. The work lies in `import/colmap` of the capture's folder, and is not done again
+/// Lenses and places of all cameras. The work is in `import/colmap` of the capture's folder, and is not done again
 /// where images
 /// and masks are the same.
 ///
@@ -97,7 +97,7 @@ pub(super) fn calibrate(
     Ok(found)
 }
 
-/// What each step says that it knows. Errors: the program is not there.
+/// What each step states that it knows. Errors: the program is not there.
 fn helps() -> Result<Vec<String>> {
     let help = |step: &Step| {
         let out = Command::new(PROGRAM).args([step.name, "--help"]).stdin(Stdio::null()).output();

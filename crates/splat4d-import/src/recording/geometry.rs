@@ -13,7 +13,7 @@ use splat4d_train::event::Progress;
 
 /// Frames in a row in which corners are followed.
 const WINDOW: usize = 90;
-/// Part of them that a clock is looked for within: right lags are recognized by standing out of many.
+/// Part of them that a clock is searched for within: right lags are recognized by standing out of many.
 const WITHIN: f64 = 1.0 / 3.0;
 /// Corners of a camera that are followed, as the doctor has them.
 const TRACKS: usize = 60;
@@ -29,7 +29,7 @@ struct StandingCamera {
     frames: usize,
 }
 
-/// Lags of neighbouring cameras. `clock` says about where to look.
+/// Lags of neighbouring cameras. `clock` states about where to look.
 pub(super) fn by_geometry(
     stored: &Stored<'_>,
     clock: &Solution,

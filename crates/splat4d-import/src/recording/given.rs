@@ -1,4 +1,4 @@
-//! A calibration that was given: whose camera is whose, and what it says of stored images.
+//! A calibration that was given: whose camera is whose, and what it states of stored images.
 
 use super::{Camera, Request};
 use crate::calibration::{self, Calibrated, Calibration, Shape, Unit, Video};
@@ -71,7 +71,7 @@ impl Given {
     }
 }
 
-/// Images of a camera in which bars are looked for.
+/// Images of a camera in which bars are searched for.
 const LOOKS: usize = 3;
 
 /// What is known of every camera's stored images: by calibration, and by the user's own lens, which goes first.
@@ -107,7 +107,7 @@ pub(super) fn known(
     Ok(out)
 }
 
-/// Some grey images of a camera, spread over the take.
+/// Some grey images of a camera, spread over the recording.
 fn some(folder: &Path, pictures: &Pictures) -> Result<Vec<Planes<f32>>> {
     let count = pictures.shots.len();
     let look = |k: usize| {

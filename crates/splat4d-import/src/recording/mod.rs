@@ -33,13 +33,13 @@ use crate::{Error, ErrorKind, Result};
 use splat4d_train::event::Progress;
 use std::path::{Path, PathBuf};
 
-/// Whether cameras stand still.
+/// Whether cameras are static.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Rig {
     /// One video is of a moving camera, several are of fixed ones.
     #[default]
     Auto,
-    /// Every camera stands still.
+    /// Every camera is static.
     Fixed,
     /// Every camera moves.
     Moving,
@@ -58,7 +58,7 @@ pub struct Request {
     pub crop: Option<Cropping>,
     /// Frames per second of folders of images.
     pub fps: f64,
-    /// Whether cameras stand still.
+    /// Whether cameras are static.
     pub rig: Rig,
     /// Whether sound is used.
     pub sound: bool,
@@ -118,7 +118,7 @@ const PLACED_WARN: f64 = 0.9;
 /// Points below which a reconstruction hangs on too little: a chessboard's.
 const FEW_POINTS: usize = 50;
 
-/// Pixels of 1920 that what a camera shows may lie from where the calibration says: a rig that was pushed or
+/// Pixels of 1920 that what a camera shows may be from where the calibration states: a rig that was pushed or
 /// focussed again is off
 /// by more, and rigs that people work with by 1 or 2.
 const CONTRADICTS: f64 = 5.0;

@@ -24,7 +24,7 @@ const MOVING_POINTS: usize = 20;
 const BY_GEOMETRY: f64 = 0.06;
 /// Where sound determines a clock, geometry contradicts it from so many frames on.
 const CONTRADICTS: f64 = 1.0;
-/// Of points that stand still training starts; where there are fewer, of all.
+/// Of points that are static training starts; where there are fewer, of all.
 const ENOUGH_STILL: usize = 200;
 
 /// A camera that could be placed.

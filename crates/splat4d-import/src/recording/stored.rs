@@ -56,7 +56,7 @@ impl<'a> Stored<'a> {
 
     /// The static background: the median of some frames, each made into what is worked with.
     pub(super) fn median(&self, camera: usize, made: impl Fn(Rgb8) -> Rgb8 + Sync) -> Result<Rgb8> {
-        /// Frames over the take.
+        /// Frames over the recording.
         const SPREAD: usize = 15;
         let count = self.pictures[camera].shots.len();
         let kept = count.min(SPREAD);

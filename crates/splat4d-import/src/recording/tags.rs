@@ -15,13 +15,13 @@ use splat4d_train::event::Progress;
 use splat4d_train::vision::raster::grey;
 use splat4d_train::vision::triangulate::{PixelObservation, angle_at, triangulate};
 
-/// Times at which fixed cameras look for tags, and frames in which a moving one does.
+/// Times at which fixed cameras search for tags, and frames in which a moving one does.
 const MOMENTS: usize = 12;
 /// A frame farther from a time than so much of an interval does not show it.
 const NEAR: f64 = 0.5;
 /// Degrees between two cameras that see a corner, at least: the placing of points goes by the same.
 const ANGLE: f64 = 1.5;
-/// Pixels of 1920 that a corner may lie off its place.
+/// Pixels of 1920 that a corner may be off its place.
 const OFF: f64 = 3.0;
 /// Of the side, by which a tag's four sides may differ from their mean.
 const UNEQUAL: f64 = 0.1;
@@ -59,7 +59,7 @@ impl TagWorld {
 struct TagView {
     camera: Camera,
     tag: Tag,
-    /// Pixels that a corner may lie off.
+    /// Pixels that a corner may be off.
     tolerance: f64,
 }
 

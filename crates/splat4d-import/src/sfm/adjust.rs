@@ -35,7 +35,7 @@ pub(crate) struct Sighting {
     pub point: usize,
     /// Where, pixels.
     pub pixel: [f64; 2],
-    /// How it moves, pixels a second; zero: it stands still.
+    /// How it moves, pixels a second; zero: it is static.
     pub velocity: [f64; 2],
 }
 
@@ -127,7 +127,7 @@ const POSE: usize = 7;
 const LENS: usize = 4;
 /// Numbers that a sighting depends on, without the point's.
 const BOTH: usize = POSE + LENS;
-/// Squared distance of a sighting whose point lies behind its camera, pixels²: as if it were seen far outside.
+/// Squared distance of a sighting whose point is behind its camera, pixels²: as if it were seen far outside.
 const BEHIND: f64 = 1e8;
 /// Parts in which points are summed up; fixed, so that the order of sums never depends on the machine.
 const PARTS: usize = 4;

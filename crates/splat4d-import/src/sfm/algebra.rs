@@ -36,7 +36,7 @@ pub(crate) fn roots(p: &[f64]) -> Vec<f64> {
     if p.len() == 2 {
         return vec![-p[0] / p[1]];
     }
-    // All roots lie within (Cauchy's bound).
+    // All roots are within (Cauchy's bound).
     let lead = p[p.len() - 1].abs();
     let bound = 1.0 + p[..p.len() - 1].iter().fold(0.0f64, |m, c| m.max(c.abs())) / lead;
     let slope = derivative(&p);
@@ -235,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn null_space_and_singular_values_do_what_they_say() {
+    fn null_space_and_singular_values_satisfy_their_definitions() {
         let rng = Rng::new(1, "algebra", 0);
         let rows: Vec<[f64; 9]> = (0..5).map(|i| std::array::from_fn(|k| rng.normal((9 * i + k) as u64))).collect();
         let null = null_space(&rows);

@@ -40,9 +40,9 @@ const FINE: f64 = 0.05;
 const BIN: f64 = 0.03;
 /// Points farther from the middle than so many medians are left out.
 const FAR: f64 = 3.0;
-/// Points that are looked at, at most, evenly chosen.
+/// Points that are examined, at most, evenly chosen.
 const MOST: usize = 3000;
-/// Of fewer points no frame is looked for.
+/// Of fewer points no frame is searched for.
 const FEWEST: usize = 60;
 /// Degrees off an upright frame at which entropy must have grown by [`CLEAR`] in every direction.
 const PROBE: f64 = 12.0;
@@ -51,7 +51,7 @@ const PROBE: f64 = 12.0;
 const CLEAR: f64 = 0.15;
 
 /// The frame whose three projections of the points have the least entropy, near to `up`: points of walls and floor then fall
-/// together. With `fixed`, `up` stays as it is and the heading alone is looked for.
+/// together. With `fixed`, `up` stays as it is and the heading alone is searched for.
 ///
 /// (Entropy of projections as a measure of structure: Huber 1985, "Projection pursuit"; aligned with a room's axes in Coughlan
 /// and Yuille's "Manhattan world", 1999.)
@@ -143,7 +143,7 @@ fn rotation(by: [f64; 3]) -> Mat3 {
     std::array::from_fn(|i| std::array::from_fn(|j| columns[j][i]))
 }
 
-/// Points about their middle without those that lie far out, and the width of a bin; none of too few.
+/// Points about their middle without those that are far out, and the width of a bin; none of too few.
 fn gathered(points: &[[f64; 3]]) -> Option<(Vec<[f64; 3]>, f64)> {
     if points.len() < FEWEST {
         return None;
@@ -163,7 +163,7 @@ fn gathered(points: &[[f64; 3]]) -> Option<(Vec<[f64; 3]>, f64)> {
     (median > 0.0 && median.is_finite()).then_some((chosen, BIN * median))
 }
 
-/// The entropy of the points' three projections, nats; each point is shared by the two bins that it lies between.
+/// The entropy of the points' three projections, nats; each point is shared by the two bins that it is between.
 fn entropy(points: &[[f64; 3]], frame: &Mat3, bin: f64) -> f64 {
     let half = (FAR / BIN).ceil() as usize + 1;
     let mut bins = vec![[0.0f64; 3]; 2 * half + 2];
@@ -179,7 +179,7 @@ fn entropy(points: &[[f64; 3]], frame: &Mat3, bin: f64) -> f64 {
     bins.iter().flatten().filter(|n| **n > 0.0).map(|n| -(n / count) * (n / count).ln()).sum()
 }
 
-/// How high a floor lies along `up`: the lowest height at which many points lie, with hardly any below.
+/// How high a floor is along `up`: the lowest height at which many points lie, with hardly any below.
 ///
 /// None: no such height.
 pub(crate) fn floor(points: &[[f64; 3]], up: [f64; 3]) -> Option<f64> {
@@ -204,7 +204,7 @@ mod tests {
     use splat4d::math::Rng;
 
     #[test]
-    fn cameras_that_were_held_upright_tell_which_way_is_up() {
+    fn upright_cameras_determine_the_up_direction() {
         let place = |k: usize| [k as f64, (k * k % 5) as f64, (3 * k % 7) as f64];
         let poses: Vec<Se3> = (0..6).map(|k| Se3::look_at(place(k), [2.0, 9.0, 4.0], [0.0, 0.0, 1.0])).collect();
         let up = up_of(&poses);
@@ -252,7 +252,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cloud_without_walls_keeps_what_cameras_hold_upwards() {
+    fn without_walls_the_up_direction_of_cameras_is_kept() {
         let rng = Rng::new(5, "cloud", 0);
         let points: Vec<[f64; 3]> = (0..800).map(|k| std::array::from_fn(|j| rng.normal(3 * k + j as u64))).collect();
         let up = normalize([0.2, 0.9, -0.3]);

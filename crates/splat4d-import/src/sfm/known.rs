@@ -69,9 +69,9 @@ impl Straight {
 /// Points and clocks of cameras whose poses and lenses are given. `links` were found without them, and measure their
 /// errors.
 ///
-/// What moves lies next to its epipolar lines as long as clocks are off: first clocks are found of what looks alike,
+/// What moves is next to its epipolar lines as long as clocks are off: first clocks are found of what looks alike,
 /// within wide
-/// bounds; then points of what lies on the lines, which it does at any clock, so that they determine none.
+/// bounds; then points of what is on the lines, which it is at any clock, so that they determine none.
 pub(crate) fn about(sights: &[CameraView], links: &[Link], how: &Mapping, progress: &mut Progress<'_>) -> Mapped {
     /// Of the tolerance: two frames of what is followed at all, in images 1920 across.
     const WIDE: f64 = 8.0;
@@ -118,7 +118,7 @@ const QUARTILE_TO_MEDIAN: f64 = 2.117;
 const AGREE: usize = 2;
 const TELL: usize = 3;
 
-/// How far what each camera shows lies from where the given poses say, pixels of the files' images.
+/// How far what each camera shows is from where the given poses say, pixels of the files' images.
 ///
 /// Links must have been found without these poses. Distances are epipolar, as the doctor takes them: the lower quartile of a
 /// pair, as the median that it implies, for chance matches only add large ones; of a camera the second least of its pairs.

@@ -51,7 +51,7 @@ impl Default for Mapping {
 pub(crate) const FOCALS: [f64; 12] = [0.6, 0.66, 0.72, 0.79, 0.86, 0.94, 1.03, 1.12, 1.22, 1.33, 1.45, 1.6];
 /// Median angle of a pair to start with, degrees.
 const START_ANGLE: f64 = 8.0;
-/// Links, those of most matches, among which it is looked for.
+/// Links, those of most matches, among which it is searched for.
 const START_AMONG: usize = 40;
 /// Known points that a camera must see, and must see where they are.
 const SEES: usize = 15;
@@ -73,7 +73,7 @@ const GROWTH: f64 = 1.08;
 const GUESSED: f64 = 0.3;
 const TOLD: f64 = 0.1;
 const CLOCK: f64 = 2.0;
-/// Epipolar distance of matches that are looked for once cameras are placed, of the tolerance.
+/// Epipolar distance of matches that are searched for once cameras are placed, of the tolerance.
 const GUIDED_WITHIN: f64 = 0.5;
 /// Lenses whose focal lengths are found to differ by no more than this share are taken for equal ones, from so many on; they then
 /// differ by this share (standard deviation). Of two phones of one model focal lengths differ by some tenths of a per cent.
@@ -486,7 +486,7 @@ impl Map<'_> {
         self.shows[sight].iter().filter_map(known).collect()
     }
 
-    /// Places a sight; says why where it cannot be.
+    /// Places a sight; states why where it cannot be.
     fn place(&mut self, sight: usize) -> bool {
         let known = self.known(sight);
         if known.len() < SEES {
@@ -607,7 +607,7 @@ impl Map<'_> {
         Some(tracks::Known { camera, pixels: self.sights[sight].features.iter().map(straight).collect() })
     }
 
-    /// Matches of placed cameras along epipolar lines, and those of `links` that lie on them.
+    /// Matches of placed cameras along epipolar lines, and those of `links` that are on them.
     pub(super) fn guided(&self, links: &[Link], progress: &mut Progress<'_>) -> Vec<Link> {
         let known: Vec<Option<tracks::Known>> =
             (0..self.sights.len()).into_par_iter().map(|s| self.stands(s)).collect();

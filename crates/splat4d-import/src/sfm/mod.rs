@@ -77,7 +77,7 @@ pub struct Point {
     pub place: [f64; 3],
     /// sRGB.
     pub color: [u8; 3],
-    /// 0: it stands still; otherwise the time it was seen at.
+    /// 0: it is static; otherwise the time it was seen at.
     pub moment: usize,
     /// Images that see it, by their place in [`Solution::taken`].
     pub seen: Vec<usize>,
@@ -96,12 +96,12 @@ pub struct Solution {
     pub up: [f64; 3],
     /// Pairs of images that were found to show one scene.
     pub pairs: usize,
-    /// For each camera whose place was known, how far what it shows lies from where that says: epipolar distance of matches that
+    /// For each camera whose place was known, how far what it shows is from where that states: epipolar distance of matches that
     /// were found without it, at the median, pixels of the files' images. None: too few matches.
     pub contradiction: Vec<Option<f64>>,
     /// Of each of [`Solution::taken`], the points that move by which its clock was found.
     pub moving: Vec<usize>,
-    /// Of each of them, whether motion in it contradicts the others: it shows another time, or another take.
+    /// Of each of them, whether motion in it contradicts the others: it shows another time, or another recording.
     pub stray: Vec<bool>,
 }
 

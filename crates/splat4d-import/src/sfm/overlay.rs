@@ -176,7 +176,7 @@ pub(super) fn aligned(x: [f64; 3], seen: &[ImagePoint<'_>], more: &[ImagePoint<'
     out
 }
 
-/// How pixels about a point in one image lie in another one, if it stands on a plane with this normal.
+/// How pixels about a point in one image are in another one, if it stands on a plane with this normal.
 fn warp(x: [f64; 3], normal: [f64; 3], from: &ImagePoint<'_>, to: &ImagePoint<'_>) -> Option<[[f64; 2]; 2]> {
     /// Pixels over which the slope is taken.
     const STEP: f64 = 2.0;
@@ -341,7 +341,7 @@ mod tests {
     }
 
     #[test]
-    fn the_speed_of_a_point_is_what_its_pixels_say() {
+    fn the_speed_of_a_point_follows_from_its_pixels() {
         let lens = Lens::plain(150.0, 160, 120);
         let poses = [[-0.9, -0.2, -2.0], [0.8, 0.3, -1.9]].map(|e| Se3::look_at(e, [0.0; 3], [0.0, -1.0, 0.0]));
         let eyes = poses.each_ref().map(|pose| Eye { lens: &lens, pose });

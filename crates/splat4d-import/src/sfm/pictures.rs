@@ -49,7 +49,7 @@ pub struct Feature {
     pub pixel: [f64; 2],
     /// Pixels a second; zero for the static background.
     pub velocity: [f64; 2],
-    /// 0: it stands still; otherwise which of the shared times it was seen at, from 1. Those of different times are
+    /// 0: it is static; otherwise which of the shared times it was seen at, from 1. Those of different times are
     /// never the same.
     pub moment: usize,
     /// What it looks like.
@@ -119,7 +119,7 @@ const MOVED: f32 = 0.06;
 const MOVED_BLUR: f64 = 1.0;
 /// A frame farther from a time than this many frames does not show it.
 const TOO_FAR: f64 = 1.0;
-/// Features that move more slowly than this stand still as far as clocks are concerned, pixels a frame.
+/// Features that move more slowly than this are static as far as clocks are concerned, pixels a frame.
 const FASTEST: f64 = 40.0;
 
 /// An image at the size that is worked with, and how many of the file's pixels are one of its.
@@ -353,7 +353,7 @@ impl Window {
     }
 }
 
-/// Features of what moves in a frame, each with its velocity; brought to the time of the time, which may lie next
+/// Features of what moves in a frame, each with its velocity; brought to the shared time, which may be next
 /// to the
 /// frame's. And what they are from.
 fn moving(

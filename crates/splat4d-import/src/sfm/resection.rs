@@ -88,7 +88,7 @@ struct Resection<'a> {
     known: &'a [Known],
     rays: Vec<[f64; 3]>,
     lens: Lens,
-    /// Whether the focal length is looked for too.
+    /// Whether the focal length is searched for too.
     free: bool,
 }
 

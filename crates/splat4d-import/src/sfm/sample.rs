@@ -3,9 +3,9 @@
 
 use splat4d::math::Rng;
 
-/// What a model is looked for in.
+/// What a model is searched for in.
 pub(crate) trait Data {
-    /// What is looked for.
+    /// What is searched for.
     type Model: Clone;
     /// Data that a model is made of.
     const SAMPLE: usize;

@@ -170,7 +170,7 @@ fn lenses_that_are_given_stay_while_poses_are_found() {
 }
 
 #[test]
-fn equal_lenses_are_taken_for_equal_and_others_are_not() {
+fn equal_lenses_share_parameters_and_others_do_not() {
     for (spread, within) in [(0.0, 0.003), (0.02, 0.01)] {
         let rig = rig(7, 600, 0.3, 0.2, spread);
         let mut silent = |_: &_| {};
@@ -187,7 +187,7 @@ fn equal_lenses_are_taken_for_equal_and_others_are_not() {
 }
 
 #[test]
-fn a_camera_of_another_scene_is_left_out_and_says_why() {
+fn a_camera_of_another_scene_is_left_out_with_a_reason() {
     let mut rig = rig(4, 260, 0.3, 0.1, 0.08);
     let rng = Rng::new(5, "elsewhere", 0);
     for (k, f) in rig.sights[2].features.iter_mut().enumerate() {
@@ -208,7 +208,7 @@ fn a_camera_of_another_scene_is_left_out_and_says_why() {
 }
 
 #[test]
-fn a_camera_that_films_another_time_is_known_by_what_moves() {
+fn an_unsynchronised_camera_is_recognised_by_moving_features() {
     let mut rig = rig(5, 700, 0.3, 0.1, 0.0);
     let who: Vec<_> = (0..5).map(|c| (c, None)).collect();
     let strays = |rig: &Rig| {
@@ -298,7 +298,7 @@ fn what_moves_is_seen_at_times_with_its_velocity() {
     assert!(still > 40 && moving.len() > 20, "{still} {}", moving.len());
     let near = |f: &Feature, speed: f64| (f.velocity[0] - speed).hypot(f.velocity[1]) < 8.0;
     let share = |speed: f64| moving.iter().filter(|f| near(f, speed)).count() as f64 / moving.len() as f64;
-    // The rest lies on the patch's border, where windows hold some of the wall.
+    // The rest is on the patch's border, where windows hold some of the wall.
     assert!(share(240.0) > 0.65, "{}", share(240.0));
     assert_eq!(sights[0].shown.iter().filter(|w| w.is_some()).count(), 4);
 }

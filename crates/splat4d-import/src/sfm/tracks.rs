@@ -180,7 +180,7 @@ pub(crate) struct Known {
     pub pixels: Vec<[f64; 2]>,
 }
 
-/// Second-best matches are looked for along the epipolar line alone, where there are few: they must be farther away.
+/// Second-best matches are searched for along the epipolar line alone, where there are few: they must be farther away.
 const GUIDED_RATIO: f32 = 0.75;
 /// What is alone on its line must be as good as if something quite unlike stood next to it: squared distance of
 /// descriptors, an

@@ -61,7 +61,7 @@ fn seven(sample: &[Pair]) -> Vec<Mat3> {
         .collect()
 }
 
-/// Pairs in which a fundamental matrix is looked for, about the images' middles and in units of their size, so that the
+/// Pairs in which a fundamental matrix is searched for, about the images' middles and in units of their size, so that the
 /// system is well conditioned (Hartley 1997).
 struct Uncalibrated<'a> {
     pairs: &'a [Pair],
@@ -273,7 +273,7 @@ pub(crate) fn parallax(motion: &Se3, &[a, b]: &Pair) -> f64 {
     norm(cross(a, b)).atan2(dot(a, b))
 }
 
-/// Pairs of rays in which an essential matrix is looked for.
+/// Pairs of rays in which an essential matrix is searched for.
 struct Calibrated<'a> {
     rays: &'a [Pair],
     focal: f64,
@@ -352,7 +352,7 @@ pub(crate) fn polish_motion(start: &Se3, rays: &[Pair]) -> Se3 {
 pub(crate) struct Relative {
     /// From the first camera's axes to the second's; the translation has length one.
     pub motion: Se3,
-    /// Pairs that agree and lie before both cameras, ascending.
+    /// Pairs that agree and are before both cameras, ascending.
     pub inliers: Vec<usize>,
     /// The median angle between their rays, radians.
     pub angle: f64,

@@ -47,7 +47,7 @@ impl Rig {
         Self { cameras: (0..offsets.len()).map(camera).collect(), offsets: offsets.to_vec(), dance, lights, seed: 5 }
     }
 
-    /// The same rig in another take.
+    /// The same rig in another recording.
     pub(super) fn other_take(mut self) -> Self {
         self.seed += 1;
         self

@@ -1,4 +1,4 @@
-//! Lags by geometry: what moves lies on the epipolar line of where the other camera saw it at the same time, and leaves the
+//! Lags by geometry: what moves is on the epipolar line of where the other camera saw it at the same time, and leaves the
 //! line at any other.
 
 use super::tracks::Track;
@@ -323,7 +323,7 @@ impl Problem<'_> {
         for &(t, x) in &m.places {
             let at = |l: f64| self.b[m.pair[1]].smooth(t + l).map(|y| sampson(self.f, x, y));
             let (Some(before), Some(now), Some(after)) = (at(lag - step), at(lag), at(lag + step)) else { continue };
-            // Cauchy's weight: what lies far off says little.
+            // Cauchy's weight: what is far off states little.
             let weight = 1.0 / (1.0 + (now / scale).powi(2));
             let speed = (after - before) / (2.0 * step);
             pull += weight * now * speed;

@@ -26,7 +26,7 @@ pub(crate) enum Refusal {
     Silent,
     /// Nothing moves.
     Still,
-    /// Nothing agrees better at one lag than at others: other takes, or nothing in common.
+    /// Nothing agrees better at one lag than at others: other recordings, or nothing in common.
     Unrelated,
     /// Several lags agree alike: what moves or sounds repeats itself. The two best, seconds.
     Repeating([f64; 2]),

@@ -1,4 +1,4 @@
-//! Lags by sound: the beginnings of sounds over the whole take, then the waveform.
+//! Lags by sound: the beginnings of sounds over the whole recording, then the waveform.
 
 use super::fft::{Complex, Fft, correlate, times};
 use super::{NORMAL_MAD, Refusal, median, parabola};
@@ -12,7 +12,7 @@ const ENVELOPE_WINDOW: usize = 256;
 const BANDS: [f64; 5] = [150.0, 640.0, 1420.0, 2680.0, 4700.0];
 /// A band's silence, relative to its mean energy: what is below is no onset.
 const FLOOR: f64 = 1e-3;
-/// Lags that are looked at closely: the coarse search may prefer a neighbour of the right one.
+/// Lags that are examined closely: the coarse search may prefer a neighbour of the right one.
 const CANDIDATES: usize = 4;
 /// Candidates are so many seconds apart.
 const CANDIDATE_GAP: f64 = 0.05;
@@ -257,7 +257,7 @@ fn fine(a: &SoundTrack, b: &SoundTrack, coarse: f64) -> Result<SoundLag, Refusal
     })
 }
 
-/// What a window says.
+/// What a window states.
 struct Window {
     /// Its middle, on a's clock.
     at: f64,

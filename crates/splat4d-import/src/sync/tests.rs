@@ -76,7 +76,7 @@ fn sounds_without_anything_in_common_are_refused() {
 }
 
 #[test]
-fn clocks_that_drift_are_seen_in_long_takes() {
+fn drifting_clocks_are_detected_in_long_recordings() {
     let drift = 60e-6;
     let (a, b) = (heard(1, 90.0, 0.5, 0.0, 0.3, 0), heard(1, 90.0, 0.7, drift, 0.3, 1));
     let found = sound::lag(&a, &b, None).unwrap();
@@ -105,7 +105,7 @@ fn motion_suggests_the_lag_to_a_frame() {
 }
 
 #[test]
-fn motion_that_repeats_itself_suggests_nothing() {
+fn periodic_motion_gives_no_time_offset() {
     let rig = Rig::new(&[0.0, 3.0 * FRAME], 25, Dance::Loop);
     let [a, b] = [0, 1].map(|c| motion(&rig, c, 100));
     assert!(matches!(motion::lag(&a, &b, None), Err(Refusal::Repeating(_))), "{:?}", motion::lag(&a, &b, None));
@@ -167,7 +167,7 @@ fn geometry_without_evidence_is_refused() {
 }
 
 #[test]
-fn motion_along_the_epipolar_lines_says_nothing() {
+fn motion_along_epipolar_lines_gives_no_time_offset() {
     // Cameras side by side, and everything moves sideways.
     let f = [[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]];
     let track = |k: usize, shift: f64| Track {
@@ -261,7 +261,7 @@ fn the_trusted_kind_wins_and_guesses_come_last() {
 }
 
 #[test]
-fn two_witnesses_that_contradict_each_other_are_not_averaged() {
+fn contradicting_offsets_are_not_averaged() {
     let geometry = Evidence { cameras: [0, 1], lag: 0.1, sigma: 2e-3, drift: None, kind: Kind::Geometry };
     let sound = Evidence { lag: 0.4, sigma: 1e-3, kind: Kind::Sound, ..geometry.clone() };
     for evidence in [[geometry.clone(), sound.clone()], [sound, geometry]] {

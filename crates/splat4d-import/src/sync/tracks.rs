@@ -379,7 +379,7 @@ mod tests {
     }
 
     #[test]
-    fn corners_lie_where_they_are_wanted_and_apart() {
+    fn corners_are_in_the_requested_region_and_apart() {
         let still = picture([0.0; 2], 1.0);
         let left: Vec<bool> = (0..still.data.len()).map(|i| i % still.width < 48).collect();
         let found = corners(&still, Some(&left), 100, 9.0, &[[20.0, 20.0]]);
@@ -403,7 +403,7 @@ mod tests {
     }
 
     #[test]
-    fn tracks_last_and_tell_where_they_were_between_frames() {
+    fn tracks_persist_and_interpolate_between_frames() {
         let mut tracker = Tracker::new(30, 6.0);
         for k in 0..6 {
             let t = f64::from(k);

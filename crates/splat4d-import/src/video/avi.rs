@@ -299,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn anything_else_asks_for_ffmpeg() {
+    fn other_formats_require_ffmpeg() {
         for bytes in [&b"RIFFxxxxWAVE"[..], b"\0\0\0\x18ftypmp42 and so on"] {
             let error = open(bytes).err().unwrap().to_string();
             assert!(error.contains("no ffmpeg") && error.contains("film.avi"), "{error}");

@@ -7,7 +7,7 @@ use super::{Frame, Info, Reader, SOUND_RATE, Selection, Source, fnv1a, open};
 use splat4d::{Error, Result};
 use std::path::{Path, PathBuf};
 
-/// A part of this many frame intervals at a chapter's end is not looked for: rounding decides whether a frame lies in it.
+/// A part of this many frame intervals at a chapter's end is not searched for: rounding decides whether a frame is in it.
 const END_FRAMES: f64 = 2.0;
 
 /// Which part of which recording a file is, by its name.
@@ -118,7 +118,7 @@ impl Joined {
         (!after && !before).then(|| Selection {
             every: 1,
             from: selection.from.map(|from| from - start).filter(|from| *from > 0.0),
-            // A part's last frames may lie behind its end by rounding.
+            // A part's last frames may be behind its end by rounding.
             to: selection.to.filter(|to| *to < end).map(|to| to - start),
             ..selection.clone()
         })

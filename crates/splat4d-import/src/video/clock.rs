@@ -122,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn an_even_clock_is_not_blamed() {
+    fn an_even_clock_has_no_finding() {
         // Times in whole milliseconds, as Matroska has them.
         let even: Vec<f64> = (0..90).map(|i| (f64::from(i) / 29.97 * 1000.0).round() / 1000.0).collect();
         let clock = Clock::of(&even, &(1..90).map(|i| (i, 2.0)).collect::<Vec<_>>());

@@ -5,7 +5,7 @@ use crate::calibration::bars;
 use splat4d::scene::Planes;
 use splat4d::{Error, Result};
 
-/// Frames in which black bars are looked for: dark content is dark in all of them hardly ever.
+/// Frames in which black bars are searched for: dark content is dark in all of them hardly ever.
 const LOOKED_AT: usize = 12;
 /// Pixels next to a bar that codecs mix with it; they are cut off too.
 const MIXED: usize = 2;
@@ -28,7 +28,7 @@ pub struct Crop {
 }
 
 impl Crop {
-    /// An error unless it lies in an image of this size.
+    /// An error unless it is in an image of this size.
     pub(super) fn check(&self, [width, height]: [usize; 2]) -> Result<()> {
         let inside = |from: usize, length: usize, most: usize| {
             length > 0 && from.checked_add(length).is_some_and(|end| end <= most)
@@ -105,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rectangle_must_lie_in_the_image_and_is_cut_out() {
+    fn a_rectangle_inside_the_image_is_cropped_and_others_refused() {
         let crop = Crop { width: 2, height: 1, x: 1, y: 1 };
         assert!(crop.check([3, 2]).is_ok());
         assert_eq!(crop.of(&[0, 1, 2, 3, 4, 5], 3, 1), [4, 5]);

@@ -138,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn a_high_dynamic_range_is_mapped_or_owned_up_to() {
+    fn a_high_dynamic_range_is_mapped_or_reported() {
         let mut hlg = info();
         hlg.color.transfer = Transfer::Hlg;
         let with = chain(&hlg, &Selection::default(), true);

@@ -126,7 +126,7 @@ pub trait Reader {
     /// The next chosen frame, in the place of the last one; false at the end.
     ///
     /// Errors: nothing can be decoded at all, an image is damaged or of another size. What can be decoded in part ends
-    /// early, and a warning says so.
+    /// early, and a warning states so.
     fn next(&mut self, frame: &mut Frame) -> Result<bool>;
 
     /// Times of all frames passed so far, chosen or not, seconds, ascending.

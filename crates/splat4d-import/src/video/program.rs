@@ -94,7 +94,7 @@ impl Tools {
         let out = command.output().map_err(|e| Error::environment("ffprobe cannot be started", e).remedy(INSTALL))?;
         if !out.status.success() {
             let said = String::from_utf8_lossy(&out.stderr);
-            // The last line says that it did not work, the one before why.
+            // The last line states that it did not work, the one before why.
             let lines: Vec<String> = said.lines().map(|l| plain(l, path)).filter(|l| !l.is_empty()).collect();
             let last = lines[lines.len().saturating_sub(2)..].join("; ");
             let what = format!("ffmpeg cannot read it as a video, or it is damaged ({last})");
@@ -247,7 +247,7 @@ fn version(text: &str) -> Option<(u32, u32)> {
 
 /// The time in a line of one of our two `showinfo` filters:
 /// `[showinfo@all @ 0x5] [info] n: 3 pts: 1536 pts_time:0.1 ...`. `units` are the unit of time stamps, printed before:
-/// `[showinfo@all @ 0x5] [info] config in time_base: 1/15360, ...`. (`pts_time` has six digits, too few for long takes.)
+/// `[showinfo@all @ 0x5] [info] config in time_base: 1/15360, ...`. (`pts_time` has six digits, too few for long recordings.)
 fn stamp(line: &str, units: &mut [Option<f64>; 2]) -> Option<(Stamp, Option<f64>)> {
     let rest = line.strip_prefix("[showinfo@")?;
     let which = match rest.split(' ').next()? {
@@ -302,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn time_stamps_keep_their_digits_in_long_takes() {
+    fn time_stamps_keep_their_precision_in_long_recordings() {
         let mut units = [None; 2];
         assert_eq!(
             stamp("[showinfo@kept @ 0x55] [info] config in time_base: 1/90000, frame_rate: 30/1", &mut units),

@@ -104,7 +104,7 @@ fn frames_come_with_their_times() {
 }
 
 #[test]
-fn rotated_videos_stand_upright() {
+fn rotated_videos_are_read_upright() {
     let Some(made) = Made::new() else { return };
     // Red above, blue below; played after a quarter turn.
     let flat = "-f lavfi -i color=red:s=64x24:d=0.1:r=10 -f lavfi -i color=blue:s=64x24:d=0.1:r=10";

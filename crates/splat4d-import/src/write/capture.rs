@@ -38,7 +38,7 @@ pub struct Placed {
     pub masks: Option<Masks>,
 }
 
-/// What is known of the whole take.
+/// What is known of the whole recording.
 #[derive(Clone, Debug, Default)]
 pub struct Recording {
     /// A short name; the folder's if there is none.

@@ -104,7 +104,7 @@ fn derived_values_are_computed_again() {
 }
 
 #[test]
-fn pictures_of_others_are_neither_taken_for_ours_nor_removed() {
+fn foreign_images_are_neither_read_nor_removed() {
     let (_folder, sources) = rig();
     let clips = clips(&sources, &Selection::default());
     let out = tempfile::tempdir().unwrap();
@@ -181,7 +181,7 @@ fn masks_are_stored_next_to_their_images() {
     let begins = [Begin { from: None }; 2];
     let make =
         |begins: &[Begin]| masks(out.path(), from.path(), &stored, begins, &mut Progress(&mut |_| ()), &|| false);
-    // One for the whole take; one for each frame of the video, of another size.
+    // One for the whole recording; one for each frame of the video, of another size.
     gray(1, 32, 24, "cam_0.png");
     (0..10).for_each(|n| gray(20 * n, 64, 48, &format!("cam_1/m{n:02}.png")));
     let why = make(&begins).unwrap_err().to_string();

@@ -542,6 +542,10 @@ test('training is followed: late join, new snapshots, lost connections', options
   step(21);
   await card.getByText('210of 500').waitFor({ timeout: 10000 });
   assert.ok(site.joined > joined, 'it came back by itself');
+  site.say({ kind: 'step', step: 220, of: 500, psnr: 17, held_out: 16.5, loss: 0.28, gaussians: 9020, left_s: 100 });
+  await card.getByText('held out', { exact: false }).first().waitFor();
+  assert.ok(await card.evaluate(e => [...e.querySelectorAll('.figures > div')].every(d => d.getBoundingClientRect().right
+    <= e.getBoundingClientRect().right)), 'four figures stay inside the card');
   assert.deepEqual(await opened(), ['?v=7', '?v=8'], 'what is known is not loaded again');
   step(50);
   site.say({ kind: 'done' });

@@ -16,12 +16,12 @@ use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-/// Every how many images one is held out where no rig and no convention says otherwise (LLFF's habit).
+/// Every how many images one is held out where no rig and no convention states otherwise (LLFF's habit).
 const HOLD_EVERY: usize = 8;
 /// White: what transparent pixels are composited on by default (the papers' choice for D-NeRF).
 const WHITE: [f32; 3] = [1.0; 3];
 
-/// Checks a take and turns it into a capture.
+/// Checks what a reader found and makes a capture of it.
 pub(super) fn assemble(mut take: RawCapture, options: &CaptureOptions) -> Result<Capture> {
     let root = take.root.clone();
     let located = |e: Error| e.at(root.display());
@@ -117,7 +117,7 @@ pub(super) fn assemble(mut take: RawCapture, options: &CaptureOptions) -> Result
     Ok(capture)
 }
 
-/// Names point clouds next to the capture's files, where it has no points: nothing says that they are in its world.
+/// Names point clouds next to the capture's files, where it has no points: nothing states that they are in its world.
 fn unread_clouds(take: &mut RawCapture) {
     let clouds: Vec<String> =
         rig::file_names(&take.root).into_iter().filter(|n| n.to_ascii_lowercase().ends_with(".ply")).collect();
@@ -514,7 +514,7 @@ fn report_orientation(take: &mut RawCapture, as_stored: usize, by_size: [usize; 
     say(by_size[1], "It is applied: only the upright images have the size of their intrinsics.");
 }
 
-/// Decides by points and features whether EXIF orientations are applied where sizes do not say so, and says it.
+/// Decides by points and features whether EXIF orientations are applied where sizes do not say so, and states it.
 fn settle_orientation(capture: &mut Capture, unsure: &[usize]) {
     if unsure.is_empty() {
         return;

@@ -7,7 +7,7 @@
 //! is anywhere in the scene, next to the object's outline it is the background again: so a border counts only if the
 //! images are mostly bright a few pixels further inside.
 //!
-//! What is looked at is the same for every part of a take: the first image of each fixed camera, and images of moving ones
+//! What is examined is the same for every part of a capture: the first image of each fixed camera, and images of moving ones
 //! evenly. The parts of one run get what the first of them found ([`Lenses`]).
 
 use super::account::Severity;
@@ -20,19 +20,19 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::path::PathBuf;
 use std::sync::Arc;
 
-/// Images of a lens that are looked at: content that is black by chance is black in all of them hardly ever.
+/// Images of a lens that are examined: content that is black by chance is black in all of them hardly ever.
 const LOOKED_AT: usize = 16;
 /// Pixels that are decoded of one lens at most, where that leaves [`FEWEST`] images: it bounds the time.
 const PIXELS: usize = 30_000_000;
 /// With fewer views of different places, what is black in all of them may be an object.
 const FEWEST: usize = 6;
-/// Lenses that are looked at, those with the most images first: it bounds the time.
+/// Lenses that are examined, those with the most images first: it bounds the time.
 const LENSES: usize = 8;
 /// What counts as black, of 255: JPEG's ringing reaches 30 next to bright content.
 const BLACK: u8 = 40;
 /// Pixels beyond a border that interpolation and JPEG have mixed with it.
 const MIXED: usize = 2;
-/// How far behind a border the content is looked at, pixels.
+/// How far behind a border the content is examined, pixels.
 const INSIDE: usize = MIXED + 2;
 /// Share of the content behind a border that is not black. Chosen between the two kinds: content is bright in most places,
 /// and the outline of an object on black is dark in nearly all images. Ten real and synthetic captures are
@@ -45,10 +45,10 @@ const OF_AN_EDGE: f64 = 0.5;
 /// black.
 const LARGEST: f64 = 0.6;
 
-/// Images that are decoded at a time after the first: most lenses have no border, and one image says so.
+/// Images that are decoded at a time after the first: most lenses have no border, and one image states so.
 const AT_ONCE: usize = 4;
 
-/// Finds the borders of a capture's images and gives them to its frames; says so in the account. `firsts`: the first image of
+/// Finds the borders of a capture's images and gives them to its frames; states so in the account. `firsts`: the first image of
 /// cameras of which only a part of the frames is listed.
 pub(super) fn find(capture: &mut Capture, options: &CaptureOptions, firsts: &BTreeMap<usize, PathBuf>) {
     if options.borders == Borders::Keep {
@@ -222,7 +222,7 @@ mod tests {
     const WIDTH: usize = 40;
     const HEIGHT: usize = 30;
 
-    /// Images that are bright where the function says: of image, column and row.
+    /// Images that are bright where the function states: of image, column and row.
     fn images(count: usize, bright: impl Fn(usize, usize, usize) -> bool) -> Vec<Vec<bool>> {
         (0..count).map(|i| (0..WIDTH * HEIGHT).map(|p| bright(i, p % WIDTH, p / WIDTH)).collect()).collect()
     }

@@ -35,7 +35,7 @@ pub(super) const COLMAP: &str = "colmap";
 pub(super) const WORKSPACES: [&str; 4] = ["undistorted/sparse", "dense/sparse", "dense/0/sparse", "distorted/sparse"];
 /// A model's points as .ply: 3DGS writes it next to the others, and other programs in place of them.
 const POINTS: &str = "points3D.ply";
-/// Where a model may lie next to poses of another layout: COLMAP's habit and Nerfstudio's.
+/// Where a model may be next to poses of another layout: COLMAP's habit and Nerfstudio's.
 const BESIDE: [&str; 2] = [SPARSE, NESTED];
 /// Names of folders between a capture's folder and a model's files, in addition to numbers.
 const MODEL_FOLDERS: [&str; 6] = [SPARSE, MULTIVIEW, COLMAP, "distorted", "undistorted", "dense"];
@@ -185,7 +185,7 @@ fn sources(folder: &Path, registered: &[Registered], poses: Poses) -> Result<Vec
     Ok(shots)
 }
 
-/// The registered images of the largest model in a folder, and its points; no image is looked at.
+/// The registered images of the largest model in a folder, and its points; no image is examined.
 pub(super) fn shots(folder: &Path) -> Result<(Vec<Shot>, Option<PointCloud>)> {
     let (folder, registered) = best_model(folder, &mut Vec::new())?;
     Ok((sources(&folder, &registered, Poses::STATED)?, cloud_of(&colmap_files::points(&folder)?, &folder)?))
@@ -254,7 +254,7 @@ fn check_errors(points: &[Point], warnings: &mut Vec<String>) {
     }
 }
 
-/// The points of a COLMAP model that lies next to `marker`, whose frames are `frames`: in their world, if the cameras
+/// The points of a COLMAP model that is next to `marker`, whose frames are `frames`: in their world, if the cameras
 /// agree. The result is reported.
 pub(super) fn points_beside(
     root: &Path,

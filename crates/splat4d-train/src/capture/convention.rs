@@ -148,7 +148,7 @@ impl Poses {
     pub const STATED: Self = Self { opengl: None, inverse: false, transposed: false, xyzw: false };
     const WORDS: [&str; 5] = ["opencv", "opengl", "inverse", "transposed", "xyzw"];
 
-    /// What the poses turn out to be, in words; relative to what `stated` says.
+    /// What the poses turn out to be, in words; relative to what `stated` states.
     pub(crate) fn in_words(self, stated: Convention) -> String {
         let mut parts: Vec<&str> = Vec::new();
         match self.opengl {

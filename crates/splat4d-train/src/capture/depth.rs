@@ -76,7 +76,7 @@ pub(super) fn at(file: &DepthFile, source: &Camera, pixels: &[[f64; 2]]) -> Resu
     Ok(pixels.iter().map(place).collect())
 }
 
-/// The mean of k×k boxes that lie on one surface; 0 where a box lies on several or any of its pixels is not known.
+/// The mean of k×k boxes that are on one surface; 0 where a box is on several or any of its pixels is not known.
 pub(super) fn reduce(map: &[f32], width: usize, height: usize, k: usize) -> Vec<f32> {
     if k == 1 {
         return map.to_vec();

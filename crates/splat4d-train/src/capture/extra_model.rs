@@ -1,4 +1,4 @@
-//! Two descriptions of the same cameras: whether they agree, and how one world lies in the other.
+//! Two descriptions of the same cameras: whether they agree, and how one world is in the other.
 
 use super::rig;
 use splat4d::math::se3::{dot, mat_mul, norm, sub, transpose};

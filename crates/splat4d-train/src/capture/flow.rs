@@ -2,7 +2,7 @@
 //! 64 v + 32768, u right and v down in pixels, and blue is not zero where they are known; `.flo` (Baker et al. 2007,
 //! Middlebury) and `.npy`, as networks write them.
 //!
-//! A frame's file says where each of its pixels goes by the next frame of its camera. In memory all keep KITTI's code, for
+//! A frame's file states where each of its pixels goes by the next frame of its camera. In memory all keep KITTI's code, for
 //! the pinhole view.
 
 use super::json;
@@ -130,7 +130,7 @@ fn decode_flo(path: &Path, camera: &Camera) -> Result<Vec<Code>> {
     encode(path, width, vectors)
 }
 
-/// [h, w, 2] or [2, h, w], with a third channel where it says what is known.
+/// [h, w, 2] or [2, h, w], with a third channel where it states what is known.
 fn decode_npy(path: &Path, camera: &Camera) -> Result<Vec<Code>> {
     let array = Npy::read(&json::read_bytes(path)?).map_err(|e| e.at(path.display()))?;
     let (height, width, channels, first) = match array.shape[..] {

@@ -1,4 +1,4 @@
-//! Exports of capture programs and telephones: Metashape, RealityScan, Polycam, Record3D. Each is a file that says where
+//! Exports of capture programs and telephones: Metashape, RealityScan, Polycam, Record3D. Each is a file that states where
 //! poses and images are; what is common to them is here. They were built from public documentation and synthetic samples.
 
 mod metashape;
@@ -30,7 +30,7 @@ struct Export {
     read: fn(&Path, &Path, &CaptureOptions) -> Result<RawCapture>,
 }
 
-/// In the order in which they are looked for: those that are recognized by their content come last.
+/// In the order in which they are searched for: those that are recognized by their content come last.
 const EXPORTS: [Export; 4] = [polycam::EXPORT, record3d::EXPORT, metashape::EXPORT, realityscan::EXPORT];
 
 /// Reads the export in a folder, or that a file is. `None`: it is none.
@@ -58,7 +58,7 @@ struct Shot {
     depth: Option<DepthFile>,
 }
 
-/// What an export says in addition to its shots.
+/// What an export states in addition to its shots.
 struct Said {
     kind: CaptureKind,
     /// What its poses are, as its program writes them.
@@ -84,7 +84,7 @@ fn opengl_pose(rows: &[[f64; 4]; 4]) -> Result<Se3> {
     Convention::NERF.read_as(pose::checked(Se3::from_rows(rows))?, Poses::STATED)
 }
 
-/// The take of some shots: of one moving camera where they have times, else as their names say.
+/// The capture of some shots: of one moving camera where they have times, else as their names say.
 fn take(root: &Path, mut shots: Vec<Shot>, said: Said, options: &CaptureOptions) -> Result<RawCapture> {
     let Said { kind, convention, fps, points, up, mut warnings, mut notes } = said;
     let fps = options.fps.or(fps).unwrap_or(DEFAULT_FPS);
@@ -181,7 +181,7 @@ fn key(name: &str) -> String {
     lookup::fold(stem)
 }
 
-/// The only point cloud in a folder; several are none, and a note says so.
+/// The only point cloud in a folder; several are none, and a note states so.
 fn only_points(root: &Path, notes: &mut Vec<String>) -> Result<Option<PointCloud>> {
     let clouds: Vec<String> =
         rig::file_names(root).into_iter().filter(|n| n.to_lowercase().ends_with(".ply")).collect();

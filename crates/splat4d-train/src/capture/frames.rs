@@ -70,7 +70,7 @@ pub struct FlowTruth<'a, F = f32> {
 pub struct Tracked<'a> {
     /// All of them.
     pub tracks: &'a Tracks,
-    /// The frame's number in the take.
+    /// The frame's number in the capture.
     pub frame: usize,
     /// The camera of the image file, in whose pixels they are.
     pub source: &'a Camera,

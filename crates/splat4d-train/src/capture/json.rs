@@ -1,4 +1,4 @@
-//! JSON with named places: every error says which key of which file is wrong and, for a misspelt key, what was meant.
+//! JSON with named places: every error states which key of which file is wrong and, for a misspelt key, what was meant.
 
 use super::account::first_names;
 use super::convention::Poses;
@@ -8,7 +8,7 @@ use serde_json::Value;
 use splat4d::{Error, Result};
 use std::path::Path;
 
-/// Longest metadata file that is read, bytes: a long take of a large rig stays far below it.
+/// Longest metadata file that is read, bytes: a long capture of a large rig stays far below it.
 const MAX_BYTES: u64 = 512 << 20;
 
 /// Reads a text or binary file of at most [`MAX_BYTES`].

@@ -1,4 +1,4 @@
-//! Which layout a folder has: markers in a stated order, what lies next to the one that is taken, and what to do
+//! Which layout a folder has: markers in a stated order, what is next to the one that is taken, and what to do
 //! where there
 //! is none.
 

@@ -5,11 +5,11 @@
 
 use splat4d::scene::Lens;
 
-/// Widest pinhole ray looked at, x/z: 84° off the axis.
+/// Widest pinhole ray examined, x/z: 84° off the axis.
 const MAX_RADIUS: f64 = 10.0;
 /// Widest fisheye ray, radians.
 const MAX_ANGLE: f64 = std::f64::consts::PI;
-/// Samples when looking for the first fold; real lenses fold once, far out.
+/// Samples when searching for the first fold; real lenses fold once, far out.
 const FOLD_SAMPLES: usize = 4096;
 /// Newton steps; ten suffice for real lenses, bisection-guarded ones need a few more at the fold.
 const MAX_STEPS: usize = 60;

@@ -25,7 +25,7 @@ const MASK_WORDS: [&str; 3] = ["mask", "matte", "segment"];
 const IMAGE_FOLDERS: [&str; 3] = ["images", "input", "image"];
 /// How names of folders begin that hold other things than images, though their files may be called like these.
 const NO_IMAGES: [&str; 5] = ["depth", "normal", "seg", "flow", "."];
-/// Names of images compared when a folder is looked for: enough to distinguish folders.
+/// Names of images compared when a folder is searched for: enough to distinguish folders.
 const SAMPLE: usize = 32;
 /// Endings of images, readable ones first; a name with one of the others may be an image converted since.
 const KNOWN_ENDINGS: &[&str] = &[
@@ -519,12 +519,12 @@ mod tests {
         for gone in ["cam1/0001.jpg", "cam0/0002.jpg", "cam0/0001.jpg/x", ""] {
             assert_eq!(find(&["images/cam0/0001.jpg"], gone).0, None, "{gone}");
         }
-        // A folder that names a camera says which image is meant.
+        // A folder that names a camera states which image is meant.
         assert_eq!(find(&["images/0001.jpg"], "cam0/0001.jpg").0, None);
     }
 
     #[test]
-    fn what_could_be_either_is_refused() {
+    fn ambiguous_file_names_are_refused() {
         let (_dir, there) = lookup(&["images/a.PNG", "images/A.png", "images/b.webp", "images/b.png"]);
         let refuse = |name: &str| there.image(&there.bases(), name).unwrap_err().to_string();
         assert!(refuse("a.png").contains("A.png, a.PNG") && refuse("b.jpg").contains("b.png, b.webp"));

@@ -1,4 +1,4 @@
-//! Masks that lie next to the images of any layout: found by the usual names, and those that fit nothing are counted.
+//! Masks that are next to the images of any layout: found by the usual names, and those that fit nothing are counted.
 //!
 //! For the image `cam0/a.jpg` these are, in `masks/` or `mask/`: `cam0/a.jpg.png` (COLMAP), `cam0/a.png`, `cam0/a_mask.png`,
 //! `cam0/mask_a.png` and `cam0/a.mask.png` (Metashape), with any ending of images.
@@ -219,7 +219,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn usual_names_of_masks_lead_to_their_images() {
+    fn masks_with_usual_names_are_matched_to_images() {
         let names = [
             "cam0/a.jpg.png",
             "cam0/a.png",

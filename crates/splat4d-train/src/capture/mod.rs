@@ -132,7 +132,7 @@ pub enum CaptureKind {
     Record3d,
 }
 
-/// One image of the take.
+/// One image of the capture.
 #[derive(Clone, Debug)]
 pub struct Frame {
     /// Index into [`Capture::cameras`].
@@ -143,7 +143,7 @@ pub struct Frame {
     pub source: Camera,
     /// Seconds on the scene clock.
     pub time: Time,
-    /// Frame number in the take, from 0; frames of several cameras with one number belong to one time unless the
+    /// Frame number in the capture, from 0; frames of several cameras with one number belong to one time unless the
     /// cameras have time offsets.
     pub index: usize,
     /// The image file.
@@ -178,7 +178,7 @@ impl Frame {
 pub struct Rig {
     /// Its name in the data set.
     pub name: String,
-    /// Whether one pose holds for the whole take.
+    /// Whether one pose holds for the whole capture.
     pub fixed: bool,
 }
 
@@ -195,7 +195,7 @@ pub enum Split {
     Future,
 }
 
-/// How much there is of a take.
+/// How much there is of a capture.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Extent {
     /// The first frame number, and the one after the last.
@@ -220,7 +220,7 @@ pub struct Capture {
     pub name: String,
     /// The folder.
     pub root: PathBuf,
-    /// Real folders of its images, masks and maps that lie elsewhere, and such files.
+    /// Real folders of its images, masks and maps that are elsewhere, and such files.
     pub elsewhere: BTreeSet<PathBuf>,
     /// The layout it was read from.
     pub kind: CaptureKind,
@@ -232,7 +232,7 @@ pub struct Capture {
     pub named: bool,
     /// All images, or those that were asked for ([`CaptureOptions::frames`]).
     pub frames: Vec<Frame>,
-    /// The whole take, whatever of it is listed.
+    /// The whole capture, whatever of it is listed.
     pub take: Extent,
     /// Indices of the frames held out to measure.
     pub held: Vec<usize>,
@@ -259,7 +259,7 @@ pub struct Capture {
     pub labels: Vec<String>,
     /// The k of [`CaptureOptions::downscale`].
     pub downscale: usize,
-    /// What the layout says that poses are.
+    /// What the layout states that poses are.
     pub convention: Convention,
     /// What they were read as instead.
     pub poses: Poses,
@@ -283,9 +283,9 @@ struct RawCapture {
     named: bool,
     timing: Timing,
     frames: Vec<RawFrame>,
-    /// The whole take, where the reader listed a part of it; empty: all is listed.
+    /// The whole capture, where the reader listed a part of it; empty: all is listed.
     take: Extent,
-    /// The first image of each camera, where the reader listed a part of the take.
+    /// The first image of each camera, where the reader listed a part of the capture.
     firsts: BTreeMap<usize, PathBuf>,
     /// The data set's convention, where the frames' splits do not give it.
     hold_out: Option<HoldOut>,
@@ -299,7 +299,7 @@ struct RawCapture {
     warnings: Vec<String>,
     notes: Vec<String>,
     account: Account,
-    /// What the layout says that poses are.
+    /// What the layout states that poses are.
     convention: Convention,
 }
 
@@ -410,7 +410,7 @@ impl Capture {
         self.frames.iter_mut().for_each(|f| f.view.near = near);
     }
 
-    /// Whether every camera keeps one pose for the whole take.
+    /// Whether every camera keeps one pose for the whole capture.
     pub(crate) fn fixed_cameras(&self) -> bool {
         self.cameras.iter().all(|c| c.fixed)
     }

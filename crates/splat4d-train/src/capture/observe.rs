@@ -1,4 +1,4 @@
-//! The part of a take that may be seen, and the future that may not: what scores a prediction must not have made it.
+//! The part of a capture that may be seen, and the future that may not: what scores a prediction must not have made it.
 
 use super::{Capture, assemble};
 use splat4d::{Error, Result};
@@ -47,7 +47,7 @@ impl Capture {
             points.colors = kept.iter().map(|&i| points.colors[i]).collect();
             points.times = kept.iter().map(|&i| points.times[i]).collect();
         }
-        // Where moving cameras will stand says how large the scene is.
+        // Where moving cameras will stand states how large the scene is.
         let near = assemble::near(self, near);
         self.frames.iter_mut().for_each(|f| f.view.near = near);
         Ok(())

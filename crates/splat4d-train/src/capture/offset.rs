@@ -6,7 +6,7 @@ use splat4d::math::Se3;
 use splat4d::math::se3::{mat_vec, sub};
 use splat4d::scene::offset::offset_of;
 
-/// Subtracts the offset that the take needs from its poses and points, and returns it: zero near the origin, where every
+/// Subtracts the offset that the capture needs from its poses and points, and returns it: zero near the origin, where every
 /// bit stays.
 pub(super) fn subtract(take: &mut RawCapture) -> [f64; 3] {
     let centers: Vec<[f64; 3]> = take.frames.iter().map(|f| f.source.center()).collect();

@@ -11,7 +11,7 @@ use std::sync::Arc;
 /// A lens: size, orientation and intrinsics of its images, in hundredths of a pixel.
 pub(super) type Lens100 = Vec<i64>;
 
-/// What the lenses of a take recorded, as far as they were looked at.
+/// What the lenses of a capture recorded, as far as they were looked at.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Lenses(pub(super) BTreeMap<Lens100, Option<Arc<Vec<u8>>>>);
 
@@ -231,11 +231,11 @@ pub struct CaptureOptions {
     pub unregistered: Unregistered,
     /// Share of the images that may be missing.
     pub max_missing: f64,
-    /// Only images with these frame numbers are listed, so that memory does not grow with the take; empty: all. What
+    /// Only images with these frame numbers are listed, so that memory does not grow with the capture; empty: all. What
     /// they
-    /// are for (training, held out) is what it is in the whole take.
+    /// are for (training, held out) is what it is in the whole capture.
     pub frames: Vec<Range<usize>>,
-    /// What is known of the lenses already, from another part of the take; else images are looked at.
+    /// What is known of the lenses already, from another part of the capture; else images are looked at.
     pub lenses: Lenses,
 }
 

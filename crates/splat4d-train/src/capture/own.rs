@@ -200,7 +200,7 @@ struct Context<'a> {
     fps: f64,
     camera: usize,
     options: &'a CaptureOptions,
-    /// Whether only the part of the take that the options name is listed.
+    /// Whether only the part of the capture that the options name is listed.
     in_part: bool,
     lookup: &'a Lookup,
 }

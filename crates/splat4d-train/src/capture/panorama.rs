@@ -33,7 +33,7 @@ pub(super) fn whole(size: [usize; 2]) -> (Intrinsics, Lens) {
     (intrinsics, Lens::Equirectangular { turn, size })
 }
 
-/// Splits the panoramas of a take; others stay.
+/// Splits the panoramas of a capture; others stay.
 pub(super) fn split(take: &mut RawCapture, hold_out: Option<&HoldOut>) -> Result<()> {
     let is_panorama = |f: &RawFrame| matches!(f.source.lens, Lens::Equirectangular { .. });
     let count = take.frames.iter().filter(|f| is_panorama(f)).count();
@@ -144,7 +144,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rays_meet_the_pixels_of_colmap() {
+    fn panorama_rays_equal_colmaps() {
         // pycolmap 4.2.1, EQUIRECTANGULAR of 640x320, `img_from_cam`.
         let known = [
             ([0.1, -0.2], [330.152165578, 139.99068492]),

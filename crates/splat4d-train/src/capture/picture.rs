@@ -18,7 +18,7 @@ pub(super) struct Header {
     pub stored: (usize, usize),
     /// Whether there is an alpha channel.
     pub alpha: bool,
-    /// What EXIF says is to be done with the pixels.
+    /// What EXIF states is to be done with the pixels.
     orientation: Orientation,
 }
 
@@ -29,7 +29,7 @@ impl Header {
         if swaps_sides(self.orientation) { (height, width) } else { (width, height) }
     }
 
-    /// Whether EXIF says that pixels are to be turned or mirrored.
+    /// Whether EXIF states that pixels are to be turned or mirrored.
     pub(super) fn is_turned(&self) -> bool {
         self.orientation != Orientation::NoTransforms
     }
@@ -235,7 +235,7 @@ pub(super) fn check_size(path: &Path, size: (usize, usize), camera: &Camera) -> 
     ))
 }
 
-/// An error unless what lies next to an image, `what` in words, is of that image's size.
+/// An error unless what is next to an image, `what` in words, is of that image's size.
 pub(super) fn check_beside(path: &Path, what: &str, size: (usize, usize), camera: &Camera) -> Result<()> {
     if size == (camera.width, camera.height) {
         return Ok(());
@@ -248,7 +248,7 @@ pub(super) fn check_beside(path: &Path, what: &str, size: (usize, usize), camera
 /// How many times as long as its image's the sides of a map may be; a larger one is a mistake, or a trap for memory.
 const MOST_TIMES: usize = 8;
 
-/// An error where what lies next to an image, `what` in words, is far larger than that image.
+/// An error where what is next to an image, `what` in words, is far larger than that image.
 pub(super) fn check_not_larger(what: &str, size: (usize, usize), camera: &Camera) -> Result<()> {
     if size.0 <= MOST_TIMES * camera.width && size.1 <= MOST_TIMES * camera.height {
         return Ok(());
@@ -257,7 +257,7 @@ pub(super) fn check_not_larger(what: &str, size: (usize, usize), camera: &Camera
     Err(Error::input(what).remedy(format!("Write it in the size of the image; at most {MOST_TIMES} times its sides.")))
 }
 
-/// Decodes what lies next to an image, `what` in words. Errors before its pixels are read where its size is not that
+/// Decodes what is next to an image, `what` in words. Errors before its pixels are read where its size is not that
 /// of the
 /// stored image.
 pub(super) fn decode_beside(path: &Path, what: &str, camera: &Camera) -> Result<Raster> {
@@ -328,7 +328,7 @@ fn jpeg_ends(bytes: &[u8]) -> bool {
     let mut at = 2;
     while at + 4 <= bytes.len() {
         if bytes[at] != 0xFF {
-            // Not a marker: leave the verdict to the decoder, and look for the end from here.
+            // Not a marker: leave the verdict to the decoder, and search for the end from here.
             break;
         }
         let marker = bytes[at + 1];

@@ -11,7 +11,7 @@ use std::path::Path;
 /// Colour of points that have none.
 const GREY: f32 = 0.5;
 
-/// Reads the points of a .ply file with their colours and, where it says them, their times.
+/// Reads the points of a .ply file with their colours and, where it states them, their times.
 pub(super) fn read_ply(path: &Path) -> Result<PointCloud> {
     cloud(&read_bytes(path)?).map_err(|e| e.at(path.display()))
 }

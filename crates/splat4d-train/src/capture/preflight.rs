@@ -14,7 +14,7 @@ pub struct Finding {
     pub aspect: Option<Aspect>,
     /// The finding, a sentence.
     pub what: String,
-    /// The remedy, a sentence; empty where the finding says all.
+    /// The remedy, a sentence; empty where the finding states all.
     pub remedy: String,
 }
 
@@ -91,7 +91,7 @@ impl Capture {
         let aspect = |text: &String| self.account.iter().find(|r| r.what == *text).map(|r| r.aspect);
         for warning in &self.warnings {
             let remedy = match aspect(warning) {
-                // The remark says what to do.
+                // The remark states what to do.
                 Some(_) => "",
                 None => "See docs/capture-format.md for the layout.",
             };

@@ -1,4 +1,4 @@
-//! Names and files: which images lie in a folder, and what an image's name says about camera and frame number.
+//! Names and files: which images are in a folder, and what an image's name states about camera and frame number.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};

@@ -34,7 +34,7 @@ const FILM_WORDS: [&str; 12] =
     ["", "frame", "frames", "image", "img", "out", "output", "video", "thumb", "rgb", "color", "f"];
 /// The one that telephones and cameras write for photos.
 const PHOTO_WORD: &str = "IMG";
-/// What Nerfstudio renames every image to, photos and frames alike: a word and five digits. It says nothing of time.
+/// What Nerfstudio renames every image to, photos and frames alike: a word and five digits. It states nothing of time.
 const RENAMED: (&str, usize) = ("frame_", 5);
 /// Words before the number in the names of a rig's cameras.
 const CAMERA_WORDS: [&str; 2] = ["cam", "camera"];
@@ -239,7 +239,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn cameras_of_a_rig_are_told_from_photos() {
+    fn camera_rigs_are_distinguished_from_photos() {
         let are = |names: &[&str]| are_cameras(&names.iter().map(|n| (*n).to_owned()).collect::<Vec<_>>());
         assert!(are(&["cam00", "cam_01"]) && are(&["left-camera2", "Camera 10"]));
         assert!(!are(&["cam00", "IMG_1234"]) && !are(&["webcam"]) && !are(&["20240212_003919"]) && !are(&["cam"]));

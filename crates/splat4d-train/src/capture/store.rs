@@ -79,7 +79,7 @@ impl StoredPicture {
         self.weights_into(self.valid.as_deref(), out)
     }
 
-    /// Writes the depth as [1, height, width] and says what kind it is; `None` (and `out` untouched) if there is none.
+    /// Writes the depth as [1, height, width] and states what kind it is; `None` (and `out` untouched) if there is none.
     pub(crate) fn depth_into(&self, out: &mut Planes<f32>) -> Option<DepthKind> {
         let (values, kind) = self.depth.as_ref()?;
         (out.channels, out.height, out.width) = (1, self.height, self.width);

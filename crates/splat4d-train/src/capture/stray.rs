@@ -19,7 +19,7 @@ const OUTPUT_CAMERAS: &str = "cameras.json";
 const OUTPUT_SETTINGS: &str = "cfg_args";
 const CHECKPOINTS: &str = "nerfstudio_models";
 const SCENE_ENDINGS: &[&str] = &["ply", "spz", "splat", "splatv", "sog", "ksplat", "glb", "s4d", "pt", "ckpt"];
-/// Bytes of a JSON file in which its keys are looked for.
+/// Bytes of a JSON file in which its keys are searched for.
 const HEAD: u64 = 1 << 16;
 /// Folders that are looked into for a capture.
 const MOST_FOLDERS: usize = 100;

@@ -26,12 +26,12 @@ use std::path::{Path, PathBuf};
 pub(super) const TRAIN: &str = "transforms_train.json";
 /// All frames of captures in one file.
 pub(super) const ALL: &str = "transforms.json";
-/// Frames that lie next to, and what they are for. The test set is what papers measure.
+/// Frames that are next to, and what they are for. The test set is what papers measure.
 const OTHERS: [(&str, Split); 2] = [("transforms_val.json", Split::Validation), ("transforms_test.json", Split::Held)];
 /// Blender's world has z up.
 const BLENDER_UP: [f64; 3] = [0.0, 0.0, 1.0];
 
-/// Reads the marker and what lies next to it. Cameras are distinguished by image names (`cam/frame`), else by repeated
+/// Reads the marker and what is next to it. Cameras are distinguished by image names (`cam/frame`), else by repeated
 /// poses; times come from `time`, else from what `sequence` makes of the names.
 pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Result<RawCapture> {
     let several = marker.file_name().is_some_and(|name| name == TRAIN);
@@ -93,7 +93,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     })
 }
 
-/// Names and cameras of all frames of a file; no image is looked at that states its size.
+/// Names and cameras of all frames of a file; no image is examined that states its size.
 pub(super) fn posed_frames(root: &Path, top: &Node<'_>) -> Result<Vec<(String, Camera)>> {
     let lookup = Lookup::new(root, &CaptureOptions::default())?;
     let file = frame::File { lookup: &lookup, bases: &lookup.bases(), top, poses: Poses::STATED, size: None };
@@ -110,7 +110,7 @@ fn add(entries: &mut Vec<Entry>, more: Vec<Entry>, several: bool) {
     }
 }
 
-/// NeRF's own scenes in several files stand still where they state no times.
+/// NeRF's own scenes in several files are static where they state no times.
 fn untimed(
     entries: &[Entry],
     options: &CaptureOptions,

@@ -35,7 +35,7 @@ impl Bed {
 }
 
 #[test]
-fn rounds_leave_what_was_asked_for_and_floats_stay_the_models_own() {
+fn pruning_rounds_reach_the_target_and_keep_the_floats() {
     let bed = Bed::new();
     let n = bed.source.len();
     let settings = Compression { prune: 0.6, rounds: 3, fine_tune: 6, codec: false, ..Compression::default() };
@@ -77,7 +77,7 @@ fn the_file_is_what_was_shown_at_every_level() {
 }
 
 #[test]
-fn a_size_takes_the_gentlest_settings_that_keep_it() {
+fn a_target_size_selects_the_gentlest_sufficient_settings() {
     let bed = Bed::new();
     let base = Compression::level(Level::Pruned, 40);
     let job = bed.job(&base);

@@ -1,9 +1,9 @@
 //! How much of an error is a camera's colour alone: an affine colour matrix fitted a camera, render to truth.
 //!
 //! A view is a handful of sums (the normal equations of the fit), whatever its size; the squared error after any such
-//! matrix is a quadratic form of them. So no image is looked at twice, and a camera of a thousand views costs some 200
+//! matrix is a quadratic form of them. So no image is examined twice, and a camera of a thousand views costs some 200
 //! bytes each. What the matrix makes of a render is not clamped again, which sums could not do: the true error is never
-//! above the given one, since the truth lies in `[0,1]`.
+//! above the given one, since the truth is in `[0,1]`.
 
 use splat4d::math::cholesky::Cholesky;
 use splat4d::scene::Planes;
@@ -13,7 +13,7 @@ const IN: usize = 4;
 /// Colours of a pixel of the truth.
 const OUT: usize = 3;
 /// A pivot of the normal equations below this share of its diagonal is none: colours of a grey render, or of a single
-/// colour, lie in a plane but for rounding (f32: 6e-8, squared about 4e-15).
+/// colour, are in a plane but for rounding (f32: 6e-8, squared about 4e-15).
 const SINGULAR: f64 = 1e-12;
 
 /// Where a render's colour r goes: row c is `[m0, m1, m2, offset]`, and channel c becomes m·r + offset.
@@ -187,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn unknown_pixels_do_not_teach_colours() {
+    fn unknown_pixels_do_not_change_colour_matrices() {
         let view = noise(1);
         let (mut truth, mut known) =
             (cast(&view, &CAST), Planes { data: vec![1.0; SIDE * SIDE], ..Planes::new(1, SIDE, SIDE) });

@@ -25,9 +25,9 @@ use splat4d::scene::{Planes, Table};
 use splat4d::{Error, Result};
 use std::collections::BTreeMap;
 
-/// Images of a camera that are looked at, at most.
+/// Images of a camera that are examined, at most.
 const PICTURES: usize = 4;
-/// Images that are looked at, at most: minutes, not hours.
+/// Images that are examined, at most: minutes, not hours.
 const MOST: usize = 400;
 /// A camera sees a Gaussian whose removal changes its images by this, colours of 0 to 1 squared and summed over
 /// pixels and

@@ -37,7 +37,7 @@ const SOFT: f64 = 0.05;
 const GAIN: [f64; 2] = [0.25, 4.0];
 /// Alpha from which on a pixel shows something that has a depth.
 const SOLID: f32 = 0.5;
-/// Numbers that are looked for: pose 6, time, logarithm of the focal length.
+/// Numbers that are searched for: pose 6, time, logarithm of the focal length.
 const UNKNOWN: usize = 8;
 const TIME: usize = 6;
 const FOCAL: usize = 7;
@@ -52,7 +52,7 @@ pub const SURE: f64 = 1.0 / 3.0;
 pub struct Question {
     /// How the scene is drawn.
     pub antialias: Antialias,
-    /// Whether the focal length is looked for too.
+    /// Whether the focal length is searched for too.
     pub lens: bool,
 }
 
@@ -63,7 +63,7 @@ pub struct Located {
     pub camera: Camera,
     /// When; the beginning of the clip where nothing moves.
     pub time: Time,
-    /// Mean absolute difference of the image from the scene, colours from 0 to 1, in the largest images looked at.
+    /// Mean absolute difference of the image from the scene, colours from 0 to 1, in the largest images examined.
     pub residual: f64,
     /// The same from the plain colour that is its mean: what a scene that has nothing to do with it may reach.
     pub chance: f64,
@@ -217,7 +217,7 @@ impl Search<'_> {
         Ok(())
     }
 
-    /// How far each number goes for what is seen to move by [`DIFFERENCE`] pixels; 0: it is not looked for.
+    /// How far each number goes for what is seen to move by [`DIFFERENCE`] pixels; 0: it is not searched for.
     fn sizes(&mut self, candidate: &Candidate, times: usize) -> Result<[f64; UNKNOWN]> {
         let drawn = self.draw(candidate, times, true)?;
         let solid = |(alpha, depth): (&f32, &f32)| (*alpha > SOLID).then(|| depth / alpha);
@@ -225,7 +225,7 @@ impl Search<'_> {
         let camera = candidate.camera.downscaled(times);
         let angle = DIFFERENCE / camera.intrinsics.fx;
         let middle = depths.len() / 2;
-        // A view of nothing looks for a scene as far away as the world's origin.
+        // A view of nothing searches for a scene as far away as the world's origin.
         let far = if depths.is_empty() {
             camera.center().iter().map(|x| x * x).sum::<f64>().sqrt().max(f64::MIN_POSITIVE)
         } else {

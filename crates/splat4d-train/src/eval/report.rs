@@ -197,7 +197,7 @@ impl Report {
 
     /// `results.json`: `{"ours_7000": {"SSIM": …, "PSNR": …, "notes": {…}, "cameras": {…}}, "train": {"ours_7000": {…}}}`.
     ///
-    /// `cameras` holds for every camera `{"PSNR": …, "PSNR-cc": …, "colour": [[m, m, m, offset] × 3]}`. A metric that is not defined is null, and `notes` says why.
+    /// `cameras` holds for every camera `{"PSNR": …, "PSNR-cc": …, "colour": [[m, m, m, offset] × 3]}`. A metric that is not defined is null, and `notes` states why.
     pub fn results(&self) -> Value {
         self.nested(Split::results_json)
     }

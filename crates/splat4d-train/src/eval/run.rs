@@ -8,7 +8,7 @@
 //! | `per_view.json` | `Report::per_view`, with `camera` and `time` of every image in addition |
 //! | `test/ours_N/{renders,gt,errors}/00000.png` | held-out views, in the capture's order |
 //!
-//! Other views or another background than the run's own ([`EvalOptions::place`]) stand next to: in both files under an
+//! Other views or another background than the run's own ([`EvalOptions::place`]) are next to: in both files under an
 //! entry of that name, as `train` does, and their images in a folder of that name.
 //!
 //! PSNR is clamped to `[0,1]`, not rounded, per image, then the mean. `PSNR-cc` is the same after the affine colour

@@ -87,7 +87,7 @@ impl Truth {
         }
     }
 
-    /// The frames in a scene's clip: a part of the take has a part of them.
+    /// The frames in a scene's clip: a part of the capture has a part of them.
     pub(super) fn frames_of(&self, scene: &Scene<f32>, fps: f64) -> Vec<usize> {
         let [from, to] = [scene.clip[0] - CLOCK_ERROR, scene.clip[1] + CLOCK_ERROR];
         (0..self.frames).filter(|&k| (from..=to).contains(&(k as f64 / fps))).collect()

@@ -120,7 +120,7 @@ mod tests {
     use splat4d::scene::Time;
 
     #[test]
-    fn what_is_wrong_with_cameras_is_what_was_done_to_them() {
+    fn camera_errors_equal_the_applied_disturbance() {
         let place = Place::new();
         let truth = place.open(&recipe(&["hold_out=none"]));
         let mut found = Capture::clone(&truth);

@@ -1,6 +1,6 @@
 //! Points that depth maps show: pixels of training images, unprojected. A point through which an image of another time
 //! sees what is farther away belongs to something that moves: it lives about its time, and begins with the velocity
-//! that optical flow and the depth at both of its ends determine ([`super::scene_flow`]). All others stand still.
+//! that optical flow and the depth at both of its ends determine ([`super::scene_flow`]). All others are static.
 
 use super::map::Map;
 use super::{Seeds, scene_flow};
@@ -12,7 +12,7 @@ use std::f64::consts::TAU;
 
 /// Images that points are taken from and held against, at most, evenly chosen.
 const VIEWS: usize = 100;
-/// Points a wanted one that stand still.
+/// Points a wanted one that are static.
 const CANDIDATES: usize = 4;
 /// Pixels of an image of which is asked whether they move, at most.
 const ASKED: usize = 20_000;
@@ -31,9 +31,9 @@ struct Candidate {
     still: bool,
 }
 
-/// About `count` points of metric depth maps that stand still; none where there are no such maps. With `moving`, up to as
+/// About `count` points of metric depth maps that are static; none where there are no such maps. With `moving`, up to as
 /// many again on dynamic regions: few pixels show it, and at every time others. They are taken from every image that is
-/// looked at.
+/// examined.
 pub(crate) fn points(frames: &dyn Frames, count: usize, moving: bool, rng: Rng) -> Result<Seeds> {
     let step = frames.len().div_ceil(VIEWS).max(1);
     let chosen: Vec<usize> = (0..frames.len()).step_by(step).collect();
@@ -159,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn what_moves_belongs_to_its_time_and_all_else_to_all() {
+    fn depth_points_of_dynamic_regions_get_their_time_and_others_none() {
         let deep = Deep(Made::new(4, 3, 24));
         let seeds = points(&deep, 400, true, Rng::new(1, "test", 0)).unwrap();
         let moving: Vec<usize> = (0..seeds.len()).filter(|&i| seeds.times[i].is_some()).collect();

@@ -19,7 +19,7 @@ const NEIGHBOURS: usize = 12;
 const ROUNDS: usize = 4;
 /// A point this far from the plane, of its inverse depth, counts half: it belongs to something else.
 const OUTLIER: f64 = 0.03;
-/// Holds slopes back where points lie in a line.
+/// Holds slopes back where points are in a line.
 const RIDGE: f64 = 0.05;
 /// Points a little outside of the image help at its edges, of its size.
 const BORDER: f64 = 0.15;
@@ -182,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn fixed_cameras_are_asked_once() {
+    fn depth_of_fixed_cameras_is_read_once() {
         let frames = crate::step::tests::Made::new(6, 2, 8);
         assert_eq!(views(&frames).len(), 6);
     }

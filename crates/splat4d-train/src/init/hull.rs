@@ -212,7 +212,7 @@ struct Votes {
     colors: Vec<[f32; 3]>,
 }
 
-/// The points that lie in (almost) all silhouettes that see them, with their median colour. One image at a time is
+/// The points that are in (almost) all silhouettes that see them, with their median colour. One image at a time is
 /// held.
 fn vote(silhouettes: &Silhouettes<'_>, points: &[[f64; 3]]) -> Result<Seeds> {
     let allowed = silhouettes.misses * silhouettes.count as f64;
@@ -259,7 +259,7 @@ mod tests {
     use crate::step::tests::Made;
 
     #[test]
-    fn hull_points_lie_in_the_object_that_moves() {
+    fn hull_points_are_inside_the_moving_object() {
         let frames = Made::new(6, 4, 32);
         let times: Vec<f64> = (0..4).map(|k| frames.time_of(k)).collect();
         let seeds = carve(&frames, &common(&frames), &times, 200, true, Rng::new(1, "hull", 0)).unwrap();
@@ -272,7 +272,7 @@ mod tests {
     }
 
     #[test]
-    fn what_moves_is_carved_without_masks_where_enough_cameras_stand_still() {
+    fn dynamic_regions_are_carved_without_masks_from_enough_fixed_cameras() {
         let frames = Made::new(6, 9, 48);
         let times: Vec<f64> = [1, 4, 7].map(|k| frames.time_of(k)).to_vec();
         let rng = Rng::new(1, "hull", 0);

@@ -380,7 +380,7 @@ mod tests {
     }
 
     #[test]
-    fn a_seed_that_moves_makes_a_gaussian_that_moves() {
+    fn a_moving_initial_point_makes_a_moving_gaussian() {
         for motion in ["spacetime", "native4d"] {
             let recipe = Recipe::default().with(|r| r.run.motion = MotionName::of(motion));
             let plan = TrainContext { extent: 2.0, clip: [0.0, 1.0], times: 11, fps: 10.0, ..recipe.plan() };

@@ -94,7 +94,7 @@ mod tests {
     }
 
     #[test]
-    fn random_points_lie_where_many_cameras_look() {
+    fn random_points_are_where_many_cameras_see() {
         let frames = Made::new(6, 2, 8);
         let volume = common(&frames);
         let seeds = random(&frames, &volume, 300, None, Rng::new(1, "random", 0));

@@ -46,7 +46,7 @@ const CONTRAST: f64 = 0.02 / INTERVALS as f64;
 const EDGE: f64 = 10.0;
 /// Octaves end at images smaller than this, pixels.
 const SMALLEST: usize = 16;
-/// Pixels from the border within which nothing is looked for.
+/// Pixels from the border within which nothing is searched for.
 const BORDER: usize = 5;
 /// Times that an extremum may move to the next pixel while it is refined.
 const MOVES: usize = 5;
@@ -55,7 +55,7 @@ const DOUBLED_BELOW: usize = 500_000;
 /// Features of an image where nothing else is said, at most: those of highest contrast.
 const MOST: usize = 3000;
 
-/// How many features are looked for.
+/// How many features are searched for.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Limits {
     /// Least contrast of an extremum, of an image in [0, 1].
@@ -329,7 +329,7 @@ mod tests {
     use splat4d::math::Rng;
 
     #[test]
-    fn a_limit_leaves_out_the_weakest_and_changes_none() {
+    fn a_limit_drops_the_weakest_features_and_keeps_the_others() {
         let mut grey = Planes::<f32>::new(1, 60, 80);
         let rng = Rng::new(1, "noise", 0);
         grey.data.iter_mut().enumerate().for_each(|(i, v)| *v = rng.uniform(i as u64) as f32);

@@ -49,7 +49,7 @@ pub fn sample(from: &Planes<f32>, u: f32, v: f32) -> f32 {
 
 /// Blurred by a Gaussian, rows then columns; the border goes on outside.
 pub fn blurred(from: &Planes<f32>, sigma: f64) -> Planes<f32> {
-    /// Of σ: what lies beyond weighs a thousandth.
+    /// Of σ: what is beyond weighs a thousandth.
     const REACH: f64 = 3.5;
     let reach = (REACH * sigma).ceil() as usize;
     let bell = |k: usize| (-0.5 * ((k as f64 - reach as f64) / sigma).powi(2)).exp();
@@ -84,7 +84,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_ramp_is_a_ramp_between_pixels_doubled_and_blurred() {
+    fn a_ramp_stays_a_ramp_when_sampled_doubled_and_blurred() {
         let mut ramp = Planes::<f32>::new(1, 24, 32);
         for i in 0..ramp.data.len() {
             ramp.data[i] = (i % 32) as f32 + 0.5 + 2.0 * ((i / 32) as f32 + 0.5);

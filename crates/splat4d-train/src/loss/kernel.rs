@@ -359,7 +359,7 @@ fn along<F: Real, const FMA: bool>(taps: &[F; TAPS], row: &[F; READ], i: usize) 
     weigh::<F, FMA>(taps, &row[i..i + TAPS], 0)
 }
 
-/// The scratch columns that lie in the image, of `count` with this halo; the first is image column
+/// The scratch columns that are in the image, of `count` with this halo; the first is image column
 /// `x0 + start − halo`.
 #[inline(always)]
 fn inside(width: usize, x0: usize, halo: usize, count: usize) -> [usize; 2] {

@@ -463,7 +463,7 @@ mod tests {
     }
 
     #[test]
-    fn rigid_motion_is_free_and_other_motion_is_not() {
+    fn only_non_rigid_motion_has_a_loss() {
         let rest: Points = normals("rest", 1.0);
         let g = Graph::new(&rest, 6, Weigh::Median(1.0));
         let q = quat::normalize([0.4, 0.7, -0.2, 0.3]).0;

@@ -10,7 +10,7 @@ use splat4d::math::{Real, Rng};
 use splat4d::scene::{GEOMETRY, Space, Table, Time};
 use std::sync::Mutex;
 
-/// Gaussians a step whose neighbourhoods are looked at, other ones in each: this bounds the cost.
+/// Gaussians a step whose neighbourhoods are examined, other ones in each: this bounds the cost.
 pub(crate) const CENTRES: usize = 1024;
 /// exp(−c d²/median) of an edge; 1 keeps the typical edge and drops the far ones.
 const FALLOFF: f64 = 1.0;

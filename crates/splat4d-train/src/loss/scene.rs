@@ -286,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn the_life_regulariser_never_reaches_the_life() {
+    fn the_lifespan_regulariser_gives_lifespans_no_gradient() {
         let (_, d) = eval(&LivingOpacity { weight: 1.0 }, &scene());
         assert!(!d.touched(LIFE));
     }

@@ -193,7 +193,7 @@ impl AdcSettings {
             }
             if grows[r] && !splits[r] {
                 // Two halves in one place are as opaque as the whole: 1 − √(1 − o) each. Parts of a split are smaller and
-                // lie next to each other; as faint as this they let training views fall by up to 2 dB (docs/suite.md).
+                // are next to each other; as faint as this they let training views fall by up to 2 dB (docs/suite.md).
                 layer.params[GEOMETRY].set(j, OPACITY, logit(1.0 - (1.0 - old_opacity[j]).sqrt()));
             }
         }
@@ -262,7 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn what_leaves_its_place_within_its_life_becomes_two_lives_of_one_path() {
+    fn gaussians_that_move_beyond_their_size_are_split_in_time() {
         let mut s = scene(4);
         s.clip = [0.0, 4.0];
         let layer = &mut s.layers[0];
@@ -347,7 +347,7 @@ mod tests {
     }
 
     #[test]
-    fn a_share_of_the_room_goes_to_those_with_the_largest_gradients() {
+    fn a_share_of_the_free_count_goes_to_the_largest_gradients() {
         let mut train_state = TrainState::new(scene(20));
         (0..20).for_each(|row| train_state.stats_mut().tables[0].write(row, 0, [1.0 + row as f32, 2.0, 5.0]));
         let settings = AdcSettings { grad_threshold: 0.1, percent_dense: 1.0, ..AdcSettings::default() };

@@ -99,7 +99,7 @@ impl<'a> Places<'a> {
         let mut last = std::collections::BTreeMap::new();
         for i in 0..frames.len() {
             let camera = frames.camera(i);
-            // A camera stands still, or is elsewhere in every image: comparing it with its last place is enough.
+            // A camera is static, or is elsewhere in every image: comparing it with its last place is enough.
             if last.insert(frames.rig(i), camera).is_none_or(|l| l.cam_from_world != camera.cam_from_world) {
                 cameras.push((camera, camera.cam_from_world.inverse().translation));
             }

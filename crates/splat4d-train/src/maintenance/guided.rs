@@ -239,7 +239,7 @@ mod tests {
     use crate::step::tests::Made;
 
     #[test]
-    fn gaussians_appear_along_the_rays_of_what_is_wrong_under_the_cap() {
+    fn gaussians_are_added_along_rays_of_large_error_under_the_cap() {
         let frames = Made::new(6, 2, 128);
         let run = |cap: usize| {
             let mut s = scene(200);
@@ -283,7 +283,7 @@ mod tests {
     }
 
     #[test]
-    fn it_is_due_as_often_as_was_asked() {
+    fn guided_sampling_is_due_at_its_interval() {
         let guided = Guided { settings: GuidedSettings { from: 0.25, times: 3, share: 0.1 } };
         assert_eq!(due_steps(&guided, 400), [100, 167, 234]);
     }

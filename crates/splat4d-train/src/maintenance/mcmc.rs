@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn the_dead_move_counts_are_conserved_and_the_cap_holds() {
+    fn dead_gaussians_are_relocated_and_the_count_stays_under_the_cap() {
         let mut s = scene(100);
         (0..10).for_each(|r| s.layers[0].params[GEOMETRY].set(r, OPACITY, -9.0));
         let mut train_state = TrainState::new(s);

@@ -206,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn twins_become_one_and_strangers_stay() {
+    fn equal_neighbours_are_merged_and_others_kept() {
         for pair in [Pair::Merge, Pair::Prune] {
             let rule = MergeSettings { pair, distance: 0.5, interval: 1 };
             let before = twins();
@@ -240,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn colours_and_sizes_that_differ_are_different_things() {
+    fn gaussians_of_different_colour_or_size_are_not_merged() {
         let rule = MergeSettings { pair: Pair::Merge, distance: 0.5, interval: 1 };
         let mut s = twins();
         for r in 50..75 {

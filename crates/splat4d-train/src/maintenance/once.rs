@@ -41,7 +41,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn it_is_due_before_its_step_and_never_behind_the_last() {
+    fn a_single_operation_is_due_once_at_its_step_and_not_after_the_last() {
         let darker = |s: &mut Scene<f32>| {
             s.background = [0.5; 3];
             Ok(())

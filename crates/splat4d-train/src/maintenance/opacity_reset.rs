@@ -87,7 +87,7 @@ mod tests {
     }
 
     #[test]
-    fn opacities_above_twice_the_dead_one_are_lowered_and_their_moments_forgotten() {
+    fn opacities_above_twice_the_dead_threshold_are_lowered_and_their_moments_cleared() {
         let mut train_state = TrainState::new(scene(20));
         train_state.scene_mut().layers[0].params[GEOMETRY].set(3, OPACITY, -9.0);
         train_state.tables_mut().1[0].table_mut(GEOMETRY).fill(1.0);
@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn it_is_due_until_densification_ends() {
+    fn opacity_resets_end_with_densification() {
         assert_eq!(due_steps(&reset(), 100), [10, 20]);
     }
 }

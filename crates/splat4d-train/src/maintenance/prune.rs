@@ -96,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn a_share_of_the_gaussians_goes() {
+    fn the_given_share_of_gaussians_is_pruned() {
         let (frames, mut train_state) = (Made::new(4, 1, 16), TrainState::new(scene(40)));
         let limits = Limits { cap: 40, extent: 4.0, min_opacity: 0.005 };
         let c = Context { frames: &frames, ..context(limits, 0, 0) };
@@ -105,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn it_leaves_time_to_recover() {
+    fn pruning_ends_early_enough_to_recover() {
         assert_eq!(due_steps(&pruning(), 70), [20, 40, 60]);
         assert_eq!(due_steps(&pruning(), 69), [20, 40]);
     }

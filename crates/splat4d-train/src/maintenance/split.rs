@@ -130,7 +130,7 @@ mod tests {
     use splat4d::scene::{GEOMETRY, LIFE, SH};
 
     #[test]
-    fn what_stands_still_gets_a_layer_of_its_own_and_looks_the_same() {
+    fn static_gaussians_move_to_a_layer_and_the_render_stays() {
         let life = LifeKind::GaussHalf;
         let mut params = splat4d::scene::Params::<f32>::new(40, 1, life.columns());
         let spec = Spec::Spacetime(SpacetimeSpec::default());

@@ -1,4 +1,4 @@
-//! `--motion auto`: looks at the capture, and takes the first program that says why it suits.
+//! `--motion auto`: looks at the capture, and takes the first program that states why it suits.
 
 use super::{Method, TrainContext};
 use crate::Result;
@@ -6,12 +6,12 @@ use crate::capture::Agreement;
 use crate::capture::frames::{Frames, Picture};
 use splat4d::scene::Planes;
 
-/// Cameras of the rig that are looked at, and pairs of neighbouring frames of each.
+/// Cameras of the rig that are examined, and pairs of neighbouring frames of each.
 const LOOKS: (usize, usize) = (4, 8);
 /// A pixel that changes by more than this from frame to frame (mean of the channels, in [0, 1]) has moved: above the
 /// noise of ordinary cameras.
 const CHANGED: f32 = 0.06;
-/// Times from which on a take is long.
+/// Times from which on a capture is long.
 const LONG: usize = 600;
 
 /// The motion that a capture shows.
@@ -32,7 +32,7 @@ pub struct CaptureStats {
     pub masks: bool,
     /// Images have metric depth maps, which are read.
     pub depth: bool,
-    /// The end of the take is kept from training, to be predicted.
+    /// The end of the capture is kept from training, to be predicted.
     pub predicted: bool,
 }
 
@@ -52,7 +52,7 @@ impl CaptureStats {
         })
     }
 
-    /// Whether the take is a long one.
+    /// Whether the capture is a long one.
     pub(crate) fn is_long(&self) -> bool {
         self.times >= LONG
     }
@@ -72,7 +72,7 @@ pub(crate) struct Choice {
     pub why: String,
 }
 
-/// Chooses for the training frames of a capture: the first of the programs that says why it suits.
+/// Chooses for the training frames of a capture: the first of the programs that states why it suits.
 pub(crate) fn choose(
     plan: &TrainContext,
     programs: impl IntoIterator<Item = (&'static str, Box<dyn Method>)>,
@@ -135,7 +135,7 @@ mod tests {
         camera: Camera,
         /// Seconds by which each camera is later than the one before.
         late: f64,
-        /// Share of the take that is seen.
+        /// Share of the capture that is seen.
         observe: f64,
     }
 

@@ -351,7 +351,7 @@ impl Stage {
     }
 }
 
-/// How a Gaussian begins, as far as its seed says it.
+/// How a Gaussian begins, as far as its seed states it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct InitialMotion {
     /// Centre and width of its life, seconds.

@@ -170,7 +170,7 @@ mod tests {
     use splat4d::scene::{GEOMETRY, LIFE, Rows, SH};
 
     #[test]
-    fn equals_the_textbook_and_rests_where_nothing_is_active() {
+    fn adam_equals_the_definition_and_skips_inactive_rows() {
         let mut p = Params::<f64>::new(40, 1, &[]);
         let mut m = Moments::new(&p);
         let mut d = Grads::new(&p);
@@ -256,7 +256,7 @@ mod tests {
     }
 
     #[test]
-    fn pages_cost_nothing_before_they_learn_and_after_they_are_forgotten() {
+    fn moments_exist_only_while_a_page_trains() {
         let (rows, frames) = (100, 5);
         let mut p = Params::<f32>::new(rows, 1, &[]);
         let mut m = Moments::new(&p);

@@ -102,7 +102,7 @@ mod tests {
     use crate::maintenance::tests::scene;
 
     #[test]
-    fn noise_spares_the_opaque_and_the_resting() {
+    fn noise_spares_opaque_and_inactive_gaussians() {
         let mut s = scene(20);
         (0..20).for_each(|r| s.layers[0].params[GEOMETRY].set(r, OPACITY, if r < 10 { -5.5 } else { 2.0 }));
         let before = s.layers[0].params[GEOMETRY].clone();

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// File in the state that says what an unfinished command was asked for.
+/// File in the state that states what an unfinished command was asked for.
 const ASKED: &str = "asked";
 /// Folder in the state with what a replaced run left, until the new one has begun: its files, its list, what it was asked for.
 const ASIDE: &str = "aside";
@@ -87,7 +87,7 @@ enum Plan {
 impl OutputFolder {
     /// Takes a folder for a command, and makes it where it is not there.
     ///
-    /// Errors: it equals, contains or lies inside what is read; another process has it; it holds what would mix with the output
+    /// Errors: it equals, contains or is inside what is read; another process has it; it holds what would mix with the output
     /// and is not to be replaced, or cannot be because there is no record that splat4d wrote it; it cannot be written. Nothing
     /// is changed then.
     pub fn begin(path: &Path, request: &Request<'_>) -> Result<(Self, FolderContent)> {
@@ -209,7 +209,7 @@ impl OutputFolder {
         self
     }
 
-    /// Removes all that says that the folder was ever ours, and the folder where nothing is in it.
+    /// Removes all that states that the folder was ever ours, and the folder where nothing is in it.
     fn give_back(&self, owner: Owner) {
         let _ = std::fs::remove_file(self.path.join(STATE).join(list::FILE));
         owner.remove(&self.path);

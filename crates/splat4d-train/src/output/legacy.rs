@@ -31,7 +31,7 @@ const SPLITS: [&str; 3] = ["test", "val", "train"];
 const INNER: [&str; 2] = ["baseline", "unpruned"];
 /// Start of the comment that points found in images have.
 const FOUND_POINTS: &[u8] = b"comment of ";
-/// Bytes of such a file in which it is looked for.
+/// Bytes of such a file in which it is searched for.
 const HEAD: usize = 512;
 
 /// Whether a folder is a run: its `recipe.toml` or `run.json` is one that we wrote.

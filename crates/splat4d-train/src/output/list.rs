@@ -1,7 +1,7 @@
 //! The list of the files that commands wrote into an output folder: `.splat4d/files`, a path a line, appended to.
 //!
 //! A file's line is written before the file gets its name, so that the list never misses one. Lines that end with a slash are
-//! folders in which files were written; half-written files are looked for there.
+//! folders in which files were written; half-written files are searched for there.
 
 use super::{STATE, cannot_write, check_plain};
 use crate::Result;
@@ -96,13 +96,13 @@ pub(super) fn read_of(folder: &Path) -> BTreeSet<PathBuf> {
     read(&folder.join(STATE).join(FILE))
 }
 
-/// Notes a file that is about to get its name, if it lies in a folder of which a list is kept. Errors: the list cannot be written.
+/// Notes a file that is about to get its name, if it is in a folder of which a list is kept. Errors: the list cannot be written.
 pub fn note(file: &Path) -> Result<()> {
     let Some((list, folder)) = kept(file) else { return Ok(()) };
     file.file_name().map_or(Ok(()), |name| list.add(&folder.join(name)))
 }
 
-/// Whether a file lies in a folder of which a list is kept.
+/// Whether a file is in a folder of which a list is kept.
 pub(super) fn keeps(file: &Path) -> bool {
     kept(file).is_some()
 }
@@ -155,7 +155,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lines_come_back_and_those_that_lead_elsewhere_do_not() {
+    fn list_lines_round_trip_and_foreign_paths_are_dropped() {
         let folder = tempfile::tempdir().unwrap();
         let list = List::keep(folder.path()).unwrap();
         let paths = [PathBuf::from("a b/100 %.png"), PathBuf::from("ü\n.json"), PathBuf::from("test/ours_20/")];

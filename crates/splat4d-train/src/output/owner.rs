@@ -3,7 +3,7 @@
 //! On one machine the lock decides: the system releases it when its process ends, however that happens, so that neither a
 //! reused process number nor a clock that was set plays a part. A lock that is free although the record names another
 //! machine may only mean that the file system does not share locks; then the heartbeat decides. Its age is measured by the
-//! folder's own clock, and where that says "long ago" or "in the future" the record is watched for some beats before it is
+//! folder's own clock, and where that states "long ago" or "in the future" the record is watched for some beats before it is
 //! taken over: a clock that jumps makes no owner dead.
 
 use super::date::rfc3339;
@@ -19,7 +19,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 /// File that is locked; it is empty, and stays.
 const LOCK: &str = "lock";
-/// File that says who has the lock.
+/// File that states who has the lock.
 const RECORD: &str = "owner.json";
 /// Time between two heartbeats.
 const BEAT: Duration = Duration::from_secs(5);
@@ -156,7 +156,7 @@ impl Owner {
         Ok(Ok(Self { record, standing, lock: Some(lock), done, heart: Some(heart) }))
     }
 
-    /// The same; that another process has it is an error that says who.
+    /// The same; that another process has it is an error that states who.
     pub fn of(folder: &Path, command: &str) -> Result<Self> {
         Self::take(folder, command)?.map_err(|who| in_use(folder, who.as_ref()))
     }
@@ -172,7 +172,7 @@ impl Owner {
         }
     }
 
-    /// Gives the folder back and removes all that says that it was ever owned: while the lock is held, so that no other process has it.
+    /// Gives the folder back and removes all that states that it was ever owned: while the lock is held, so that no other process has it.
     pub(super) fn remove(mut self, folder: &Path) {
         self.rest();
         discard(&folder.join(STATE));
@@ -369,7 +369,7 @@ mod tests {
     }
 
     #[test]
-    fn an_owner_elsewhere_lives_as_long_as_its_heart_beats_whatever_clocks_say() {
+    fn a_remote_owner_is_alive_while_its_heartbeat_changes() {
         let folder = tempfile::tempdir().unwrap();
         let hour = Duration::from_secs(3600);
         let take = || Owner::with_patience(folder.path(), "train", QUICK).unwrap();

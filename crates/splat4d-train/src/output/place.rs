@@ -1,6 +1,6 @@
 //! Where an output folder lies, compared with what is read.
 //!
-//! Folders are compared by what the file system says they are (device and number), so that links, mounts, `..` and names
+//! Folders are compared by what the file system states they are (device and number), so that links, mounts, `..` and names
 //! that only differ in case are seen through.
 
 use crate::{Error, Result};
@@ -13,18 +13,18 @@ pub struct Input<'a> {
     pub path: &'a Path,
     /// What it is, for errors: `the capture`.
     pub what: &'a str,
-    /// Whether the output may lie in it, as renders lie in their run.
+    /// Whether the output may be in it, as renders are in their run.
     pub may_hold: bool,
 }
 
 impl<'a> Input<'a> {
-    /// An input that no output may lie in.
+    /// An input that no output may be in.
     pub fn new(path: &'a Path, what: &'a str) -> Self {
         Self { path, what, may_hold: false }
     }
 }
 
-/// Refuses an output folder that equals, contains or lies inside an input. Missing inputs are reported by
+/// Refuses an output folder that equals, contains or is inside an input. Missing inputs are reported by
 /// their readers.
 pub fn check_apart(output: &Path, inputs: &[Input<'_>]) -> Result<()> {
     let above_output = ids(output);
@@ -112,7 +112,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_output_lies_apart_from_what_is_read() {
+    fn an_output_inside_or_around_an_input_is_refused() {
         let work = tempfile::tempdir().unwrap();
         let at = |name: &str| work.path().join(name);
         std::fs::create_dir_all(at("capture/images")).unwrap();

@@ -16,7 +16,7 @@ const NAME_BYTES: usize = 180;
 const LEFT_OVER: Duration = Duration::from_secs(3600);
 /// Numbers of this process's temporary files.
 static NUMBER: AtomicU64 = AtomicU64::new(0);
-/// Folders in which this process has looked for leftovers.
+/// Folders in which this process has searched for leftovers.
 static LOOKED: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
 
 /// `.NAME.MACHINE-PROCESS-NUMBER.splat4d-tmp`, of a long name only the beginning.

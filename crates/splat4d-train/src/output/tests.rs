@@ -42,7 +42,7 @@ fn run(folder: &Path, text: &str) {
 }
 
 #[test]
-fn force_replaces_what_splat4d_wrote_and_keeps_what_is_the_users() {
+fn force_replaces_files_of_splat4d_and_keeps_user_files() {
     let work = tempfile::tempdir().unwrap();
     let folder = work.path().join("run");
     run(&folder, "old");
@@ -161,7 +161,7 @@ fn force_is_refused_where_there_is_no_run() {
 }
 
 #[test]
-fn of_a_run_without_a_list_only_sure_names_go() {
+fn without_a_file_list_only_known_names_are_removed() {
     let work = tempfile::tempdir().unwrap();
     let folder = work.path();
     let recipe = Recipe::default().to_toml();
@@ -195,7 +195,7 @@ fn of_a_run_without_a_list_only_sure_names_go() {
 }
 
 #[test]
-fn a_list_that_leads_elsewhere_removes_nothing_there() {
+fn a_file_list_with_foreign_paths_removes_nothing_outside() {
     let work = tempfile::tempdir().unwrap();
     let (folder, other) = (work.path().join("run"), work.path().join("other"));
     std::fs::create_dir_all(&other).unwrap();
@@ -216,7 +216,7 @@ fn a_list_that_leads_elsewhere_removes_nothing_there() {
 }
 
 #[test]
-fn the_same_command_continues_and_another_does_not() {
+fn a_partial_output_is_continued_by_the_same_command_only() {
     let work = tempfile::tempdir().unwrap();
     let folder = work.path().join("run");
     let begin = |asked: &str| OutputFolder::begin(&folder, &request(asked, false));
@@ -246,7 +246,7 @@ fn the_same_command_continues_and_another_does_not() {
 }
 
 #[test]
-fn a_sequence_does_not_take_over_the_tail_of_another() {
+fn a_sequence_removes_leftover_frames_of_an_older_one() {
     let work = tempfile::tempdir().unwrap();
     let folder = work.path().join("frames");
     let is = |n: &OsStr| n.to_string_lossy().starts_with("frame_");
@@ -287,7 +287,7 @@ fn a_sequence_does_not_take_over_the_tail_of_another() {
 /// Folders come from other people, who can put a link or a pipe in place of any file that a command writes.
 #[cfg(unix)]
 #[test]
-fn links_and_pipes_in_place_of_our_files_lead_nowhere() {
+fn links_and_pipes_at_output_names_are_not_followed() {
     use std::os::unix::fs::symlink;
     let work = tempfile::tempdir().unwrap();
     let (folder, mine) = (work.path().join("run"), work.path().join("mine.txt"));

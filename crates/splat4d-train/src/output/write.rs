@@ -107,7 +107,7 @@ mod tests {
     use std::time::SystemTime;
 
     #[test]
-    fn what_dead_processes_left_is_removed_and_nothing_else() {
+    fn only_temporary_files_of_dead_processes_are_removed() {
         let folder = tempfile::tempdir().unwrap();
         let at = |name: String| folder.path().join(name);
         let own = std::process::id();

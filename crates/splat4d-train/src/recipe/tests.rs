@@ -48,7 +48,7 @@ fn names_are_distinct_and_all_are_known() {
 }
 
 #[test]
-fn tables_flat_names_and_assignments_say_the_same() {
+fn tables_flat_names_and_assignments_are_equivalent() {
     let tables = "[run]\niterations = 300\n[densify]\nfrom = 40\nmax_cap = 2e4\n[life]\nkind = \"interval\"\n";
     let mixed = "iterations = 300\nlife = \"interval\"\n[densify]\ndensify_from_iter = 40\nmax_cap = 20000\n";
     let set = ["run.iterations=300", "densify_from_iter = 40", "densify.max_cap=2e4", "life=interval"];
@@ -59,7 +59,7 @@ fn tables_flat_names_and_assignments_say_the_same() {
 }
 
 #[test]
-fn numbers_may_be_written_as_people_write_them() {
+fn assignments_accept_exponents_and_spaces() {
     let r = Recipe::of(&["position_lr_init=1", "max_cap=2e4", "motion = still"]).unwrap();
     assert_eq!((r.rates.position_init, r.densify.max_cap, r.run.motion.as_str()), (1.0, 20_000, "still"));
 }
@@ -93,7 +93,7 @@ fn resolve_sets_everything_and_every_setting_is_documented() {
 }
 
 #[test]
-fn words_come_back_and_wrong_ones_get_a_suggestion() {
+fn choices_round_trip_and_wrong_ones_get_a_suggestion() {
     for setting in Recipe::settings() {
         for word in &setting.choices {
             let mut r = Recipe::default();
@@ -163,7 +163,7 @@ fn settings_without_effect_are_found_with_their_condition() {
 }
 
 #[test]
-fn what_followed_from_the_length_follows_from_another_one_and_what_was_chosen_stays() {
+fn derived_settings_follow_a_new_length_and_chosen_ones_stay() {
     let saved = Recipe::of(&["densify_until_iter=777", "run.replans=[[5,90],[40,60]]"]).unwrap().resolve();
     let read = Recipe::from_toml(&saved.to_toml()).unwrap();
     assert_eq!(read, saved);
@@ -177,7 +177,7 @@ fn what_followed_from_the_length_follows_from_another_one_and_what_was_chosen_st
 }
 
 #[test]
-fn qualities_take_more_from_one_to_the_next() {
+fn each_quality_costs_more_than_the_one_below() {
     let [draft, standard, best] = Quality::ALL.map(|q| Recipe::default().of_quality(q));
     assert_eq!(standard, Recipe::default());
     let takes = |r: &Recipe| (r.run.iterations, r.densify.max_cap);

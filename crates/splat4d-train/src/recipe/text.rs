@@ -124,7 +124,7 @@ impl Recipe {
         out
     }
 
-    /// Errors: one of these settings, by either of its names, does nothing in this recipe. Where it says that
+    /// Errors: one of these settings, by either of its names, does nothing in this recipe. Where it states that
     /// something is not
     /// to be, training warns.
     pub fn refuse_unused<'a>(&self, set: impl Iterator<Item = &'a str>) -> Result<()> {
@@ -193,7 +193,7 @@ impl Recipe {
 pub(crate) struct UnusedSetting {
     /// `table.field`.
     pub key: String,
-    /// Whether it says that something is not to be, which it is not anyhow.
+    /// Whether it states that something is not to be, which it is not anyhow.
     pub off: bool,
     /// The condition that is not met.
     pub needs: String,

@@ -103,7 +103,7 @@ impl Planner {
     /// Begins at so many seconds of the command, behind these plans.
     pub(super) fn new(budget: Budget, now: f64, replans: &[ScheduleChange]) -> Self {
         let last = replans.last().map_or(0, |row| row.at);
-        // A part that begins late in a command is looked at as often as one that begins at once.
+        // A part that begins late in a command is examined as often as one that begins at once.
         let interval = (60.0 * budget.minutes - now).max(0.0) / LOOKS;
         Self { budget, interval, looked: now, taken: [0.0; 2], slowness: None, last }
     }
@@ -227,14 +227,14 @@ mod tests {
     }
 
     #[test]
-    fn a_machine_that_keeps_its_speed_keeps_the_plan() {
+    fn constant_speed_keeps_the_plan() {
         let (end, _, rows) = drive(&|_, _| 1.0);
         // A run has whole Gaussians, a plan while they grow a fraction of one more.
         assert!(rows.is_empty() && (end - 1.0).abs() < 1e-4, "{end} {rows:?}");
     }
 
     #[test]
-    fn the_end_comes_on_time_on_machines_that_turn_slower_and_faster() {
+    fn runs_end_on_time_when_the_machine_changes_speed() {
         let jitter = |i: usize| (0.5 * Rng::new(3, "jitter", i as u64).normal(0)).exp();
         type Machine<'a> = &'a dyn Fn(f64, usize) -> f64;
         let machines: [(&str, Machine<'_>); 9] = [
@@ -257,7 +257,7 @@ mod tests {
 
     /// A run that cannot be kept to its time is not taken to pieces for it.
     #[test]
-    fn a_step_never_stands_for_more_than_a_few_of_the_schedule() {
+    fn a_step_replaces_at_most_a_few_scheduled_steps() {
         let (end, _, rows) = drive(&|t, _| if t < 0.3 { 1.0 } else { 100.0 });
         let total = rows.last().unwrap().total;
         assert!(end > 1.1 && total > STEPS / MOST / 2, "{end} {total}");

@@ -4,7 +4,7 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Seconds since a command began, as the system's clock or a test says.
+/// Seconds since a command began, as the system's clock or a test states.
 #[derive(Clone)]
 pub struct Stopwatch(Arc<dyn Fn() -> f64 + Send + Sync>);
 
@@ -15,7 +15,7 @@ impl Stopwatch {
         Self::of(move || start.elapsed().as_secs_f64())
     }
 
-    /// What a function says; it never decreases.
+    /// What a function states; it never decreases.
     pub fn of(seconds: impl Fn() -> f64 + Send + Sync + 'static) -> Self {
         Self(Arc::new(seconds))
     }

@@ -161,13 +161,13 @@ mod tests {
         assert_eq!(number(room, 1000.0, 1.0), 45_000);
         assert_eq!(number(walk, 7000.0, 1.0), 315_000);
         assert_eq!(number(walk, 20_000.0, 2.0), 900_000);
-        // 132 frames of 480x270: the walk that stands still, and one in which something moves.
+        // 132 frames of 480x270: the walk that is static, and one in which something moves.
         let of = |motion: &str| number(132.0 * 129.6e3 / each(&recipe(&[&format!("motion={motion}")])), 7000.0, 1.0);
         assert_eq!([of("still"), of("spacetime")], [142_000, 48_000]);
     }
 
     #[test]
-    fn what_fits_the_minutes_settles() {
+    fn the_count_that_fits_the_minutes_converges() {
         // Steps cost in proportion to the Gaussians: 900 M of both fit.
         let steps = |count: usize| Ok(900_000_000 / count);
         let count = settled(500_000, 1.0, steps).unwrap();

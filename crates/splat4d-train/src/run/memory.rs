@@ -163,7 +163,7 @@ mod tests {
     }
 
     #[test]
-    fn what_takes_more_is_estimated_to_take_more() {
+    fn memory_estimates_grow_with_the_work() {
         let place = Place::new();
         let estimate = |line: &str| {
             let r = recipe(&line.split(' ').collect::<Vec<_>>()).resolve();

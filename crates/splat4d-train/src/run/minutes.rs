@@ -1,5 +1,5 @@
 //! The time that steps take, found out before a run: a few steps are timed at the initial and at the capped number of
-//! Gaussians, and the schedule's own densification says how many there are when. `--minutes M` begins with as many
+//! Gaussians, and the schedule's own densification states how many there are when. `--minutes M` begins with as many
 //! iterations as fit by that; [`budget`](super::budget) plans again when the machine turns out to be slower or faster.
 
 use super::clock::Stopwatch;
@@ -211,10 +211,10 @@ impl Probe<'_> {
     }
 
     fn step(&mut self) -> Result<()> {
-        // A device is not to be still at it when the clock is looked at.
+        // A device is not to be still at it when the clock is examined.
         match self.trainer.step()?.and_then(|_| self.trainer.catch_up()) {
             Ok(_) => Ok(()),
-            // The run that follows looks for itself whether there is one.
+            // The run that follows searches for itself whether there is one.
             Err(Fault(_, Blame::Device, _)) => {
                 self.trainer.go_on();
                 self.step()

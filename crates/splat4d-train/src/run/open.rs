@@ -48,12 +48,12 @@ pub fn capture_options(recipe: &Recipe) -> Result<CaptureOptions> {
     })
 }
 
-/// Opens a capture as a recipe wants it: scale, split, and the part of the take that is used.
+/// Opens a capture as a recipe wants it: scale, split, and the part of the capture that is used.
 pub fn open_capture(path: &Path, recipe: &Recipe) -> Result<Capture> {
     open_frames(path, recipe, Vec::new(), &Lenses::default())
 }
 
-/// The same for a part of a long take: only images with these frame numbers are listed ([`CaptureOptions::frames`]). `lenses`:
+/// The same for a part of a long capture: only images with these frame numbers are listed ([`CaptureOptions::frames`]). `lenses`:
 /// what another part of it found ([`Capture::lenses`]).
 pub fn open_frames(path: &Path, recipe: &Recipe, frames: Vec<Range<usize>>, lenses: &Lenses) -> Result<Capture> {
     let options = CaptureOptions { frames, lenses: lenses.clone(), ..capture_options(recipe)? };

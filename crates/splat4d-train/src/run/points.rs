@@ -27,10 +27,10 @@ const BARE: f64 = 0.2;
 /// Cells along an image's longer side in which that is counted; of a rig at most so many views.
 const CELLS: f64 = 16.0;
 const VIEWS: usize = 64;
-/// Of the initial Gaussians, the points that are looked for: what lies between them is laid along surfaces.
+/// Of the initial Gaussians, the points that are searched for: what is between them is laid along surfaces.
 const WANTED: f64 = 0.5;
 
-/// The capture with points from its images, where it brings too few and the recipe lets them be looked for.
+/// The capture with points from its images, where it brings too few and the recipe lets them be searched for.
 pub(super) fn complete(
     opened: OpenCapture,
     recipe: &Recipe,
@@ -134,7 +134,7 @@ mod tests {
     use std::sync::atomic::AtomicBool;
 
     #[test]
-    fn points_are_looked_for_once_and_belong_to_the_run() {
+    fn points_are_searched_once_and_stored_with_the_run() {
         let (place, recipe) = (Place::new(), recipe(&["init=auto", "motion=still"]));
         let run = place.run("own");
         let train = || {
@@ -174,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn who_has_few_points_or_leaves_out_a_part_of_the_images_and_no_cut_out_object_is_looked_at() {
+    fn points_are_searched_for_sparse_or_partial_clouds_but_not_for_cut_out_objects() {
         let place = Place::new();
         let wants = |sets: &[&str], spread: &dyn Fn(&Capture) -> Vec<[f64; 3]>, background: Option<[f32; 3]>| {
             let recipe = recipe(sets);
@@ -198,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn what_no_point_is_near_is_uncovered() {
+    fn pixels_without_a_near_point_are_uncovered() {
         let place = Place::new();
         let capture = Capture::clone(&place.open(&recipe(&[])));
         let camera = capture.places().next().unwrap();

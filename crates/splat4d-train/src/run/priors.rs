@@ -12,7 +12,7 @@ use splat4d::layers::{Evaluation, Scene};
 use splat4d::render::{Antialias, Image, RenderConfig, Renderer, Shot};
 use std::sync::Arc;
 
-/// Frames that are looked at, evenly chosen.
+/// Frames that are examined, evenly chosen.
 const LOOKED_AT: usize = 8;
 /// Flow shorter than this has no reliable direction, pixels.
 const SHORT: f32 = 1.0;
@@ -145,7 +145,7 @@ fn flow_reads(capture: &Capture, store: &ImageStore, frame: usize) -> Result<Opt
     }))
 }
 
-/// How metric depth lies to the capture's points.
+/// How metric depth relates to the capture's points.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Depths {
     /// They agree, or cannot be compared.
@@ -156,7 +156,7 @@ enum Depths {
     Foreign(f64),
 }
 
-/// By training frame with a metric map, of those that are looked at: ln(z/D) of the points that stand still in it.
+/// By training frame with a metric map, of those that are examined: ln(z/D) of the points that are static in it.
 fn ratios(opened: &OpenCapture) -> Result<Vec<(usize, Vec<f64>)>> {
     let capture = &opened.capture;
     let Some(cloud) = capture.points.as_ref() else { return Ok(Vec::new()) };
@@ -178,7 +178,7 @@ fn ratios(opened: &OpenCapture) -> Result<Vec<(usize, Vec<f64>)>> {
     Ok(all)
 }
 
-/// How the metric depth maps of a capture lie to its points: by where their ratios are densest, since a point that something hides
+/// How the metric depth maps of a capture relate to its points: by where their ratios are densest, since a point that something hides
 /// is farther away than what is seen there.
 fn depths(opened: &OpenCapture) -> Result<Depths> {
     let mut ratios: Vec<f64> = ratios(opened)?.into_iter().flat_map(|(_, ratios)| ratios).collect();
@@ -333,7 +333,7 @@ mod tests {
     }
 
     #[test]
-    fn maps_are_taken_in_the_unit_of_the_points_and_left_out_where_they_contradict_them() {
+    fn depth_maps_are_scaled_to_the_points_and_ignored_if_they_contradict() {
         let folder = tempfile::tempdir().unwrap();
         let recipe = Recipe::default();
         let scales = |o: &OpenCapture| -> Vec<Option<f64>> {
@@ -359,7 +359,7 @@ mod tests {
         let (hidden, _) =
             believed(opened(folder.path(), "metric", &|x| depth(x) * if x < 21 { 1.0 } else { 0.5 }), &recipe).unwrap();
         assert_eq!(before(&hidden, &recipe).unwrap(), Vec::<String>::new());
-        // What claims no unit is held against the scene alone, and what is not read is not looked at.
+        // What claims no unit is held against the scene alone, and what is not read is not examined.
         let relative = opened(folder.path(), "relative", &|x| depth(SIDE - 1 - x));
         assert_eq!(believed(relative, &recipe).unwrap().1, None);
         let off = recipe.with(|r| r.loss.depth = 0.0);

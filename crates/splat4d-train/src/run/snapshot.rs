@@ -18,7 +18,7 @@ use std::time::{Duration, Instant};
 
 /// Training goes on for so many times as long as the last snapshot took: at most 2.5 % of the time.
 const REST: u32 = 40;
-/// Entries of the palette, rounds that fit it, effort of deflate: a snapshot is looked at for seconds.
+/// Entries of the palette, rounds that fit it, effort of deflate: a snapshot is examined for seconds.
 const PALETTE: usize = 256;
 const ROUNDS: usize = 1;
 const EFFORT: u32 = 1;

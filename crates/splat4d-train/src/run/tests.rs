@@ -461,7 +461,7 @@ fn foreign_checkpoints_are_refused_with_a_reason() {
     std::fs::write(run.join("recipe.toml"), other.to_toml()).unwrap();
     let error = resume_quietly(&run).unwrap_err().to_string();
     assert!(error.contains("another recipe") && error.contains("start a new run"), "{error}");
-    // What only says how memory is spent may change.
+    // What only states how memory is spent may change.
     let run = copy("memory");
     let other = base.resolve().with(|r| {
         r.run.image_memory = 1 << 20;
@@ -543,7 +543,7 @@ fn minutes_fix_a_recipe_that_repeats() {
 }
 
 #[test]
-fn where_no_gaussian_is_opaque_images_show_their_mean_colour_and_others_what_they_were_cut_out_of() {
+fn opaque_captures_get_their_mean_colour_as_background_and_masked_ones_their_own() {
     let (place, recipe) = (Place::new(), recipe(&[]));
     let shown = |capture: Arc<Capture>| {
         let opened = OpenCapture::new(capture, &recipe).unwrap();
@@ -587,7 +587,7 @@ fn exposure_is_learned_for_rigs_and_for_one_camera_only_if_set() {
 }
 
 #[test]
-fn who_watches_changes_nothing() {
+fn observers_do_not_change_the_bits() {
     let place = Place::new();
     let base = recipe(&["hold_out=camera=0"]);
     place.train("alone", &base).unwrap();
@@ -612,7 +612,7 @@ fn who_watches_changes_nothing() {
 }
 
 #[test]
-fn scenes_with_a_head_are_judged_with_it_and_refuse_what_cannot_hold_it() {
+fn scenes_with_a_head_are_evaluated_with_it_and_not_exported_without() {
     use crate::eval::run::{EvalOptions, evaluate};
     use splat4d::bake::{Options, bake};
     use splat4d::layers::{Head, freeze};
@@ -665,7 +665,7 @@ fn scenes_with_a_head_are_judged_with_it_and_refuse_what_cannot_hold_it() {
 }
 
 #[test]
-fn figures_say_what_they_hold_for_and_what_is_colour_in_them() {
+fn results_report_conditions_and_colour_corrected_psnr() {
     use crate::eval::run::{EvalOptions, Measured, evaluate};
     let place = Place::new();
     let recipe = recipe(&["hold_out=camera=0"]);
@@ -716,7 +716,7 @@ fn figures_say_what_they_hold_for_and_what_is_colour_in_them() {
 }
 
 #[test]
-fn checkpoints_of_before_recipes_had_tables_know_their_recipe() {
+fn checkpoints_with_flat_recipes_are_read() {
     let recipe = Recipe::from_toml(include_str!("../recipe/tests/flat-changed.toml")).unwrap();
     assert_eq!(recipe_print(&recipe, ""), "c963d9ac12b354b3", "what the code of then made of it");
 }

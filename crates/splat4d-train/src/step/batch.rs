@@ -21,7 +21,7 @@ pub(super) struct Batch {
 }
 
 impl Batch {
-    /// Loads the frames `seen`, at half their size where `half` says so, from where and when `corrections` say. `rng` draws the
+    /// Loads the frames `seen`, at half their size where `half` states so, from where and when `corrections` say. `rng` draws the
     /// frames to which points are followed.
     pub(super) fn load(
         &mut self,

@@ -305,7 +305,7 @@ impl<F: Real> Compared<F> {
         }
     }
 
-    /// The gradient to the further channels, if a term has looked at them.
+    /// The gradient to the further channels, if a term has examined them.
     fn d_channels(&self) -> Option<&Table<F>> {
         self.d_splats.extra.as_ref().filter(|_| self.d_image.extra.get().is_some())
     }

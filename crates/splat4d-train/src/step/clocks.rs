@@ -16,7 +16,7 @@ use splat4d::render::{Antialias, Image, RenderConfig, Shot};
 use splat4d::scene::{Planes, Time};
 use std::collections::BTreeMap;
 
-/// Images of a camera that are looked at, spread over the take.
+/// Images of a camera that are examined, spread over the capture.
 const LOOKS: usize = 6;
 /// Neighbouring searches look at other images: at so many places between two of them, in turn.
 const TURNS: usize = 3;
@@ -120,7 +120,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_least_shift_is_the_vertex_of_a_parabola_and_none_where_all_cost_the_same() {
+    fn the_best_shift_is_a_parabolas_vertex_and_zero_for_equal_costs() {
         let shifts: Vec<f64> = (-4..=4).map(|k| 0.5 * f64::from(k)).collect();
         let costs = |f: &dyn Fn(f64) -> f64| shifts.iter().map(|&s| f(s)).collect::<Vec<_>>();
         let found = least(&shifts, &costs(&|s| 3.0 + (s - 0.63).powi(2)));

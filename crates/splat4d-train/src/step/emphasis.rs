@@ -22,7 +22,7 @@ const ROWS: usize = 16;
 pub(crate) struct Emphasis {
     /// k: how much more than others a pixel weighs that shows nothing but what moves.
     strength: f32,
-    /// By camera: its temporal median, channel by channel at the size that images are looked at in, as bytes.
+    /// By camera: its temporal median, channel by channel at the size that images are examined in, as bytes.
     still: BTreeMap<usize, [Vec<u8>; 3]>,
     /// Scratch: Σ ψ/3 by pixel at that size.
     moves: Planes<f32>,
@@ -155,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_emphasised_without_fixed_cameras_or_times() {
+    fn without_fixed_cameras_or_times_all_pixel_weights_are_one() {
         assert!(Emphasis::new(&Made::new(3, 5, 4), 0.0).unwrap().is_none());
         assert!(Emphasis::new(&Made::new(3, 2, 4), 1.0).unwrap().is_none(), "two moments have no median");
     }

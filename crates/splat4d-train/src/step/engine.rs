@@ -1,5 +1,5 @@
 //! [`Engine`]: takes steps on a learner. The processor's is [`CpuEngine`]; one whose tables stay on a device can stand in its
-//! place, since a plan says all that a step is of, and a learner says what happened to it between steps.
+//! place, since a plan states all that a step is of, and a learner states what happened to it between steps.
 
 use super::chain::{Chain, ImageTerm, Losses, Step, StepInfo, StepReport, View};
 use super::loss::TrainLoss;
@@ -82,7 +82,7 @@ pub enum Blame {
 }
 
 /// A step that was spoilt, so that nothing of the learner is to be trusted any more: what and where, by what, and the numbers of the
-/// frames that it looked at, where it is not the last one that was begun.
+/// frames that it examined, where it is not the last one that was begun.
 #[derive(Clone, Debug)]
 pub struct Fault(pub String, pub Blame, pub Option<Vec<usize>>);
 

@@ -83,7 +83,7 @@ mod tests {
 
     /// The schedule is gone through in order, to its end and with the last step only, and in equal parts.
     #[test]
-    fn every_change_of_plan_goes_on_from_where_the_run_was() {
+    fn every_replanning_continues_the_schedule() {
         for rows in [vec![row(1, 2)], vec![row(7, 900), row(8, 30)], vec![row(99, 100), row(150, 151)]] {
             let pace = Pace::new(1000, &rows);
             for (k, row) in rows.iter().enumerate() {

@@ -28,7 +28,7 @@ enum Newest {
     TrainState,
     /// Both have the same.
     Both,
-    /// The device: the learner is to be settled before it is looked at.
+    /// The device: the learner is to be settled before it is examined.
     Device,
 }
 

@@ -350,7 +350,7 @@ impl<'a> Trainer<'a> {
         self.engine.stages()
     }
 
-    /// A fault with the names of the frames that were looked at, where they may be to blame.
+    /// A fault with the names of the frames that were examined, where they may be to blame.
     fn named(&self, fault: Fault) -> Fault {
         let Fault(what, blame, frames) = fault;
         if blame == Blame::Device {

@@ -282,7 +282,7 @@ mod tests {
     }
 
     #[test]
-    fn all_pixels_are_followed_but_those_that_vanish() {
+    fn flow_is_found_for_all_pixels_except_occluded_ones() {
         let (all, way) = ([2.3, -1.4], [-7.0, 5.5]);
         let (a, b) = (scene([0.0; 2], [0.0; 2]), scene(all, way));
         let flow = dense(&Pyramid::new(a), &Pyramid::new(b));

@@ -29,7 +29,7 @@ const OVERLAP: f64 = 0.3;
 /// Largest distance from an epipolar line and from where a point is seen, pixels.
 const OFF: f64 = 1.5;
 /// The second best match must be this many times farther away (Lowe 2004: 0.8). Along a line are few, so that
-/// this says less than in a whole image: points that only two cameras see must have more.
+/// this states less than in a whole image: points that only two cameras see must have more.
 const RATIO: f64 = 0.8;
 const RATIO_OF_TWO: f64 = 0.7;
 /// Descriptors farther apart than this have nothing in common: of two bytes' descriptors the squared distance is at most

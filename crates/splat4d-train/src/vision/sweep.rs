@@ -1,7 +1,7 @@
 //! Points on surfaces, by plane sweep: a window of one image is laid at many depths and compared with its neighbours
 //! there (normalised cross-correlation; Collins 1996).
 //!
-//! Not every pixel: the window with the strongest texture of every cell of a lattice, so that points lie evenly in
+//! Not every pixel: the window with the strongest texture of every cell of a lattice, so that points are spread evenly in
 //! images and the work follows from how many are wanted. The window is tilted at the best depth (floors and walls are
 //! rarely seen from in front), and neighbours must find the same depth by themselves.
 
@@ -15,7 +15,7 @@ use splat4d::math::se3::{norm, sub};
 pub(crate) struct Swept {
     /// In the world.
     pub point: [f64; 3],
-    /// Colour of the pixel where it was looked for, in [0, 1].
+    /// Colour of the pixel where it was searched for, in [0, 1].
     pub color: [f32; 3],
 }
 
@@ -66,11 +66,11 @@ const ANGLE_SPREAD: [f64; 2] = [4.0, 16.0];
 /// Angles at which windows cannot be compared, degrees.
 const ANGLES: std::ops::RangeInclusive<f64> = 1.0..=45.0;
 
-/// A view, its neighbours, and the depths that are looked at.
+/// A view, its neighbours, and the depths that are examined.
 struct Reference<'a> {
     view: &'a View,
     others: Vec<Other<'a>>,
-    /// Inverse depths are multiples of this, from 0 on: the farthest background lies at no depth that can be measured.
+    /// Inverse depths are multiples of this, from 0 on: the farthest background is at no depth that can be measured.
     step: f64,
     depths: usize,
 }
@@ -125,7 +125,7 @@ pub(crate) fn sweep(views: &[View], known: &[[f64; 3]], count: usize) -> Vec<Swe
             Some(Swept { point, color: reference.view.color(pixel) })
         })
         .collect();
-    // Every n-th of a lattice, row by row, lies evenly too.
+    // Every n-th of a lattice, row by row, is spread evenly too.
     spread(found.len(), count).map(|k| found[k]).collect()
 }
 
@@ -237,7 +237,7 @@ impl<'a> Reference<'a> {
         self.step * k as f64
     }
 
-    /// Where a window lies in depth; `None` where neighbours do not agree on it, or as well elsewhere.
+    /// Where a window is in depth; `None` where neighbours do not agree on it, or as well elsewhere.
     fn find(&self, window: &Window) -> Option<Patch> {
         let flat = |inverse: f64| Patch { inverse, tilt: [0.0; 2] };
         let scores: Vec<f32> = (0..self.depths).map(|k| self.alike(window, flat(self.inverse(k)))).collect();

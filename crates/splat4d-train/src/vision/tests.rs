@@ -15,7 +15,7 @@ struct Room {
     /// Length of what is one in the descriptions below.
     unit: f64,
     textured: bool,
-    /// No wall, but what lies a hundred times as far away.
+    /// No wall, but what is a hundred times as far away.
     far: bool,
     panel: bool,
     /// Frames of one moving camera, and not of a camera each.
@@ -26,7 +26,7 @@ struct Room {
 type Plane = ([f64; 3], f64);
 const WALL: Plane = ([-0.3, 0.0, 1.0], 1.0);
 const FLOOR: Plane = ([0.0, 1.0, 0.0], 1.2);
-/// What lies behind a room without a wall, and how much larger its texture is.
+/// What is behind a room without a wall, and how much larger its texture is.
 const HORIZON: Plane = ([0.0, 0.0, 1.0], 500.0);
 const LARGER: f64 = 100.0;
 /// Depth of the panel and half its edge, units.
@@ -150,13 +150,13 @@ impl Frames for Room {
     }
 }
 
-/// Share of the points that lie within a hundredth of their depth of a surface.
+/// Share of the points that are within a hundredth of their depth of a surface.
 fn share_on(room: &Room, points: &[Point], moment: Option<usize>) -> f64 {
     points.iter().filter(|p| room.off(p.place, moment) < 0.01).count() as f64 / points.len().max(1) as f64
 }
 
 #[test]
-fn points_lie_on_the_surfaces_in_any_unit() {
+fn points_are_on_the_surfaces_in_any_unit() {
     for unit in [1.0, 1e-3, 1e3] {
         let room = Room::new(6, unit);
         let found = room.points(&[], 300);
@@ -170,7 +170,7 @@ fn points_lie_on_the_surfaces_in_any_unit() {
 }
 
 #[test]
-fn features_alone_lie_on_the_surfaces() {
+fn points_from_features_alone_are_on_the_surfaces() {
     let room = Room::new(6, 1.0);
     let views = Rigs::of(&room).still(&room).unwrap();
     let tracks = matching::tracks(&views);
@@ -250,7 +250,7 @@ fn wrong_poses_give_few_points() {
 }
 
 #[test]
-fn what_moves_keeps_its_time_and_what_stands_has_none() {
+fn dynamic_points_keep_their_time_and_static_points_have_none() {
     let room = Room { moments: 6, panel: true, ..Room::new(6, 1.0) };
     let moment = 3;
     let found = room.points(&[room.time_of(moment)], 300);
@@ -266,7 +266,7 @@ fn what_moves_keeps_its_time_and_what_stands_has_none() {
 }
 
 #[test]
-fn one_moving_camera_shows_what_stands_still() {
+fn static_points_are_found_with_one_moving_camera() {
     let room = Room { one_camera: true, ..Room::new(10, 1.0) };
     let found = room.points(&[0.0], 200);
     assert!(found.len() >= 100 && found.iter().all(|p| p.time.is_none()), "{}", found.len());

@@ -153,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn one_place_and_rays_that_part_give_no_point() {
+    fn equal_positions_and_diverging_rays_give_no_point() {
         let one = camera(0.5, 1.0);
         let same = [PixelObservation { camera: &one, pixel: [10.0, 20.0] }; 2];
         assert!(triangulate(&same).is_none());

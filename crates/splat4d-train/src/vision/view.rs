@@ -1,4 +1,4 @@
-//! The images that points are looked for in: the static background as fixed cameras see it, single times, or the frames
+//! The images that points are searched for in: the static background as fixed cameras see it, single times, or the frames
 //! of moving cameras.
 
 use super::raster::{blurred, grey};
@@ -9,7 +9,7 @@ use splat4d::math::median_by;
 use splat4d::scene::{Camera, Planes};
 use std::collections::BTreeMap;
 
-/// Images that are looked at together, at most, evenly chosen.
+/// Images that are examined together, at most, evenly chosen.
 const VIEWS: usize = 64;
 /// Images are halved until they have no more pixels than this: finer detail places points no better than Gaussians
 /// need.
@@ -24,7 +24,7 @@ const MOVED: f32 = 0.06;
 /// Differences are blurred by so many pixels: single ones are noise.
 const MOVED_BLUR: f64 = 1.0;
 
-/// An image to look for points in.
+/// An image to search for points in.
 pub(crate) struct View {
     /// Where it was taken from; its size is the image's.
     pub camera: Camera,
@@ -32,7 +32,7 @@ pub(crate) struct View {
     pub colors: Vec<[u8; 3]>,
     /// The mean of the channels.
     pub grey: Planes<f32>,
-    /// Pixels in which points are looked for.
+    /// Pixels in which points are searched for.
     pub wanted: Vec<bool>,
 }
 
@@ -43,7 +43,7 @@ impl View {
         Self { camera, colors, grey: grey(color), wanted }
     }
 
-    /// Whether points are looked for in a pixel.
+    /// Whether points are searched for in a pixel.
     pub(crate) fn wants(&self, x: usize, y: usize) -> bool {
         self.wanted[y * self.camera.width + x]
     }
@@ -55,7 +55,7 @@ impl View {
         self.colors[y * self.camera.width + x].map(|c| f32::from(c) / 255.0)
     }
 
-    /// Whether a pixel position lies inside the image.
+    /// Whether a pixel position is inside the image.
     pub(crate) fn holds(&self, [u, v]: [f64; 2]) -> bool {
         (0.0..self.camera.width as f64).contains(&u) && (0.0..self.camera.height as f64).contains(&v)
     }
@@ -65,7 +65,7 @@ impl View {
 pub(crate) enum Rigs {
     /// Cameras that do not move, each with its frames in the order of time.
     Fixed(Vec<Vec<usize>>),
-    /// Frames of cameras that move: what they agree on stands still.
+    /// Frames of cameras that move: what they agree on is static.
     Moving(Vec<usize>),
 }
 

@@ -1,4 +1,4 @@
-//! What the index of a playback file says: sections, sizes, and how much has to arrive before there is something to see.
+//! What the index of a playback file states: sections, sizes, and how much has to arrive before there is something to see.
 
 use super::line;
 use crate::files::{grouped, human_bytes};
@@ -10,7 +10,7 @@ use std::path::Path;
 
 /// Sections that are listed; `--json` has them all.
 const LISTED: usize = 24;
-/// Times of the clip that are looked at.
+/// Times of the clip that are examined.
 const MOMENTS: usize = 5;
 
 /// The index in words and as JSON.

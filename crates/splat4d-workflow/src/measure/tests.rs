@@ -67,7 +67,7 @@ fn a_scene_and_the_file_of_it_are_measured_alike() {
 }
 
 #[test]
-fn looks_go_round_the_rig_and_through_the_clip() {
+fn sampled_views_cover_the_rig_and_the_clip() {
     for cameras in [1, 2, 3, 20, 23, 100] {
         let all = measured_views(&views(cameras), [1.0, 3.0], [80, 40]);
         assert!(all.windows(2).all(|w| w[0].time.0 < w[1].time.0));

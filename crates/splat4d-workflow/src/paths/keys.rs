@@ -38,7 +38,7 @@ struct Pose {
 
 /// Key frames in time.
 pub(super) struct Track {
-    /// Frames a second, where the file says so.
+    /// Frames a second, where the file states so.
     pub fps: Option<f64>,
     keys: Vec<Pose>,
 }

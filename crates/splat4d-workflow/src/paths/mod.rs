@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 pub use orbit::Stage;
 
-/// Reads key frames and says what is wrong with them.
+/// Reads key frames and states what is wrong with them.
 pub fn check_keys(text: &str) -> Result<()> {
     keys::Track::parse(text, [0.0, 1.0, 0.0]).map(drop)
 }
@@ -46,7 +46,7 @@ pub enum Route {
     Test,
     /// The training views, one frame each.
     Train,
-    /// One camera of the data set stands still while time goes on.
+    /// One camera of the data set is static while time goes on.
     Camera(String),
     /// Key frames from a JSON file.
     Keys(PathBuf),

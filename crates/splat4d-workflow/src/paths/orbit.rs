@@ -24,7 +24,7 @@ const SMALL_SWAY: f64 = 0.1;
 /// Middle, distance, height and arc of an orbit.
 #[derive(Clone, Debug)]
 pub struct Stage {
-    /// Point that is looked at.
+    /// Point that is examined.
     pub center: [f64; 3],
     /// Upwards (unit).
     pub up: [f64; 3],

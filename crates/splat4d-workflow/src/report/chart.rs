@@ -70,24 +70,26 @@ pub fn lines(series: &[Series], x_label: &str, unit: &str) -> Option<String> {
     let px = |x: f64| LEFT + (x - x0) / (x1 - x0) * (WIDTH - LEFT - RIGHT);
     let py = |y: f64| HEIGHT - BOTTOM - (y - y0) / (y1 - y0) * (HEIGHT - TOP - BOTTOM);
     let mut svg = open(HEIGHT, &format!("{unit} over {x_label}"));
-    for y in ticks(y0, y1, 5) {
-        let v = py(y);
+    let y_ticks = ticks(y0, y1, 5);
+    for (y, label) in y_ticks.iter().zip(labels(&y_ticks)) {
+        let v = py(*y);
         let _ = write!(
             svg,
             r#"<line class="grid" x1="{LEFT}" x2="{:.1}" y1="{v:.1}" y2="{v:.1}"/><text class="tick" x="{:.1}" y="{:.1}" text-anchor="end">{}</text>"#,
             WIDTH - RIGHT,
             LEFT - 7.0,
             v + 4.0,
-            short(y)
+            label
         );
     }
-    for x in ticks(x0, x1, 6) {
-        let u = px(x);
+    let x_ticks = ticks(x0, x1, 6);
+    for (x, label) in x_ticks.iter().zip(labels(&x_ticks)) {
+        let u = px(*x);
         let _ = write!(
             svg,
             r#"<text class="tick" x="{u:.1}" y="{:.1}" text-anchor="middle">{}</text>"#,
             HEIGHT - BOTTOM + 16.0,
-            short(x)
+            label
         );
     }
     let _ = write!(
@@ -172,7 +174,7 @@ pub fn file(series: &[Series], x_label: &str, unit: &str) -> Option<String> {
 pub fn bars(rows: &[(String, f64, String)], from: f64, label: &str) -> Option<String> {
     const ROW: f64 = 24.0;
     const LABEL: f64 = 128.0;
-    const VALUE: f64 = 84.0;
+    const VALUE: f64 = 112.0; // "20.48 dB (20.59)"
     let highest = rows.iter().map(|r| r.1).filter(|v| v.is_finite()).fold(f64::NEG_INFINITY, f64::max);
     if rows.is_empty() || !highest.is_finite() {
         return None;
@@ -237,12 +239,31 @@ fn ticks(lo: f64, hi: f64, count: usize) -> Vec<f64> {
     (first..).map(|i| i as f64 * step).take_while(|v| *v <= hi + 1e-9 * step).take(2 * count + 2).collect()
 }
 
+/// Labels of ticks, with as many decimals as their distance needs; thousands and millions are shortened if they stay distinct.
+fn labels(ticks: &[f64]) -> Vec<String> {
+    let shortened: Vec<String> = ticks.iter().copied().map(short).collect();
+    let step = ticks.windows(2).map(|pair| pair[1] - pair[0]).fold(f64::INFINITY, f64::min);
+    let distinct = shortened.windows(2).all(|pair| pair[0] != pair[1]);
+    if !step.is_finite() || distinct && ticks.iter().any(|v| v.abs() >= SHORTENED) {
+        return shortened;
+    }
+    // A step of 0.1 may be a little less than that.
+    let digits = -(step.log10() + 1e-9).floor();
+    let digits = digits.clamp(0.0, MOST_DECIMALS) as usize;
+    ticks.iter().map(|v| format!("{v:.digits$}")).collect()
+}
+
+/// From here on numbers are written in thousands.
+const SHORTENED: f64 = 1e4;
+/// Decimals of a tick's label: more do not fit next to the axis.
+const MOST_DECIMALS: f64 = 6.0;
+
 /// A number as people write it on an axis.
 pub fn short(v: f64) -> String {
     let a = v.abs();
     let text = match a {
         _ if a >= 1e6 => format!("{:.1}M", v / 1e6),
-        _ if a >= 1e4 => format!("{:.0}k", v / 1e3),
+        _ if a >= SHORTENED => format!("{:.0}k", v / 1e3),
         _ if a >= 100.0 => format!("{v:.0}"),
         _ if a >= 10.0 => format!("{v:.1}"),
         _ if a >= 0.1 || v == 0.0 => format!("{v:.2}"),
@@ -263,6 +284,10 @@ mod tests {
     fn ticks_are_round_and_inside() {
         assert_eq!(ticks(0.0, 10.0, 5), [0.0, 2.0, 4.0, 6.0, 8.0, 10.0]);
         assert!(ticks(21.37, 21.52, 5).iter().all(|t| (21.37..=21.53).contains(t)));
+        assert_eq!(labels(&[17.65, 17.7, 17.75]), ["17.65", "17.70", "17.75"], "no two ticks have one label");
+        assert_eq!(labels(&[14.0, 14.2, 14.4]), ["14.0", "14.2", "14.4"]);
+        assert_eq!(labels(&[12_000.0, 12_500.0]), ["12000", "12500"]);
+        assert_eq!(labels(&[10_000.0, 20_000.0]), ["10k", "20k"]);
         assert_eq!((short(30_000.0), short(0.25), short(31.0)), ("30k".into(), "0.25".into(), "31".into()));
     }
 

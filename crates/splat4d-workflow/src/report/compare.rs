@@ -28,18 +28,37 @@ pub fn page(entries: &[Entry]) -> String {
 fn table(out: &mut String, entries: &[Entry]) {
     let ((head, rows), best) = (comparing::table(entries), comparing::best(entries));
     out.push_str("<h2>Held-out views</h2>\n<table><tr>");
-    head.iter().for_each(|h| _ = write!(out, "<th>{}</th>", escape(h)));
+    head.iter().for_each(|h| _ = write!(out, "<th{}>{}</th>", alignment(h), escape(&titled(h))));
     out.push_str("</tr>\n");
     for (e, row) in rows.iter().enumerate() {
         out.push_str("<tr>");
         for (name, cell) in head.iter().zip(row) {
             let first = score_of(name).is_some_and(|i| best[i] == Some(e));
             let (open, close) = if first { ("<b>", "</b>") } else { ("", "") };
-            let _ = write!(out, "<td>{open}{}{close}</td>", escape(cell));
+            let _ = write!(out, "<td{}>{open}{}{close}</td>", alignment(name), escape(cell));
         }
         out.push_str("</tr>\n");
     }
-    out.push_str("</table>\n<p class=\"note\">Bold: the best of a column. A difference below the spread of seeds means nothing.</p>\n");
+    out.push_str("</table>\n");
+    if best.iter().any(Option::is_some) {
+        out.push_str(
+            "<p class=\"note\">Bold: the best of a column. A difference below the spread of seeds means nothing.</p>\n",
+        );
+    }
+}
+
+/// Numbers are aligned at their last digit, words at their first letter.
+fn alignment(column: &str) -> &'static str {
+    if comparing::WORDS.contains(&column) { "" } else { " class=\"number\"" }
+}
+
+/// A column's title with its unit.
+fn titled(column: &str) -> String {
+    match column {
+        _ if column.starts_with("PSNR") => format!("{column}, dB"),
+        "flicker" => "flicker, of 255".to_owned(),
+        _ => column.to_owned(),
+    }
 }
 
 fn curves(out: &mut String, entries: &[Entry]) {
@@ -55,7 +74,7 @@ fn curves(out: &mut String, entries: &[Entry]) {
     if by_step.is_none() && by_time.is_none() {
         return;
     }
-    out.push_str("<h2>PSNR of training views</h2>\n<div class=\"grid2\">");
+    out.push_str("<h2>PSNR of training views, dB</h2>\n<div class=\"grid2\">");
     for chart in [by_step, by_time].into_iter().flatten() {
         let _ = write!(out, "<div class=\"panel\">{chart}</div>");
     }

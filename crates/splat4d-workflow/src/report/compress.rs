@@ -207,7 +207,7 @@ fn sides(out: &mut String, told: &Compressed) {
     .into_iter()
     .filter_map(|(name, side)| Some((name, side?)))
     .collect();
-    out.push_str("<div class=\"panel\"><table><tr><th></th>");
+    out.push_str("<div class=\"panel\"><table class=\"numbers\"><tr><th></th>");
     for (name, _) in &columns {
         let _ = write!(out, "<th>{name}</th>");
     }
@@ -260,7 +260,9 @@ fn parts(file: &Path) -> Option<String> {
 
 fn stages(steps: &[Step]) -> Option<String> {
     let first = steps.first()?;
-    let mut table = String::from("<table><tr><th>stage</th><th>steps</th><th>Gaussians</th><th>minutes</th></tr>");
+    let mut table = String::from(
+        "<table class=\"numbers\"><tr><th>stage</th><th>steps</th><th>Gaussians</th><th>minutes</th></tr>",
+    );
     for step in steps {
         let (name, minutes) = (escape(&step.name), human_seconds(step.seconds));
         let (taken, left) = (grouped(step.steps), grouped(step.gaussians));

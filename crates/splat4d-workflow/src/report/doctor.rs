@@ -63,7 +63,7 @@ fn page(report: &Report, capture: &Capture) -> String {
     }
     for f in &report.findings {
         let class = if f.grade == Grade::Note { "note" } else { "warn" };
-        let _ = write!(body, "<div class=\"{class}\"><b>{}</b> {}", word(f.grade), escape(&f.what));
+        let _ = write!(body, "<div class=\"{class}\"><b>{}:</b> {}", title(f.grade), escape(&f.what));
         for (label, text) in
             [("Effect", f.looks), ("Remedy", f.remedy.as_str())].into_iter().filter(|(_, t)| !t.is_empty())
         {
@@ -75,7 +75,7 @@ fn page(report: &Report, capture: &Capture) -> String {
         let _ = writeln!(
             body,
             "<h2>Map of the cameras</h2>\n<p class=\"note\">From above; grey dots are points of the capture. Lines show where \
-             cameras look. Orange: a warning, red: bad.</p>\n<div class=\"panel\">{map}</div>"
+             cameras look. Orange: a warning, red: bad.</p>\n<div class=\"panel map\">{map}</div>"
         );
     }
     if !report.leave_out.is_empty() {
@@ -121,7 +121,7 @@ fn page(report: &Report, capture: &Capture) -> String {
         );
         row("sharpness", camera.sharpness.map(|v| format!("{v:.2} times the others'")), limits("sharpness", 1.0, view));
         row("moved", camera.moved.map(|v| format!("{v:.2} px of 1920")), limits("moved", 1.0, view));
-        row("focus, last to first", camera.focus.map(|v| format!("{v:.2}")), limits("focus", 1.0, view));
+        row("focus, last to first", camera.focus.map(|v| format!("{v:.2} times")), limits("focus", 1.0, view));
         row(
             "first to last row",
             camera.shutter.map(|[v, s]| format!("{:+.1} ± {:.1} ms", 1e3 * v, 1e3 * s)),
@@ -146,10 +146,10 @@ fn pairs(report: &Report) -> String {
     }
     let number = |v: f64, digits: usize| if v.is_finite() { format!("{v:+.digits$}") } else { "–".to_owned() };
     let mut out = format!(
-        "<details><summary>{} pairs of images with common features, worst poses \
+        "<details><summary>{} with common features, worst poses \
          first</summary>\n<table><tr><th>cameras</th><th>features</th><th>pose error, px at 1920</th><th>brightness \
          of the second, stops (red green blue)</th><th>sharpness ratio</th></tr>\n",
-        report.pairs.len()
+        counted(report.pairs.len(), "pair") + " of images"
     );
     for p in &report.pairs {
         let _ = writeln!(
@@ -175,6 +175,15 @@ pub fn word(grade: Grade) -> &'static str {
     }
 }
 
+/// A grade as the beginning of a paragraph.
+fn title(grade: Grade) -> &'static str {
+    match grade {
+        Grade::Bad => "Bad",
+        Grade::Warning => "Warning",
+        Grade::Note => "Note",
+    }
+}
+
 /// Further facts of the capture, in sentences.
 pub fn about(report: &Report) -> Vec<String> {
     let mut out = Vec::new();
@@ -183,9 +192,9 @@ pub fn about(report: &Report) -> Vec<String> {
     }
     if let Some(training) = &report.training {
         out.push(format!(
-            "Training uses the motion model {} and needs about {} MB of memory.",
+            "Training uses the motion model {} and needs about {} of memory.",
             training.motion,
-            training.memory.div_ceil(1 << 20)
+            files::human_bytes(training.memory)
         ));
     }
     out
@@ -194,12 +203,29 @@ pub fn about(report: &Report) -> Vec<String> {
 /// All of it in a sentence.
 pub fn summary(report: &Report) -> String {
     let count = |g: Grade| report.findings.iter().filter(|f| f.grade == g).count();
-    let cameras = report.cameras.len();
     format!(
-        "{cameras} camera{}: {} bad, {} warnings, {} notes",
-        if cameras == 1 { "" } else { "s" },
+        "{}: {} bad, {}, {}",
+        counted(report.cameras.len(), "camera"),
         count(Grade::Bad),
-        count(Grade::Warning),
-        count(Grade::Note)
+        counted(count(Grade::Warning), "warning"),
+        counted(count(Grade::Note), "note")
     )
+}
+
+/// `1 camera`, `2 cameras`.
+fn counted(n: usize, noun: &str) -> String {
+    format!("{n} {noun}{}", if n == 1 { "" } else { "s" })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_of_a_kind_has_no_plural() {
+        assert_eq!(
+            [counted(0, "warning"), counted(1, "pair"), counted(2, "note")],
+            ["0 warnings", "1 pair", "2 notes"]
+        );
+    }
 }

@@ -213,7 +213,7 @@ fn views(out: &mut String, run: &Run) {
         let captions = [("gt", format!("truth, {place}")), ("renders", score), ("errors", "error".into())];
         for (picture, (kind, caption)) in pictures.iter().zip(captions) {
             let image = picture.as_ref().map(|p| format!("<img alt=\"{}\" src=\"{p}\">", escape(&caption)));
-            // The file itself, as long as the page lies in its run.
+            // The file itself, as long as the page is in its run.
             let image = image.zip(place_of(kind, &view.file)).map(|(image, place)| {
                 format!("<a href=\"{}\">{image}</a>", escape(&place.to_string_lossy().replace('\\', "/")))
             });
@@ -278,7 +278,7 @@ fn scores(out: &mut String, run: &Run) {
         }
     }
     let mean = |views: &[&ViewScore]| views.iter().filter_map(|v| v.psnr).sum::<f64>() / views.len().max(1) as f64;
-    // What its colours cost a camera stands next to its score.
+    // What its colours cost a camera is next to its score.
     let label = |views: &[&ViewScore]| {
         let all: Vec<f64> = views.iter().filter_map(|v| v.corrected).collect();
         let corrected = all.iter().sum::<f64>() / all.len() as f64;
@@ -372,7 +372,7 @@ fn conditions(out: &mut String, run: &Run) {
         rows += &format!("<tr>{}</tr>", cells.map(|c| format!("<td>{}</td>", escape(&c))).concat());
     }
     if !rows.is_empty() {
-        let head = ["views", "background", "step", "PSNR", "corrected", "SSIM", "instructions", "device"];
+        let head = ["views", "background", "step", "PSNR, dB", "corrected, dB", "SSIM", "instructions", "device"];
         let head = head.map(|h| format!("<th>{h}</th>")).concat();
         let _ = write!(out, "<h2>Measurements</h2>\n<table><tr>{head}</tr>{rows}</table>\n");
     }
@@ -483,8 +483,9 @@ fn panels<const N: usize>(out: &mut String, title: &str, charts: [(&str, Option<
         })
         .collect();
     if !shown.is_empty() {
-        // Two columns: charts of one width have letters of one size.
-        let _ = write!(out, "<h2>{}</h2>\n<div class=\"grid2\">{shown}</div>\n", escape(title));
+        // Two columns, also for a single chart: charts of one width have letters of one size.
+        let blank = if shown.matches("class=\"panel\"").count() == 1 { "<div></div>" } else { "" };
+        let _ = write!(out, "<h2>{}</h2>\n<div class=\"grid2\">{shown}{blank}</div>\n", escape(title));
     }
 }
 

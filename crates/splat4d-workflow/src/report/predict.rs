@@ -114,12 +114,13 @@ fn page(run: &str, told: &Summary, films: &[(String, PathBuf)]) -> String {
         ],
     );
     if !films.is_empty() {
-        body.push_str("<h2>Truth (left) and prediction</h2>\n");
+        body.push_str("<h2>Truth (left) and prediction</h2>\n<div class=\"grid2\">\n");
         for (camera, path) in films {
             if let Some(film) = pictures::film_file(path, "Truth (left) and prediction") {
-                let _ = writeln!(body, "<p class=\"note\">camera {}</p>\n{film}", escape(camera));
+                let _ = writeln!(body, "<figure>{film}<figcaption>camera {}</figcaption></figure>", escape(camera));
             }
         }
+        body.push_str("</div>\n");
     }
     body.push_str(
         "<p class=\"note\">Dynamic regions: pixels that differ from the last observed image of the camera. Skill: 1 \
@@ -135,6 +136,15 @@ fn page(run: &str, told: &Summary, films: &[(String, PathBuf)]) -> String {
     )
 }
 
+/// A number with that many decimals; zero has no sign.
+pub fn rounded(x: f64, digits: usize) -> String {
+    let text = format!("{x:.digits$}");
+    match text.strip_prefix('-') {
+        Some(plain) if plain.bytes().all(|b| matches!(b, b'0' | b'.')) => plain.to_owned(),
+        _ => text,
+    }
+}
+
 /// Columns without a value are left out; of the first `compared` rows the best is marked, and the baseline named.
 fn table(out: &mut String, models: &[&ModelScores], compared: usize) {
     let heads = [
@@ -142,11 +152,11 @@ fn table(out: &mut String, models: &[&ModelScores], compared: usize) {
         "PSNR, dB",
         "dynamic regions, dB",
         "skill over freeze",
-        "over velocity",
+        "skill over velocity",
         "wins over freeze",
-        "over velocity",
-        "back-test",
-        "error of points, last frame",
+        "wins over velocity",
+        "back-test, units",
+        "error of points, last frame, units",
         "error / predicted σ",
         "fitting time",
         "diverged",
@@ -154,7 +164,7 @@ fn table(out: &mut String, models: &[&ModelScores], compared: usize) {
     let score = |m: &ModelScores| m.psnr_dynamic.or(m.psnr);
     let scored = models.iter().take(compared).enumerate().filter_map(|(i, m)| Some((i, score(m)?)));
     let best = scored.max_by(|a, b| a.1.total_cmp(&b.1)).map(|b| b.0);
-    let number = |x: Option<f64>, digits: usize| x.map_or_else(String::new, |x| format!("{x:.digits$}"));
+    let number = |x: Option<f64>, digits: usize| x.map_or_else(String::new, |x| rounded(x, digits));
     let percent = |x: Option<f64>| x.map_or_else(String::new, |x| format!("{:.0} %", 100.0 * x));
     let cells = |(i, m): (usize, &&ModelScores)| {
         let role = if Some(i) == best { " · best" } else { "" };
@@ -183,5 +193,15 @@ fn table(out: &mut String, models: &[&ModelScores], compared: usize) {
         format!("<tr{class}>{cells}</tr>")
     };
     let rows: String = rows.iter().enumerate().map(line).collect();
-    let _ = writeln!(out, "<div class=\"panel\"><table><tr>{head}</tr>{rows}</table></div>");
+    let _ = writeln!(out, "<div class=\"panel\"><table class=\"numbers\"><tr>{head}</tr>{rows}</table></div>");
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_that_round_to_zero_have_no_sign() {
+        assert_eq!([rounded(-4e-4, 3), rounded(-6e-4, 3), rounded(0.0031, 3)], ["0.000", "-0.001", "0.003"]);
+    }
 }

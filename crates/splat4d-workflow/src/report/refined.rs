@@ -64,7 +64,7 @@ pub(super) fn section(out: &mut String, run: &Run) {
     rows.sort_by(|a, b| far(b).total_cmp(&far(a)));
     let _ = writeln!(
         out,
-        "<h2>Refined cameras</h2>\n<p class=\"note\">{}</p>\n<table><tr><th>camera</th><th>rotated, °</th><th>moved, \
+        "<h2>Refined cameras</h2>\n<p class=\"note\">{}</p>\n<table class=\"numbers\"><tr><th>camera</th><th>rotated, °</th><th>moved, \
          % of the radius</th><th>focal length, %</th><th>time offset, ms</th></tr>",
         escape(&words)
     );

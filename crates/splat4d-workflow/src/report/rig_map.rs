@@ -8,13 +8,19 @@ use std::fmt::Write;
 
 /// Width of the map and its margin, units of the SVG.
 const WIDTH: f64 = 560.0;
-const MARGIN: f64 = 46.0;
+const MARGIN: f64 = 64.0;
 /// Most points that are drawn.
 const POINTS: usize = 600;
 /// Length of a viewing direction, of the map's width.
 const ARROW: f64 = 0.09;
-/// Most cameras with a name: more names cover each other.
+/// Most cameras with a name.
 const NAMED: usize = 40;
+/// Distance of a name from its camera, height of a line and mean width of a letter at the size of type on phones.
+const NAME_GAP: f64 = 12.0;
+const NAME_LINE: f64 = 17.0;
+const LETTER: f64 = 8.5;
+/// Lines by which a name gives way to others; one that still covers another is left to the tooltip.
+const NAME_SHIFTS: usize = 3;
 
 /// The map of fixed cameras; empty where there are fewer than two. `grade`: the worst finding of a camera.
 pub(super) fn svg(capture: &Capture, grade: &dyn Fn(&str) -> Option<Grade>) -> String {
@@ -52,8 +58,9 @@ fn draw(
     let mut out = format!("<svg viewBox=\"0 0 {WIDTH} {height:.0}\" role=\"img\" aria-label=\"Map of the cameras\">\n");
     for p in points {
         let [x, y] = place(*p);
-        let _ = writeln!(out, "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"1\" fill=\"var(--line)\"/>");
+        let _ = writeln!(out, "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"1\" fill=\"var(--soft)\" opacity=\"0.55\"/>");
     }
+    let mut labels = Labels::default();
     for (name, at, forward) in cameras {
         let colour = match grade(name) {
             Some(Grade::Bad) => "#d4351c",
@@ -64,15 +71,13 @@ fn draw(
         let length = forward[0].hypot(forward[1]);
         let step = if length > 0.0 { ARROW * WIDTH / length } else { 0.0 };
         let (tx, ty) = (x + step * forward[0], y - step * forward[1]);
-        let name = escape(name);
+        let (label, name) = (labels.place(name, [x, y], [tx - x, ty - y]), escape(name));
         let _ = writeln!(
             out,
             "<g stroke=\"{colour}\" fill=\"{colour}\"><title>{name}</title><line x1=\"{x:.1}\" y1=\"{y:.1}\" x2=\"{tx:.1}\" \
              y2=\"{ty:.1}\" stroke-width=\"1.6\"/><circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"4.5\" stroke=\"none\"/></g>"
         );
-        if cameras.len() <= NAMED {
-            // Outside, away from where the camera looks.
-            let (nx, ny) = (x - 0.3 * (tx - x), y - 0.3 * (ty - y));
+        if let Some([nx, ny]) = label.filter(|_| cameras.len() <= NAMED) {
             let _ = writeln!(
                 out,
                 "<text class=\"tick\" x=\"{nx:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{name}</text>",
@@ -81,6 +86,33 @@ fn draw(
         }
     }
     out + "</svg>\n"
+}
+
+/// Names of cameras that cover neither each other nor their own camera: centre and half size of each.
+#[derive(Default)]
+struct Labels(Vec<([f64; 2], [f64; 2])>);
+
+impl Labels {
+    /// The centre of a camera's name, behind the camera; `None` if others are everywhere around.
+    fn place(&mut self, name: &str, at: [f64; 2], forward: [f64; 2]) -> Option<[f64; 2]> {
+        let length = forward[0].hypot(forward[1]);
+        // A camera that looks straight down has its name below.
+        let back = if length > 0.0 { forward.map(|v| -v / length) } else { [0.0, 1.0] };
+        let half = [0.5 * LETTER * name.chars().count() as f64, 0.5 * NAME_LINE];
+        for shift in 0..=NAME_SHIFTS {
+            // The box's edge, not its centre, is `NAME_GAP` behind the camera.
+            let reach = NAME_GAP + NAME_LINE * shift as f64;
+            let center = [0, 1].map(|k| at[k] + back[k] * (reach + half[k] * back[k].abs()));
+            let free = |(other, size): &([f64; 2], [f64; 2])| {
+                (0..2).any(|k| (center[k] - other[k]).abs() >= half[k] + size[k])
+            };
+            if self.0.iter().all(free) {
+                self.0.push((center, half));
+                return Some(center);
+            }
+        }
+        None
+    }
 }
 
 /// Two directions on the ground.
@@ -135,6 +167,21 @@ impl Bounds {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn names_of_close_cameras_do_not_cover_each_other() {
+        let mut labels = Labels::default();
+        let places: Vec<[f64; 2]> =
+            (0..3).filter_map(|k| labels.place("cam00", [100.0 + 10.0 * k as f64, 50.0], [0.0, -1.0])).collect();
+        assert_eq!(places.len(), 3);
+        for (a, b) in [(0, 1), (0, 2), (1, 2)] {
+            let apart = [0, 1].map(|k| (places[a][k] - places[b][k]).abs());
+            assert!(apart[0] >= 5.0 * LETTER || apart[1] >= NAME_LINE, "{places:?}");
+        }
+        let crowd = (0..20).filter_map(|_| labels.place("cam00", [100.0, 50.0], [0.0, -1.0])).count();
+        assert!(crowd <= NAME_SHIFTS, "names without room are left out: {crowd}");
+        assert!(labels.place("cam00", [400.0, 50.0], [0.0; 2]).is_some_and(|p| p[1] > 50.0), "it looks straight down");
+    }
 
     #[test]
     fn cameras_stand_on_the_map_as_seen_from_above() {

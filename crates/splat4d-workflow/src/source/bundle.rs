@@ -146,7 +146,7 @@ fn streamed(folder: &Path) -> Result<Source> {
     Ok(Source { dialect: Some(sog::DIALECT), warnings, ..Source::own(scene) })
 }
 
-/// A SOG scene whose files lie in a folder.
+/// A SOG scene whose files are in a folder.
 pub(crate) fn open_sog(folder: &Path) -> Result<Source> {
     let (params, warnings) = read_sog(folder)?;
     let scene = Scene { up: sog::DIALECT.up, ..dialect::still(params) };

@@ -27,7 +27,7 @@ const KEPT: usize = 128 << 20;
 const ROWS: usize = 128;
 /// The time between samples is not halved beyond so many of them: 30,000 Gaussians at 266 times.
 const REFINED: usize = 8_000_000;
-/// Gaussians of a layer whose motion between time samples is looked at.
+/// Gaussians of a layer whose motion between time samples is examined.
 const PROBED: usize = 400;
 /// Mean squared error of images by motion between time samples that is let pass: 46 dB, a quarter of what 40 dB allow.
 const BETWEEN: f64 = 2.5e-5;

@@ -18,7 +18,7 @@ pub(super) const LEVEL_PIXELS: f64 = 8.0;
 const FAINT: f64 = 1e-4;
 /// Share of the trace by which a covariance may differ before it counts as turned or stretched: f32 rounding.
 const SAME_SHAPE: f64 = 1e-5;
-/// The envelope's centre may lie so many reaches off a node before rounded velocities would be felt; a piece further
+/// The envelope's centre may be so many reaches off a node before rounded velocities would be felt; a piece further
 /// out gets a centre of its own.
 const FAR: f64 = 8.0;
 /// SH coefficients of all channels.
@@ -338,11 +338,11 @@ pub(super) fn primitive(
     }
 }
 
-/// How a node and a Gaussian's time lie to each other.
+/// How a node and a Gaussian's time relate to each other.
 pub(super) enum Place {
     /// Nothing is to be seen in the node.
     Nowhere,
-    /// All of it lies in this half, and the node is longer than a segment.
+    /// All of it is in this half, and the node is longer than a segment.
     In(Span),
     /// The node may hold it.
     Here,

@@ -93,7 +93,7 @@ mod tests {
     use std::sync::Arc;
 
     #[test]
-    fn every_kind_of_life_keeps_its_shape() {
+    fn every_kind_of_lifespan_keeps_its_shape() {
         let row = [0.3f32, -1.1, -2.3];
         for kind in [LifeKind::Infinite, LifeKind::GaussHalf, LifeKind::GaussOne, LifeKind::Interval] {
             let mut params = Params::new(1, 1, kind.columns());

@@ -66,7 +66,7 @@ pub struct Options {
     /// Most renders each, of fixed cameras and of one that moves, that measure how strongly images react to errors:
     /// bounds the time as well.
     pub renders: usize,
-    /// The take is played so many times over.
+    /// The clip is played so many times over.
     pub repeat: usize,
     /// The cameras whose pixels count, at all times. No camera and no path: a 1080p image that the scene fills.
     pub cameras: Vec<Camera>,

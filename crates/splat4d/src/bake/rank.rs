@@ -1,6 +1,6 @@
 //! Ranks primitives by what images lack without them, so that a part of a file looks like the whole.
 //!
-//! What a primitive covers says little: a large one behind a wall, or one of its neighbours' colour, is not missed. Renders
+//! What a primitive covers states little: a large one behind a wall, or one of its neighbours' colour, is not missed. Renders
 //! of the baked scene at times spread over the clip measure what the removal of each primitive changes. A short life lies
 //! between two renders or on one by chance; therefore the change is measured for each unit of squared opacity, and then
 //! weighed by the time for which the primitive is there. A static primitive and one that is there for a tenth of the clip
@@ -20,7 +20,7 @@ const FEWEST: usize = 12;
 const WORK: usize = 2_000_000;
 /// Longer side of these renders, pixels: half of a Gaussian's rank is settled by less.
 const SIDE: usize = 240;
-/// A Gaussian fainter than this says nothing of what its removal changes.
+/// A Gaussian fainter than this states nothing of what its removal changes.
 const FAINT: f64 = 0.02;
 /// Share of what its size alone suggests that is kept where no render shows the Gaussian: another view may.
 const UNSEEN: f64 = 0.02;
@@ -73,7 +73,7 @@ pub(super) fn rank(nodes: &mut [Node], scene: &Scene<f32>, options: &Options) {
     }
 }
 
-/// Times and cameras: those that stand still at times spread over the clip, and those of a path at their own.
+/// Times and cameras: those that are static at times spread over the clip, and those of a path at their own.
 fn shots(clip: [f64; 2], options: &Options, gaussians: usize) -> Vec<(f64, &Camera)> {
     let [from, to] = clip;
     let most = (WORK / gaussians.max(1)).max(FEWEST);
@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn what_images_lack_most_comes_first() {
+    fn gaussians_with_the_largest_image_error_rank_first() {
         let pose = Se3::look_at([0.0, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
         let camera = Camera::with_fov_y(pose, 0.8, 64, 48);
         let options = Options { cameras: vec![camera], ..Options::default() };

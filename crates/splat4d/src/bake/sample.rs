@@ -1,6 +1,6 @@
-//! A layer looked at frame after frame: what the fit is made from.
+//! A layer examined frame after frame: what the fit is made from.
 //!
-//! Rows come in runs that are small enough for all frames of a run to lie in memory at once, however long the take is.
+//! Rows come in runs that are small enough for all frames of a run to be in memory at once, however long the clip is.
 
 use super::shape::Shape;
 use super::tree::{Span, Tree};
@@ -23,7 +23,7 @@ pub(super) struct Row {
     pub id: usize,
     /// The seconds in which it can be seen, within the clip.
     pub seen: [f64; 2],
-    /// First and last frame that was looked at.
+    /// First and last frame that was examined.
     pub frames: Span,
     /// Where its samples begin.
     offset: usize,

@@ -68,7 +68,7 @@ impl Shape {
         self
     }
 
-    /// One step, `pace` times as long as the linear part says, and how far it went (radians).
+    /// One step, `pace` times as long as the linear part states, and how far it went (radians).
     fn step(&self, looks: &[(f64, f64, [f64; 6])], [total, mean, spread]: [f64; 3], pace: f64) -> (Self, f64) {
         let mut out = *self;
         let lambda = self.scales.map(|s| s * s);

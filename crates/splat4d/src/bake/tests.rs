@@ -122,7 +122,7 @@ fn a_cross_fade_is_baked_into_opacities() {
 }
 
 #[test]
-fn straight_motion_of_every_life_is_exact() {
+fn straight_motion_with_every_kind_of_lifespan_is_exact() {
     for (spec, life) in [
         (Spec::Still, LifeKind::Infinite),
         (spacetime(0, false), LifeKind::Interval),
@@ -152,7 +152,7 @@ fn straight_motion_of_every_life_is_exact() {
 }
 
 #[test]
-fn the_general_way_finds_straight_motion_too() {
+fn the_general_algorithm_bakes_straight_motion_exactly() {
     // The same scene twice: once as what it is, once behind an opaque model.
     let straight = scene(vec![layer(&spacetime(1, false), LifeKind::GaussHalf, 150, 0.3, 2.4)], 2.4);
     let mut hidden = straight.clone();
@@ -195,7 +195,7 @@ fn key_states_turn_on_to_the_next_frame() {
 }
 
 #[test]
-fn leaps_become_key_states() {
+fn jumps_become_key_states() {
     let scene = leaps(60, 20.0);
     let baked = baked(&scene, &options(0.25));
     let visible = 60 - baked.report.unseen;
@@ -259,7 +259,7 @@ fn any_number_of_threads_bakes_the_same() {
 }
 
 #[test]
-fn lives_lie_as_deep_as_they_fit_and_no_deeper() {
+fn lifespans_are_stored_at_the_deepest_fitting_level() {
     let mut short = layer(&spacetime(1, false), LifeKind::GaussHalf, 300, 0.1, 7.9);
     for i in 0..300 {
         short.params[LIFE].set(i, 1, 0.05f32.ln());
@@ -271,11 +271,11 @@ fn lives_lie_as_deep_as_they_fit_and_no_deeper() {
 }
 
 #[test]
-fn rounds_keep_what_stands_still_once() {
+fn static_gaussians_of_repeated_rounds_are_stored_once() {
     let still = layer(&Spec::Still, LifeKind::Infinite, 50, 0.1, 1.0);
     let moving = layer(&spacetime(1, false), LifeKind::GaussHalf, 70, 0.3, 1.0);
     let one = scene(vec![still, moving], 29.0 / FPS);
-    // So strict that only what really stands still counts as still.
+    // So strict that only what really is static counts as still.
     let (once, thrice) = (baked(&one, &options(1e-6)), baked(&one, &Options { repeat: 3, ..options(1e-6) }));
     let still = 50;
     let moving = once.report.primitives - still;
@@ -365,7 +365,7 @@ fn a_file_is_as_good_and_can_be_baked_again() {
     let times: Vec<f64> = (0..57).step_by(5).map(|k| f64::from(k) / FPS).collect();
     let like = |file: &Scene<f32>| like_at(file, &times);
     let played = file(&first);
-    // A held-out view may lie before the first training frame or after the last one, where a player shows the clip's ends.
+    // A held-out view may be before the first training frame or after the last one, where a player shows the clip's ends.
     let beyond = like_at(&played, &[scene.clip[0] - 0.5, scene.clip[1] + 0.5]);
     assert!(beyond.worst_psnr > 38.0, "{beyond:?}");
     assert!(like(&played).psnr > 40.0, "{:?} {:?}", like(&played), likeness(&scene, &first));
@@ -418,7 +418,7 @@ fn segments_by_price_are_as_good_as_by_tolerance() {
 
 /// A camera that moves sees each Gaussian for a while: segments go there, and none of it is lost elsewhere.
 #[test]
-fn segments_go_to_when_a_moving_camera_looks() {
+fn segments_concentrate_at_times_that_a_moving_camera_sees() {
     let scene = leaps(80, 30.0);
     let looking = |t: f64| {
         let a = 2.0 * t;
@@ -442,7 +442,7 @@ fn segments_go_to_when_a_moving_camera_looks() {
 
 /// Renders that weigh errors take time: there are no more than the options allow.
 #[test]
-fn renders_that_weigh_errors_are_bounded() {
+fn renders_for_error_weights_are_bounded_in_number() {
     let scene = leaps(20, 6.0);
     let path: Vec<_> = (0..6).map(|k| (f64::from(k) / FPS, cameras().remove(0))).collect();
     for (renders, taken) in [(0, 0), (2, 4), (4, 7)] {
@@ -456,7 +456,7 @@ fn renders_that_weigh_errors_are_bounded() {
 
 /// The curve predicts what is baked.
 #[test]
-fn the_curve_says_how_many_segments_which_error_costs() {
+fn the_curve_gives_the_segments_needed_for_each_error() {
     let scene = scene(vec![layer(&spacetime(3, true), LifeKind::GaussHalf, 120, 0.4, 1.9)], 1.9);
     let options = options(0.25);
     let mut bakery = Bakery::new(&scene, &options).unwrap();
@@ -475,7 +475,7 @@ fn the_curve_says_how_many_segments_which_error_costs() {
 }
 
 #[test]
-fn straight_scenes_have_nothing_to_choose() {
+fn straight_scenes_get_one_segment_at_every_tolerance() {
     let scene = scene(vec![layer(&spacetime(1, false), LifeKind::Interval, 50, 0.3, 1.0)], 1.0);
     let options = options(0.25);
     let mut bakery = Bakery::new(&scene, &options).unwrap();

@@ -8,15 +8,15 @@ pub(super) type Span = [usize; 2];
 
 /// Most frames of a clip: nine hours at 30 frames a second; more is a damaged clock.
 const MAX_FRAMES: f64 = 1_000_000.0;
-/// Most parts of a frame: enough for a take of one frame a second, and a bound on the work for a slower one.
+/// Most parts of a frame: enough for a clip of one frame a second, and a bound on the work for a slower one.
 const MAX_PARTS: f64 = 32.0;
 
-/// Borders of spans lie on frames, so that a frame is shown by one node a level and by no two. Where the take has few
+/// Borders of spans are on frames, so that a frame is shown by one node a level and by no two. Where the clip has few
 /// frames a second, what is called a frame here is a part of one: a player shows the times between them too, and a
 /// model need not be straight there.
 ///
 /// The tree halves the clip at the borders of segments, and a segment, where motion demands it, frame by frame. Its
-/// last border lies one frame of the take behind the clip's last second, so that this second is inside.
+/// last border is one frame of the clip behind the clip's last second, so that this second is inside.
 #[derive(Clone, Debug)]
 pub(super) struct Tree {
     clip: [f64; 2],
@@ -145,14 +145,14 @@ mod tests {
     }
 
     #[test]
-    fn segments_last_about_as_long_as_asked() {
+    fn segments_have_about_the_requested_length() {
         let tree = Tree::new([0.0, 10.0 - 1.0 / 30.0], 30.0, 30.0, 1.0, usize::MAX).unwrap();
         assert_eq!(tree.grid, (0..=10).map(|i| 30 * i).collect::<Vec<_>>());
         assert!((tree.border(300) - 10.0).abs() < 1e-12);
     }
 
     #[test]
-    fn few_frames_a_second_are_looked_at_in_parts() {
+    fn low_frame_rates_are_sampled_between_frames() {
         for (fps, looks, parts) in
             [(10.0, 30.0, 3), (29.97, 30.0, 1), (24.0, 30.0, 2), (60.0, 30.0, 1), (10.0, 0.0, 1), (1e-6, 30.0, 32)]
         {
@@ -171,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_that_is_no_clock_is_refused() {
+    fn an_invalid_clip_range_is_refused() {
         for clip in [[0.0, f64::NAN], [1.0, 0.0], [0.0, 1e9], [f64::NEG_INFINITY, 0.0]] {
             assert!(Tree::new(clip, 30.0, 30.0, 1.0, usize::MAX).is_err(), "{clip:?}");
         }

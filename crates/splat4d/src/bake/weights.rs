@@ -170,7 +170,7 @@ impl Weights {
         let pass = LOW_PASS / (scale * scale);
         let sizes = values.map(|s| s.max(0.0) + pass);
         let GaussianSums { moment, energy: sum, color, still: [renders, still] } = self.seen[layer][row];
-        // Cameras that stand still and one that moves count the same, each by its mean.
+        // Cameras that are static and one that moves count the same, each by its mean.
         let still = if renders > 0.0 { still / renders } else { 0.0 };
         let count = self.seen[layer].len();
         let on_path = |k: usize| f64::from(self.path[layer][k * count + row]);

@@ -26,7 +26,7 @@ fn the_cpu_is_always_there() {
 }
 
 #[test]
-fn what_only_the_cpu_can_is_done_by_the_cpu() {
+fn work_unsupported_by_the_device_runs_on_the_cpu() {
     for wanted in [Wanted { head: true, ..Wanted::default() }, Wanted { extra: true, ..Wanted::default() }] {
         let opened = open(Device::Gpu, RenderConfig::default(), &wanted, Tables::Changing);
         assert!(opened.fell_back && opened.backend.can(&wanted).is_ok(), "{}", opened.why);
@@ -75,7 +75,7 @@ impl Backend for Failing {
 }
 
 #[test]
-fn a_device_that_fails_on_the_way_is_left_for_the_cpu() {
+fn a_device_that_fails_is_replaced_by_the_cpu() {
     let config = RenderConfig { low_pass: 0.5, ..RenderConfig::default() };
     let mut backend: Box<dyn Backend> =
         Box::new(Failing { renderer: Renderer::new(config), drawn: 0, going_back: false });
@@ -91,7 +91,7 @@ fn a_device_that_fails_on_the_way_is_left_for_the_cpu() {
 }
 
 #[test]
-fn training_goes_on_on_the_cpu_with_the_very_gradients() {
+fn training_continues_on_the_cpu_with_equal_gradients() {
     let made = scene(3, 2).cast::<f32>();
     let camera = Camera::with_fov_y(Se3::look_at([0.0, 0.5, -4.0], [0.0; 3], [0.0, -1.0, 0.0]), 0.8, 40, 30);
     let direct = |out| Part::new(out, Color::Direct { table: &made.direct });
@@ -162,7 +162,7 @@ impl Backend for Crooked {
 }
 
 #[test]
-fn a_device_that_computes_something_else_is_not_trusted() {
+fn a_device_with_wrong_results_is_not_used() {
     for (faults, good) in [
         ([0.0, 0.0], true),
         ([0.005, 0.01], true),
@@ -312,7 +312,7 @@ fn differences<F: Real>(a: &Planes<F>, b: &Planes<f64>, unit: f64) -> [f64; 2] {
 }
 
 #[test]
-fn every_backend_draws_what_the_oracle_draws() {
+fn every_backend_renders_as_the_reference_does() {
     let mut backends = vec![cpu(RenderConfig::default())];
     #[cfg(feature = "gpu")]
     match gpu(Device::Gpu, RenderConfig::default(), &Wanted::default(), Tables::Changing) {
@@ -365,7 +365,7 @@ fn every_backend_draws_what_the_oracle_draws() {
 }
 
 #[test]
-fn the_oracle_takes_no_gradients_back() {
+fn the_reference_renderer_refuses_a_backward_pass() {
     let (mut oracle, wanted) = (Oracle::default(), Wanted { backward: true, ..Wanted::default() });
     let error = oracle.can(&wanted).expect_err("it is a forward alone").to_string();
     assert!(error.contains("the oracle does not take gradients back"), "{error}");

@@ -333,7 +333,7 @@ fn merge(scene: &mut Scene<f32>, mut other: Scene<f32>, name: &str, at: Option<f
         }
         other.clip = other.clip.map(|t| t + later);
     }
-    // Both say where they lie in their world, which is taken for one.
+    // Both say where they are in their world, which is taken for one.
     let mut to = *to;
     if scene.offset != [0.0; 3] && other.offset != [0.0; 3] {
         to.translation = std::array::from_fn(|k| to.translation[k] + other.offset[k] - scene.offset[k]);

@@ -1,4 +1,4 @@
-//! Selections evaluated over time: every Gaussian is looked at at some times of its own life.
+//! Selections evaluated over time: every Gaussian is examined at some times of its own life.
 
 use super::select::Expr;
 use super::{Context, Mask};
@@ -11,11 +11,11 @@ use crate::scene::splats::{COV, SPLAT_OPACITY};
 use crate::scene::{Camera, Color, GEOMETRY, Rows, Space, Table, Time, features, labels};
 use crate::{Error, Result};
 
-/// Times at which a Gaussian is looked at, at most, evenly over its life: a bit each.
+/// Times at which a Gaussian is examined, at most, evenly over its life: a bit each.
 const LOOKS: usize = 8;
 /// Times of the clip at which neighbours are sought.
 const NEIGHBOUR_LOOKS: usize = 8;
-/// Share of the images that have a Gaussian in them in which it must lie on the subject: others may hide it, whose
+/// Share of the images that have a Gaussian in them in which it must be on the subject: others may hide it, whose
 /// masks
 /// then leave it out.
 const ON_SUBJECT: f32 = 0.75;
@@ -24,7 +24,7 @@ const ON_SUBJECT: f32 = 0.75;
 pub type Selected = Vec<Vec<bool>>;
 
 /// Selects in a scene. A predicate of places holds for a Gaussian where it holds at more than half of the times of its
-/// life that are looked at; `ever`, `always` and `at` say otherwise.
+/// life that are examined; `ever`, `always` and `at` say otherwise.
 ///
 /// Errors: names of cameras, layers or masks that there are not; masks of another size than their camera.
 pub fn select(expr: &Expr, scene: &Scene<f32>, context: &dyn Context) -> Result<Selected> {
@@ -46,7 +46,7 @@ struct LayerLooks {
 
 struct Looks(Vec<LayerLooks>);
 
-/// A time, the rows that are looked at then, and which of its looks it is for each.
+/// A time, the rows that are examined then, and which of its looks it is for each.
 type Query<'a> = (Time, &'a (Vec<u32>, Vec<u8>));
 
 /// By layer and row: bit i stands for time i of the row.
@@ -62,13 +62,13 @@ impl Looks {
         let of = |layer: &Layer<f32>| {
             let seen: Vec<[f64; 2]> = layer.spans().iter().map(|[from, to]| [from.max(start), to.min(end)]).collect();
             let frame = |t: f64| ((t - start) * fps).clamp(0.0, (frames - 1) as f64);
-            // By frame: the rows that are looked at then, and the place of that look.
+            // By frame: the rows that are examined then, and the place of that look.
             let mut asked: Vec<(Vec<u32>, Vec<u8>)> = vec![Default::default(); frames];
-            // Who is never seen is looked at nowhere: no predicate of places holds, and its negation does.
+            // Who is never seen is examined nowhere: no predicate of places holds, and its negation does.
             let mut count = vec![1; seen.len()];
             for (row, [from, to]) in seen.iter().enumerate().filter(|(_, [from, to])| from <= to) {
                 let (first, last) = (frame(*from).ceil() as usize, frame(*to).floor() as usize);
-                // A life between two frames is looked at at the nearer one.
+                // A life between two frames is examined at the nearer one.
                 let (first, last) =
                     if first > last { [frame(0.5 * (from + to)).round() as usize; 2].into() } else { (first, last) };
                 let looks = LOOKS.min(last - first + 1);
@@ -160,7 +160,7 @@ fn all(count: u8) -> u8 {
     ((1u16 << count) - 1) as u8
 }
 
-/// The rows whose features are like those of the Gaussian that is nearest to a place at any time that is looked at.
+/// The rows whose features are like those of the Gaussian that is nearest to a place at any time that is examined.
 ///
 /// Errors: the scene has no features.
 fn alike(scene: &Scene<f32>, looks: &Looks, place: [f64; 3], least: f64) -> Result<Selected> {
@@ -299,14 +299,14 @@ fn evaluate(expr: &Expr, scene: &Scene<f32>, looks: &Looks, context: &dyn Contex
     })
 }
 
-/// The pixel of a point and its depth, where it lies in the image.
+/// The pixel of a point and its depth, where it is in the image.
 fn pixel(camera: &Camera, x: [f64; 3]) -> Option<([usize; 2], f64)> {
     let ([u, v], z) = camera.project(x)?;
     let inside = u >= 0.0 && v >= 0.0 && u < camera.width as f64 && v < camera.height as f64;
     inside.then_some(([u as usize, v as usize], z))
 }
 
-/// Whether a point lies on the white of a mask; none: not in the image.
+/// Whether a point is on the white of a mask; none: not in the image.
 fn on(camera: &Camera, mask: &Mask, x: [f64; 3]) -> Option<bool> {
     pixel(camera, x).map(|([u, v], _)| mask.white[v * mask.width + u])
 }
@@ -325,7 +325,7 @@ fn fits(mask: &Mask, camera: &Camera, name: &str) -> Result<()> {
     mask_fits([mask.width, mask.height], camera, name)
 }
 
-/// The Gaussians that lie on the subject in most images that have masks.
+/// The Gaussians that are on the subject in most images that have masks.
 fn subject(scene: &Scene<f32>, context: &dyn Context) -> Result<Selected> {
     let views = context.subject()?;
     let mut votes: Vec<Vec<[u32; 2]>> = scene.layers.iter().map(|l| vec![[0; 2]; l.params.len()]).collect();

@@ -81,7 +81,7 @@ pub struct Lasso {
 }
 
 impl Lasso {
-    /// Whether a point lies behind the polygon, within the depths.
+    /// Whether a point is behind the polygon, within the depths.
     pub(super) fn holds(&self, cam_from_world: &[[f64; 3]; 3], x: [f64; 3]) -> bool {
         let p = mat_vec(cam_from_world, sub(x, self.eye));
         let deep = p[2] > 0.0 && (self.range[0]..=self.range[1]).contains(&p[2]);
@@ -121,7 +121,7 @@ impl Surface {
         Some(along(1, rows)? * self.columns + along(0, self.columns)?)
     }
 
-    /// Whether a point lies in the rectangle and not behind the surface.
+    /// Whether a point is in the rectangle and not behind the surface.
     pub(super) fn holds(&self, cam_from_world: &[[f64; 3]; 3], x: [f64; 3]) -> bool {
         let p = mat_vec(cam_from_world, sub(x, self.eye));
         p[2] > 0.0 && self.cell([p[0] / p[2], p[1] / p[2]]).is_some_and(|cell| p[2] <= self.depths[cell])
@@ -133,7 +133,7 @@ impl Surface {
     }
 }
 
-/// Whether a point lies within a polygon, by the even-odd rule.
+/// Whether a point is within a polygon, by the even-odd rule.
 pub fn within(polygon: &[[f64; 2]], [x, y]: [f64; 2]) -> bool {
     let mut inside = false;
     for (i, a) in polygon.iter().enumerate() {

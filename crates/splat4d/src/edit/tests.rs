@@ -12,7 +12,7 @@ use crate::render::RenderConfig;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::{GEOMETRY, LIFE, LifeKind, Params, Rows, SH, Space};
 
-/// A context that has one camera, one mask and one scene; nodes stand still.
+/// A context that has one camera, one mask and one scene; nodes are static.
 struct Bench {
     other: Scene<f32>,
     mask: Mask,
@@ -235,7 +235,7 @@ fn labels_are_selected_kept_and_merged() {
 }
 
 #[test]
-fn masks_are_seen_from_their_camera() {
+fn a_mask_selects_what_its_camera_sees() {
     let s = walker();
     // The left half of the image is white: x < 0 of the camera, which sees the world mirrored in no axis.
     let white = (0..48 * 64).map(|i| i % 64 < 32).collect::<Vec<_>>();
@@ -253,7 +253,7 @@ fn masks_are_seen_from_their_camera() {
 }
 
 #[test]
-fn what_is_undone_was_never_there() {
+fn undo_restores_the_scene_exactly() {
     for s in scenes() {
         let before = bytes(&s);
         let gone = run(r#"[{"do": "delete", "select": "sphere(0,0,0, 0.5)"}]"#, &s).unwrap();
@@ -266,7 +266,7 @@ fn what_is_undone_was_never_there() {
 }
 
 #[test]
-fn there_and_back_again_is_where_it_was() {
+fn an_edit_and_its_inverse_cancel() {
     let turn = r#""turn": [0.3, 1, -0.2, 70], "scale": 1.25"#;
     let back = r#""turn": [0.3, 1, -0.2, -70], "scale": 0.8"#;
     let text = format!(
@@ -291,7 +291,7 @@ fn there_and_back_again_is_where_it_was() {
 }
 
 #[test]
-fn a_hidden_part_is_away_for_its_time() {
+fn a_hidden_part_is_invisible_during_its_time_range() {
     for s in scenes() {
         let hidden = run(r#"[{"do": "hide", "select": "box(-9,-9,-9, 0,9,9)", "from": 0.3, "to": 0.6}]"#, &s).unwrap();
         let gone = run(r#"[{"do": "delete", "select": "box(-9,-9,-9, 0,9,9)"}]"#, &s).unwrap();
@@ -377,7 +377,7 @@ fn retiming_works_on_every_model() {
 }
 
 #[test]
-fn merged_scenes_are_each_as_alone() {
+fn merged_scenes_render_as_each_alone() {
     for s in scenes() {
         let other = of(vec![layer("ball", &spacetime(), 150, 7)]);
         let bench = Bench { other: other.clone(), ..Bench::empty() };
@@ -433,7 +433,7 @@ fn rods() -> Scene<f32> {
 }
 
 #[test]
-fn a_drag_bends_what_is_pulled_and_nothing_else() {
+fn a_drag_moves_the_selection_alone() {
     let s = rods();
     let step = r#"[{"do": "drag", "select": "all", "at": 0.0, "nodes": 60, "pins": [[0, 0, -1, 0.7]],
         "handles": [{"place": [0, 0, 1], "radius": 0.2, "keys": [{"t": 0.0, "by": [0, 0, 0]}, {"t": 0.5, "by": [0, 0.6, 0]}]}]}]"#;
@@ -609,7 +609,7 @@ fn visible_selects_up_to_the_depth_of_each_cell() {
 }
 
 #[test]
-fn eased_keys_are_left_and_come_to_slowly_and_meet_where_even_ones_do() {
+fn eased_keys_start_and_end_slowly_at_the_same_values() {
     let scene = &scenes()[3];
     let path = |ease: bool, t: f64| {
         let keys = format!(
@@ -627,7 +627,7 @@ fn eased_keys_are_left_and_come_to_slowly_and_meet_where_even_ones_do() {
 }
 
 #[test]
-fn the_nodes_of_a_model_bend_what_is_on_them() {
+fn dragged_nodes_move_their_gaussians() {
     let scene = &scenes()[2];
     let all: Selected = vec![vec![true; 150]];
     let own = Evaluation::of_layer(&scene.layers[0], Space::Nodes, Rows::All, Time(0.5));
@@ -677,7 +677,7 @@ fn the_preview_of_a_drag_equals_its_step() {
 
 /// What a step would multiply beyond memory, or stretch beyond use, is refused before it is made.
 #[test]
-fn what_grows_beyond_memory_or_time_is_refused_before() {
+fn edits_beyond_memory_or_time_are_refused_before_they_run() {
     struct Small(Bench);
     impl Context for Small {
         fn memory(&self) -> Option<u64> {

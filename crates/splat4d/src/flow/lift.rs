@@ -15,7 +15,7 @@ pub fn lift(from: &Camera, to: &Camera, pixel: [f64; 2], flow: [f64; 2], depth: 
 }
 
 /// The same where the second depth is not known: the point is taken to keep its distance from the camera's plane, so that
-/// motion along the viewing direction is missing. The camera stands still.
+/// motion along the viewing direction is missing. The camera is static.
 pub fn lift_in_plane(camera: &Camera, pixel: [f64; 2], flow: [f64; 2], depth: f64) -> [f64; 3] {
     lift(camera, camera, pixel, flow, depth, depth)
 }

@@ -2,7 +2,7 @@
 //! camera sees of it.
 //!
 //! A pixel belongs to the Gaussians that it shows: the eight heaviest α_i T_i at about the depth of the one at which half of
-//! the pixel's weight is reached (what a translucent edge lets through behind it has another motion), and its point lies on
+//! the pixel's weight is reached (what a translucent edge lets through behind it has another motion), and its point is on
 //! the pixel's ray at that depth. A place belongs to the Gaussians nearest to it. They carry the point on by their mean
 //! displacement; where half of them have died, the nearest that live on take over, so that points are followed through
 //! models with short lifespans, at the price of the drift of an integration.
@@ -68,7 +68,7 @@ impl Followed {
 pub struct PointView {
     /// Pixel position; outside of the image too.
     pub pixel: [f64; 2],
-    /// Whether it lies in the image with at least half of the light left before it.
+    /// Whether it is in the image with at least half of the light left before it.
     pub visible: bool,
 }
 
@@ -386,7 +386,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pixel_is_followed_both_ways_and_goes_as_the_wall_does() {
+    fn a_pixel_follows_its_wall_forwards_and_backwards() {
         let v = [0.4, -0.2, 0.1];
         let s = scene(vec![wall(0.0, 3.0, v, None)]);
         let query = Query { time: 0.5, place: Place::Pixel(Box::new(camera()), [33.0, 25.5]) };
@@ -400,7 +400,7 @@ mod tests {
     }
 
     #[test]
-    fn others_take_over_where_gaussians_live_briefly() {
+    fn short_lived_gaussians_hand_a_path_over_to_others() {
         let v = [0.4, 0.0, 0.0];
         let s = scene(vec![wall(0.0, 3.0, v, Some(0.1))]);
         let query = Query { time: 0.0, place: Place::World([0.1, 0.2, 0.0]) };
@@ -414,7 +414,7 @@ mod tests {
     }
 
     #[test]
-    fn a_point_behind_something_is_not_seen_and_nothing_is_not_followed() {
+    fn occluded_points_are_marked_and_empty_pixels_not_followed() {
         // A small screen before a wall goes from left to right.
         let s = scene(vec![wall(0.0, 6.0, [0.0; 3], None), wall(1.0, 0.6, [2.0, 0.0, 0.0], None)]);
         let seen = |t: f64, x: [f64; 3]| sights(&s, &camera(), Time(t), &[Some(x)])[0].unwrap();

@@ -62,7 +62,7 @@ fn each_pixel(flow: &Flow<f64>, mut f: impl FnMut(usize, usize, [f64; 2])) {
 }
 
 #[test]
-fn nothing_moves_without_motion() {
+fn flow_of_a_static_scene_is_zero() {
     let (scene, eye) = (wall([0.0; 3], LifeKind::GaussHalf), camera([0.4, 0.3, 4.0], [0.0; 3]));
     let shot = |t: f64| Shot { t: Time(t), camera: &eye };
     let flow = render_flow(&scene, shot(0.3), shot(0.8), &mut renderer());

@@ -35,7 +35,7 @@ pub struct Dialect {
     pub moves: bool,
     /// Whether bytes are such a file; `None`: they have no mark, and only the ending decides.
     pub mark: Option<fn(&[u8]) -> bool>,
-    /// Reads a file; [`Dialect::open`] says which way is up.
+    /// Reads a file; [`Dialect::open`] states which way is up.
     pub read: fn(&[u8]) -> Result<Opened>,
     /// How it is written.
     pub writer: Writer,
@@ -90,7 +90,7 @@ pub struct PlyInfo {
     pub mended: Mended,
     /// Whether base colours are RGB (`red green blue`), not coefficients.
     pub rgb: bool,
-    /// What was subtracted from positions in double precision that are far from the origin, or what the file says was.
+    /// What was subtracted from positions in double precision that are far from the origin, or what the file states was.
     pub offset: [f64; 3],
     /// Whether the numbers were quantised (PlayCanvas' compressed layout).
     pub compressed: bool,
@@ -105,9 +105,9 @@ pub struct PlyInfo {
 /// An opened file.
 #[derive(Debug)]
 pub struct Opened {
-    /// The scene, in the file's own axes; `up` says which way they lie.
+    /// The scene, in the file's own axes; `up` states which way they lie.
     pub scene: Scene<f32>,
-    /// Which way is up, where the file itself says so.
+    /// Which way is up, where the file itself states so.
     pub up: Option<[f64; 3]>,
     /// Metadata of a .ply.
     pub ply: Option<PlyInfo>,
@@ -127,7 +127,7 @@ impl From<(Params, Warnings)> for Opened {
     }
 }
 
-/// A scene of one layer that stands still; its `up` is not said.
+/// A scene of one layer that is static; its `up` is not said.
 pub fn still(params: Params) -> Scene<f32> {
     let layer = Layer::new("gaussians", params, Arc::new(Still), LifeKind::Infinite);
     Scene { layers: vec![layer], fps: DEFAULT_FPS, ..Scene::default() }
@@ -160,7 +160,7 @@ impl Dialect {
         (self.read)(bytes).map(|opened| self.finish(opened))
     }
 
-    /// What [`open`](Self::open) does after reading: says which way is up and mends values at the edge. For files that are
+    /// What [`open`](Self::open) does after reading: states which way is up and mends values at the edge. For files that are
     /// read with others next to them ([`gltf::read_text`](super::gltf::read_text)).
     pub fn finish(&self, mut opened: Opened) -> Opened {
         opened.scene.up = opened.up.unwrap_or(self.up);

@@ -8,7 +8,7 @@
 use crate::scene::LifeKind;
 use crate::scene::Time;
 
-/// Times at which the opacity is looked at.
+/// Times at which the opacity is examined.
 const SAMPLES: usize = 32;
 /// An end counts as cut where this share of the opacity is lost at once.
 const CUT: f64 = 0.02;
@@ -57,13 +57,13 @@ impl Visibility {
         if [self.span[0] <= first, self.span[1] >= last][k] {
             return false;
         }
-        // Most is seen at the centre, where that lies beyond the end.
+        // Most is seen at the centre, where that is beyond the end.
         let center = self.life[0];
         let beyond = self.kind != LifeKind::Infinite && [center < self.span[0], center > self.span[1]][k];
         self.sigma(if beyond { center.max(first).min(last) } else { self.span[k] }) > CUT
     }
 
-    /// The fade that says the same exactly. `None`: there is none.
+    /// The fade that states the same exactly. `None`: there is none.
     pub(super) fn exact(&self) -> Option<Fade> {
         let [first, last] = self.clip;
         let [center, log_width, log_softness] = self.life;

@@ -22,7 +22,7 @@ const NARROWEST: f64 = 1e-7;
 /// Assumed length of a file without a clock of its own: one second.
 const UNKNOWN_CLIP: f64 = 1.0;
 
-/// Where the file's 0 and 1 lie on the scene clock.
+/// Where the file's 0 and 1 are on the scene clock.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Clock {
     /// First and last second of the clip.
@@ -89,7 +89,7 @@ impl Moving {
 
 /// All Gaussians of a scene on the clock of a file called `name`.
 ///
-/// Errors: a layer's motion or life is not of this kind; the message says what to do.
+/// Errors: a layer's motion or life is not of this kind; the message states what to do.
 pub(super) fn rows(
     scene: &Scene<f32>,
     clock: Clock,

@@ -38,7 +38,7 @@ const MOST: f64 = 0.5;
 /// Of scenes of logarithms, hardly a Gaussian is as large as a quarter of the inner half of the scene; of lengths read as
 /// logarithms, e^s ≥ 1, most are wherever the scene is not far larger than a unit.
 const LARGE: f64 = 0.25;
-/// In larger scenes: lengths below a unit, read as logarithms, would all lie between 1 and e units in every direction. No
+/// In larger scenes: lengths below a unit, read as logarithms, would all be between 1 and e units in every direction. No
 /// trained scene has such sizes.
 const UNIT: f32 = 1.0;
 /// White in opacities and colours that are bytes, and in opacities that are percent.
@@ -119,7 +119,7 @@ fn alphas(of: &Spread) -> Option<String> {
     })
 }
 
-/// Evidence that base colours are RGB. Coefficients of trained scenes lie on both sides of zero, which is grey.
+/// Evidence that base colours are RGB. Coefficients of trained scenes are on both sides of zero, which is grey.
 fn rgb(of: &Spread) -> Option<String> {
     let parts = of.high <= 1.0 && of.low < of.high;
     let bytes = of.high > BRIGHTEST && of.high <= BYTE && of.middle > 1.0;
@@ -218,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn values_stored_as_they_are_are_doubted_and_read_on_request() {
+    fn linear_values_are_warned_of_and_read_on_request() {
         let mut logs = gaussians(200, 4);
         let within = |c: f32| c.clamp(-1.7, 1.7);
         (0..200).for_each(|row| {
@@ -251,7 +251,7 @@ mod tests {
     }
 
     #[test]
-    fn opacities_that_are_all_one_are_doubted() {
+    fn opacities_that_are_all_one_are_warned_of() {
         let mut p = gaussians(60, 1);
         let mut found = |opacity: f32| {
             (0..60).for_each(|row| p[GEOMETRY].set(row, OPACITY, opacity));
@@ -261,7 +261,7 @@ mod tests {
     }
 
     #[test]
-    fn lengths_of_one_size_are_doubted_in_scenes_of_any_size() {
+    fn uniform_lengths_are_warned_of_at_any_scale() {
         // The radius of these Gaussians is about 3 units.
         for (stretch, length) in [(1.0, 0.01), (1.0, 0.3), (1.0, 1.0), (20.0, 0.05), (20.0, 0.9), (20.0, 4.0)] {
             let mut p = gaussians(60, 1);

@@ -66,7 +66,7 @@ pub const DIALECTS: &[Dialect] = &[
     checkpoint::DIALECT,
 ];
 
-/// The scene in a file of any kind that says by its first bytes what it is: `.s4d`, .ply (3DGS, compressed, Spacetime
+/// The scene in a file of any kind that states by its first bytes what it is: `.s4d`, .ply (3DGS, compressed, Spacetime
 /// Gaussians), .spz, .splatv, zipped SOG, `scene.safetensors` and checkpoints. A .splat has no mark: [`splat::read`] it.
 ///
 /// Assumptions are not returned; [`Dialect::open`] returns them. Errors: no such kind; the reader's.

@@ -32,7 +32,7 @@ pub(crate) fn linear(code: u32, min: f64, max: f64, levels: u32) -> f64 {
     min + (max - min) * (f64::from(code as i32) / f64::from(levels))
 }
 
-/// Code 0..=`levels` of a positive number whose logarithm lies in [min, max].
+/// Code 0..=`levels` of a positive number whose logarithm is in [min, max].
 ///
 /// Relative error of the round trip: at most exp((max − min)/(2·levels)) − 1. Zero and less give code 0.
 #[cfg(test)]

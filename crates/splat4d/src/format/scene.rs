@@ -54,7 +54,7 @@ impl Stated {
             "life": l.life.name(),
             "motion": spec_to_json(&l.motion.spec()),
         });
-        // JSON knows no infinity: a side that is open is null, and a layer that is always seen says nothing.
+        // JSON knows no infinity: a side that is open is null, and a layer that is always seen states nothing.
         if l.span != ALWAYS {
             layer["span"] = json!(l.span.map(|t| t.is_finite().then_some(t)));
         }
@@ -492,7 +492,7 @@ mod tests {
     }
 
     #[test]
-    fn an_offset_comes_back_exactly_and_near_scenes_say_nothing_of_it() {
+    fn an_offset_round_trips_and_near_scenes_store_none() {
         let mut s = scene();
         let near = metadata(&s).to_string();
         s.offset = [431_234.1, 5_412_345.6, -310.2];

@@ -42,7 +42,7 @@ const MOST_JSON: usize = 1 << 20;
 const SMALLEST_SCALE: f32 = 6e-8;
 
 /// Writes a moving scene. The options' cameras are offered by the players; without any, the first of [`Scene::clip`] is
-/// looked at from afar.
+/// viewed from afar.
 ///
 /// Errors: the scene moves in a way that the format cannot say, or lives so and may not be fitted; the sink's.
 pub fn write(scene: &Scene<f32>, options: &WriteOptions, out: &mut impl Write) -> Result<Warnings> {

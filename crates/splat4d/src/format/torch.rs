@@ -170,7 +170,7 @@ impl<'a> Torch<'a> {
         entries.iter().filter_map(text).collect()
     }
 
-    /// The numbers of a tensor, row-major. Errors: it lies outside its storage, which is missing or too short.
+    /// The numbers of a tensor, row-major. Errors: it is outside its storage, which is missing or too short.
     pub(super) fn numbers(&self, tensor: &Tensor) -> Result<Vec<f32>> {
         let name = format!("{}data/{}", self.folder, tensor.key);
         // Storages are stored as they are: a small file cannot become a large one.

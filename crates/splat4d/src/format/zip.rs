@@ -33,7 +33,7 @@ const MOST_COMMENT: usize = 65_535;
 const ZIP64: u32 = u32::MAX;
 /// Deflate shrinks 1032:1 at the very most (zlib technical details).
 const MOST_RATIO: usize = 1032;
-/// Most files that are looked at: a SOG scene has eight, an archive of arrays an array each.
+/// Most files that are examined: a SOG scene has eight, an archive of arrays an array each.
 const MOST_FILES: u16 = 4096;
 
 /// An archive's directory.

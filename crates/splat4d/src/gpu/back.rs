@@ -37,7 +37,7 @@ pub(super) struct Returned {
     partial: Vec<[f64; 3]>,
 }
 
-/// Where things lie in the memory that the CPU reads.
+/// Where things are in the memory that the CPU reads.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Layout {
     cameras: u64,
@@ -234,7 +234,7 @@ impl GpuRenderer {
         let frame = Frame { gpu: &self.gpu, kernels: &self.kernels, buffers: &self.buffers, groups };
         let mut recorder = Recorder::new(&self.gpu, &self.queries, self.clock);
         if again {
-            // The lists and planes of another band lie there.
+            // The lists and planes of another band are there.
             frame.band(&mut recorder, band, across, None)?;
         }
         let end = if last { End::Splats } else { End::Band };

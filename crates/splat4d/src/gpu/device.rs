@@ -40,7 +40,7 @@ pub struct Gpu {
 impl Gpu {
     /// Opens the best adapter: discrete before integrated, hardware before software.
     ///
-    /// Errors: there is none (the message says what was found), or its driver refuses WebGPU's default limits.
+    /// Errors: there is none (the message states what was found), or its driver refuses WebGPU's default limits.
     pub fn open(adapters: Adapters) -> Result<Self> {
         Self::open_within(adapters, u64::MAX)
     }

@@ -91,7 +91,7 @@ pub(super) struct Groups {
     sort_depth: Vec<BindGroup>,
     sort_tile: Vec<BindGroup>,
     tiles: BindGroup,
-    /// For lists that lie in the first and in the second buffer.
+    /// For lists that are in the first and in the second buffer.
     ranges: [BindGroup; 2],
     rasterize: [BindGroup; 2],
 }
@@ -212,7 +212,7 @@ impl Frame<'_> {
         dispatch(pass, kernel, 2, self.buffers, blocks);
     }
 
-    /// One pass of a sort a group; `of` says in which buffer the number of blocks is.
+    /// One pass of a sort a group; `of` states in which buffer the number of blocks is.
     fn sort(&self, pass: &mut ComputePass<'_>, groups: &[BindGroup], of: usize) {
         let kernel = &self.kernels.sort;
         for group in groups {

@@ -2,7 +2,7 @@
 //! them
 //! passing through the CPU. Densification, files and whatever else looks at a scene fetch the tables, and hand them back.
 //!
-//! Tables of more rows than a binding holds lie in pages of whole blocks, each with buffers and dispatches of its own; every row
+//! Tables of more rows than a binding holds are in pages of whole blocks, each with buffers and dispatches of its own; every row
 //! has a thread to itself, so that pages change no bit of the tables.
 
 mod cameras;

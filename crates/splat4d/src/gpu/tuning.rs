@@ -1,4 +1,4 @@
-//! Constants of the kernels that decide how fast they are, and of what they compute nothing but, where it says so, last bits: what
+//! Constants of the kernels that decide how fast they are, and of what they compute nothing but, where it states so, last bits: what
 //! a sweep on a card varies.
 
 use super::limits::THREADS;
@@ -122,7 +122,7 @@ mod tests {
     use crate::wgsl;
 
     #[test]
-    fn every_constant_is_found_once_and_its_default_is_what_stands_there() {
+    fn every_shader_constant_exists_once_with_its_default() {
         let shaders =
             [wgsl::SORT, wgsl::SCAN, wgsl::RANGES, wgsl::RASTERIZE, wgsl::RASTERIZE_BACK, wgsl::LEARNT, wgsl::ADAM];
         for shader in shaders {

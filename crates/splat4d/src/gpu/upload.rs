@@ -1,4 +1,4 @@
-//! A scene's tables on the GPU, just as they lie in memory: `[row / 16][column][16]`.
+//! A scene's tables on the GPU, just as they are in memory: `[row / 16][column][16]`.
 //!
 //! Tables of colours may be larger than a binding: they are cut by rows, and each cut is projected and coloured by a
 //! dispatch of its own.

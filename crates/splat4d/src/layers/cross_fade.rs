@@ -108,7 +108,7 @@ mod tests {
     const SIZE: usize = 12;
     const ROWS: usize = 5;
 
-    /// Gaussians behind one another, as large as `log_scale` says.
+    /// Gaussians behind one another, as large as `log_scale` states.
     fn layer(log_scale: f64) -> Layer<f64> {
         let mut params = Params::new(ROWS, 1, LifeKind::Infinite.columns());
         for i in 0..ROWS {

@@ -184,7 +184,7 @@ impl<F: Real> Layer<F> {
         }
     }
 
-    /// Whether t lies in the layer's span. A NaN does, so that the trainer's guard finds it.
+    /// Whether t is in the layer's span. A NaN is, so that the trainer's guard finds it.
     pub fn spans_over(&self, t: Time) -> bool {
         !(t.0 < self.span[0] || t.0 >= self.span[1])
     }
@@ -383,8 +383,8 @@ pub enum Head {
     /// They are the colour.
     #[default]
     Identity,
-    /// By the network of Spacetime Gaussians, whose weights lie in the first layer that has features. Layers without
-    /// features may stand next to it: theirs count as zero.
+    /// By the network of Spacetime Gaussians, whose weights are in the first layer that has features. Layers without
+    /// features may be next to it: theirs count as zero.
     Features,
 }
 

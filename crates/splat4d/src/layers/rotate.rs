@@ -157,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn up_goes_where_it_should() {
+    fn the_rotation_between_two_directions_is_exact() {
         let axes = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.1, -0.9, 0.2]];
         for from in axes.into_iter().chain(axes.map(|a| a.map(|x| -x))) {
             for to in axes {

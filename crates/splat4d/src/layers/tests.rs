@@ -102,7 +102,7 @@ fn detached_center_learns_from_opacity_alone() {
 }
 
 #[test]
-fn zero_delta_is_the_base_pose_and_a_moving_frame_changes_nothing() {
+fn zero_delta_is_the_base_pose_and_motion_is_galilean_invariant() {
     let spec = Spec::Spacetime(SpacetimeSpec { order: 3, rotation: true, ..SpacetimeSpec::default() });
     let mut l = layer(&spec, LifeKind::GaussHalf, 20, 5);
     let mut tape = LayerTape::default();
@@ -255,7 +255,7 @@ fn turning() -> Scene<f32> {
 }
 
 #[test]
-fn plain_gaussians_are_what_is_drawn_and_what_turned_keeps_its_scales() {
+fn plain_gaussians_equal_the_rendered_ones_and_keep_their_scales() {
     use crate::math::sym3::from_quat_log_scales;
     let (scene, t) = (turning(), Time(0.9));
     let mut seen = Evaluation::default();

@@ -115,7 +115,7 @@ mod tests {
     }
 
     #[test]
-    fn a_similarity_is_found_and_taken_away() {
+    fn a_similarity_between_trajectories_is_estimated_and_removed() {
         let truth = Sim3 { scale: 3.0, rotation: rotation([0.9, 0.3, -0.6, 0.2]), translation: [5.0, -2.0, 9.0] };
         let poses = path();
         let pairs = [[0, 1], [1, 2], [2, 3], [3, 4], [4, 5]];
@@ -137,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn an_error_that_no_similarity_explains_is_the_trajectorys() {
+    fn errors_that_no_similarity_explains_remain() {
         // A square whose corners move outwards and inwards in turn: no similarity comes nearer than leaving it.
         let corners = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]];
         let pose = |c: [f64; 3]| Se3::look_at(c, [0.0, 0.0, 3.0], [1.0, 1.0, 0.0]);

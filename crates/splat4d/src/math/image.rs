@@ -40,7 +40,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn boxes_are_averaged_and_what_fills_none_is_left_out() {
+    fn boxes_are_averaged_and_partial_boxes_dropped() {
         let plane: Vec<f32> = (0..15).map(|i| i as f32).collect();
         let mut half = plane.iter().chain(&plane).copied().collect();
         halve(&mut half, [2, 3, 5]);

@@ -97,7 +97,7 @@ impl Tree {
         let mut depth = 0;
         let mut ranges = vec![items.len()];
         let mut nodes = Vec::new();
-        // All ranges of a level differ by at most one in length, so all leaves lie on one level.
+        // All ranges of a level differ by at most one in length, so all leaves are on one level.
         while items.len() >> depth > LEAF {
             let mut parts = Vec::with_capacity(ranges.len());
             let mut rest = items.as_mut_slice();

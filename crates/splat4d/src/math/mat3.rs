@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn what_leaves_a_choice_turns_least() {
+    fn an_ambiguous_rotation_is_the_smallest() {
         let identity = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
         assert_eq!(procrustes([[0.0f32; 3]; 3]), identity.map(|r| r.map(|x| x as f32)));
         assert_eq!(procrustes([[f64::NAN; 3]; 3]), identity);

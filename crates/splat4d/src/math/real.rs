@@ -64,7 +64,7 @@ pub trait Real:
     fn max(self, other: Self) -> Self;
     /// Neither NaN nor infinite.
     fn is_finite(self) -> bool;
-    /// self·b + c, fused only where the instruction set has it (the caller says so by `FMA`).
+    /// self·b + c, fused only where the instruction set has it (the caller states so by `FMA`).
     fn fma<const FMA: bool>(self, b: Self, c: Self) -> Self;
     /// 2^self for self in [-126, 0]: a branch-free polynomial in f32 (relative error ≤ 5e-6, 1 only at 0), exact in
     /// f64. Below the range the result is any number.
@@ -284,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn exp_is_within_its_stated_error_and_keeps_what_is_special() {
+    fn exp_is_within_its_stated_error_and_keeps_special_values() {
         let mut worst = 0.0f64;
         // Every exponent and some thousand mantissas each, both signs, where the result is a normal number.
         for bits in (0..0x42b2_0000u32).step_by(7919) {

@@ -74,7 +74,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn moments_and_independence_of_streams() {
+    fn random_streams_have_the_right_mean_and_variance_and_are_independent() {
         let (a, b) = (Rng::new(1, "a", 0), Rng::new(1, "b", 0));
         let n = 100_000;
         let mean: f64 = (0..n).map(|i| a.normal(i)).sum::<f64>() / n as f64;

@@ -121,7 +121,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn look_at_puts_the_target_ahead_and_up_above() {
+    fn look_at_puts_the_target_ahead_with_up_upwards() {
         let pose = Se3::look_at([3.0, 1.0, -2.0], [0.0, 0.5, 0.0], [0.0, 1.0, 0.0]);
         let p = pose.apply([0.0, 0.5, 0.0]);
         assert!(p[0].abs() < 1e-12 && p[1].abs() < 1e-12 && p[2] > 0.0);

@@ -79,7 +79,7 @@ mod tests {
     }
 
     #[test]
-    fn is_a_rigid_motion_and_nothing_at_zero() {
+    fn a_twist_is_a_rigid_motion_and_zero_is_the_identity() {
         for i in 0..50 {
             let (p, q, v) = (draw(i), draw(100 + i), draw(200 + i));
             let w = draw(300 + i).map(|x| x * [1e-9, 1e-3, 0.5, 3.0][i as usize % 4]);
@@ -95,7 +95,7 @@ mod tests {
     }
 
     #[test]
-    fn gradient_equals_finite_differences_and_both_branches_meet() {
+    fn gradient_equals_finite_differences_and_both_branches_agree() {
         for i in 0..40 {
             let scale = [1e-7, 1e-2, 0.57, 1.5][i as usize % 4];
             let x: [f64; 9] =

@@ -594,7 +594,7 @@ impl<F: Real> Motion<F> for Edited<F> {
         own
     }
 
-    /// Places inside a path or a drag are not the world's: only what stands next to them can take a frame in.
+    /// Places inside a path or a drag are not the world's: only what is next to them can take a frame in.
     fn apply_transform(&self, p: &mut Params<F>, frame: &Sim3) -> bool {
         match self.change {
             Change::Path { .. } | Change::Drag(_) => false,

@@ -1,7 +1,7 @@
 //! `filtered`: a Kalman-like filter in Wasserstein geometry around any model.
 //!
 //! The answer of the model inside at t is an observation Nₒ. From its answers one frame (and one baseline more) earlier
-//! follows a prediction Nₚ at constant velocity, Exp(−Log) (see [`Predictor`]). The state that is drawn lies between:
+//! follows a prediction Nₚ at constant velocity, Exp(−Log) (see [`Predictor`]). The state that is drawn is between:
 //!
 //! | fusion | state |
 //! |---|---|

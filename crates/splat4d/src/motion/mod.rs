@@ -152,7 +152,7 @@ pub trait Motion<F: Real = f32>: Any + Send + Sync {
     /// Fills `tape.out` [rows, 10] for one question; random access in t.
     fn at(&self, q: &At<'_, F>, cache: &Cache, tape: &mut Tape<F>);
 
-    /// Where the splats' colour comes from; the layer's SH unless a model says otherwise.
+    /// Where the splats' colour comes from; the layer's SH unless a model states otherwise.
     fn color<'a>(&self, q: &At<'a, F>, _tape: &'a Tape<F>) -> Color<'a, F> {
         Color::Sh { table: &q.p[SH], rows: q.rows, weights: None, base: true }
     }
@@ -183,7 +183,7 @@ pub trait Motion<F: Real = f32>: Any + Send + Sync {
     }
 
     /// For models whose life is not the layer's: fills [N, 2] with (centre, log width) of a `GaussHalf` life and returns
-    /// true. False: the layer's own life table says it.
+    /// true. False: the layer's own life table states it.
     fn life(&self, _p: &Params<F>, _out: &mut Table<F>) -> bool {
         false
     }

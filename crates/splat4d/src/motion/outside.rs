@@ -124,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn names_that_are_taken_or_cannot_be_written_are_refused() {
+    fn duplicate_and_unwritable_names_are_refused() {
         for name in ["still", "auto", "filtered", "", "a b", "../x"] {
             assert!(register(name, Arc::new(Falls::make)).is_err(), "{name}");
         }

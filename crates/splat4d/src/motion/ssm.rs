@@ -8,7 +8,7 @@
 //!
 //! - `mode`: scans in both directions to reconstruct; the past alone to forecast, with ticks past the clip as asked for.
 //! - `output`: poses, or their rates, which are composed from tick to tick (drifts, but carries on).
-//! - `equivariance`: none; `frames`: all that the network sees and says is in local frames of the nodes (`nn::frames`),
+//! - `equivariance`: none; `frames`: all that the network sees and states is in local frames of the nodes (`nn::frames`),
 //!   so that a turned scene is a turned scene; `vector`: vector neurons (`nn::vector`), which mirror exactly, too.
 //!
 //! A node's context (positions, frames, neighbours) is taken when nodes are placed or edited and held
@@ -88,7 +88,7 @@ pub struct SsmSpec {
     pub embedding: usize,
     /// Octaves of the clock; 0: no clock, only the impulse at the ends.
     pub octaves: usize,
-    /// Scene units that a node moves where the network says 1.
+    /// Scene units that a node moves where the network states 1.
     pub extent: f64,
     /// Which ticks a pose may depend on.
     pub mode: Mode,

@@ -4,7 +4,7 @@
 //! Between frames, u = (t − t_k)/(t_{k+1} − t_k): μ = (1 − u) μ_k + u μ_{k+1}, and q = (1 − u) q̂_k ± u q̂_{k+1} with the
 //! sign that makes the two quaternions neighbours. Before the first frame and after the last one nothing moves. On a
 //! frame itself, where the slopes of both sides differ, dL/dt is 0 and only that frame is read.
-//! Source: Luiten et al. 2024 (Dynamic 3D Gaussians) §3; what lies between frames is ours.
+//! Source: Luiten et al. 2024 (Dynamic 3D Gaussians) §3; what is between frames is ours.
 
 #[cfg(test)]
 mod tests;
@@ -27,7 +27,7 @@ pub const POSE: usize = 7;
 const PAGE: [(&str, usize); 2] = [("means", 3), ("quats", 4)];
 /// Name of the pages' tables.
 const PAGES: &str = "poses";
-/// Name of the table, and of its only column group, that says who is foreground: a logit.
+/// Name of the table, and of its only column group, that states who is foreground: a logit.
 pub const FOREGROUND: &str = "foreground_logits";
 /// Cameras that must see every time: with two, what moves along a line between them is not seen to move.
 pub const LEAST_CAMERAS: usize = 3;
@@ -206,7 +206,7 @@ impl<F: Real> Motion<F> for Tracked {
         Spec::Tracked(self.spec.clone())
     }
 
-    /// On a frame, and outside of the clip; what lies between two frames is of both.
+    /// On a frame, and outside of the clip; what is between two frames is of both.
     fn pose_table(&self, t: Time) -> Option<Key> {
         let (a, b, _) = self.around(t.0);
         (a == b).then_some(self.pages[a])
@@ -240,7 +240,7 @@ impl<F: Real> Motion<F> for Tracked {
         }
     }
 
-    /// The slope of the line that t lies on; on a frame the mean of both sides. Outside the clip nothing moves.
+    /// The slope of the line that t is on; on a frame the mean of both sides. Outside the clip nothing moves.
     fn velocity(&self, q: &At<'_, F>, out: &mut Table<F>) {
         *out = Table::new(&[("velocity", 3)], q.len());
         let times = &self.spec.times;
@@ -267,7 +267,7 @@ impl<F: Real> Motion<F> for Tracked {
 struct Reader<'a, F> {
     geometry: &'a Table<F>,
     from: &'a Table<F>,
-    /// The frame after t, where t lies between two.
+    /// The frame after t, where t is between two.
     to: Option<&'a Table<F>>,
     share: F,
     /// du/dt, 1/s

@@ -54,7 +54,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn values_are_those_of_the_definition() {
+    fn values_equal_the_definition() {
         let mut out = vec![9.0f64; encoded(1, 2)];
         encode(&[0.0], 2, &mut out);
         assert_eq!(out, [0.0, 0.0, 1.0, 0.0, 1.0]);

@@ -258,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn a_gap_too_small_takes_the_parents_axes_instead_of_jumping() {
+    fn nearly_coinciding_points_use_the_parents_axes() {
         // Two of three moments agree up to noise: without the fallback the axes would be those of the noise.
         let ring: Vec<[f64; 3]> = (0..12)
             .map(|i| {

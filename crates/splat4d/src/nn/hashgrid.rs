@@ -1,7 +1,7 @@
 //! [`HashGrid`]: features on grids of several resolutions, blended between the corners of a cell; fine grids share their
 //! entries by a hash.
 //!
-//! Level l has R_l = ⌊base·g^l⌋ cells a side with g = (finest/base)^{1/(levels−1)}. A point u in \[0,1\]^d lies at
+//! Level l has R_l = ⌊base·g^l⌋ cells a side with g = (finest/base)^{1/(levels−1)}. A point u in \[0,1\]^d is at
 //! u·(R_l − 1) + ½, so that corners of no two levels coincide at 0. A level with (R_l + 1)^d ≤ 2^log2_size corners has an
 //! entry for each, any other looks its corners up at (⊕ c_k π_k) mod 2^log2_size.
 //! A level's gradient is scattered by one task in the order of the rows: the bits do not depend on the number of threads.
@@ -85,7 +85,7 @@ struct Level {
     dense: bool,
 }
 
-/// A grid whose entries lie in a layer's [`Params`].
+/// A grid whose entries are in a layer's [`Params`].
 #[derive(Clone, Debug)]
 pub struct HashGrid {
     shape: HashShape,
@@ -226,7 +226,7 @@ impl HashGrid {
     }
 }
 
-/// Work on the rows of one level, with `N` features an entry; 0: as many as it says.
+/// Work on the rows of one level, with `N` features an entry; 0: as many as it states.
 trait LevelPass: Sized {
     fn pass<const N: usize>(self);
 }
@@ -319,7 +319,7 @@ impl<F: Real, const D: usize> LevelPass for Scatter<'_, F, D> {
     }
 }
 
-/// Adds what a level says to the gradient of the points.
+/// Adds what a level states to the gradient of the points.
 struct Slopes<'a, F, const D: usize> {
     rows: Points<'a, F, D>,
     d_out: Columns<'a, F>,
@@ -386,7 +386,7 @@ impl Level {
         cell
     }
 
-    /// The entry of a corner; bit k of `corner` says which end of axis k.
+    /// The entry of a corner; bit k of `corner` states which end of axis k.
     #[inline(always)]
     fn entry<F: Real, const D: usize>(&self, cell: &Cell<F, D>, corner: usize) -> usize {
         let c = |k: usize| cell.low[k] + (corner >> k & 1) as u32;

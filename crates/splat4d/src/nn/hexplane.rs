@@ -4,7 +4,7 @@
 //! channels a level. Sources: Cao and Johnson 2023 (HexPlane); Fridovich-Keil et al. 2023 (K-Planes); Wu et al. 2024
 //! ("4DGaussians"), whose released code multiplies the planes and concatenates the levels.
 //!
-//! Coordinates run over [0, 1]: 0 is the first grid point, 1 the last, and what lies outside sees the border and has no
+//! Coordinates run over [0, 1]: 0 is the first grid point, 1 the last, and what is outside sees the border and has no
 //! gradient. (The released code sends t in [0, 1] to a grid over [-1, 1] and so never reads half of it; here the whole
 //! grid is time, and half as many time steps are as fine.)
 //!

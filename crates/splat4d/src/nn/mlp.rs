@@ -1,5 +1,5 @@
 //! [`Mlp`]: a perceptron over many rows, forward and backward a chunk of rows at a time, so that all layers of a chunk
-//! are worked on while it lies in the cache.
+//! are worked on while it is in the cache.
 //!
 //! a₀ = x, aᵢ₊₁ = max(0, aᵢ Wᵢᵀ + bᵢ), out = a_D W_Dᵀ + b_D; where `skip` = s the input of layer s + 1 is [a_{s+1}, x].
 //! Backward: dWᵢ = dYᵢᵀ aᵢ, dbᵢ = Σ_rows dYᵢ, daᵢ = dYᵢ Wᵢ, masked where aᵢ is not positive.
@@ -80,7 +80,7 @@ struct Map {
     outputs: usize,
 }
 
-/// A perceptron whose weights lie in a layer's [`Params`].
+/// A perceptron whose weights are in a layer's [`Params`].
 #[derive(Clone, Debug)]
 pub struct Mlp {
     shape: MlpShape,
@@ -346,7 +346,7 @@ impl Mlp {
         (CHUNK_NUMBERS / self.shape.width.max(1)).clamp(CHUNK_ROWS[0], CHUNK_ROWS[1])
     }
 
-    /// Numbers a row that the hidden layers give, with the input where it stands next to them.
+    /// Numbers a row that the hidden layers give, with the input where it is next to them.
     fn hidden(&self) -> usize {
         self.maps[1..].iter().map(|m| m.inputs).sum()
     }

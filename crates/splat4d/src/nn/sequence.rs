@@ -1,9 +1,9 @@
 //! The residual block of a sequence model, for sixteen sequences at a time: LayerNorm → state space, in one or both
 //! directions → GELU → linear → residual.
 //!
-//! Numbers lie as [rows, ticks] of lanes, so that a layer that mixes rows is one matrix product for all ticks, and a scan
+//! Numbers are as [rows, ticks] of lanes, so that a layer that mixes rows is one matrix product for all ticks, and a scan
 //! reads one row from end to end. Gradients of weights are added to; those of activations are written over where a
-//! function says so.
+//! function states so.
 
 use super::matmul::{Matrix, product};
 use super::ssm::{self, Direction, Discrete, LANES, Lane, Pair};
@@ -24,7 +24,7 @@ pub(crate) struct Layout {
 }
 
 impl Layout {
-    /// Appends a part of `numbers`; says where it lies.
+    /// Appends a part of `numbers`; states where it lies.
     pub(crate) fn push(&mut self, name: String, numbers: usize) -> Range<usize> {
         let at = self.len..self.len + numbers;
         self.len = at.end;

@@ -19,7 +19,7 @@ pub(crate) const CHUNK: usize = 16;
 const SERIES: f64 = 1e-2;
 /// Ā falls to e^-40 at most in a tick: what decays faster is gone anyway, and 0/0 is not met.
 const STRONGEST_DECAY: f64 = 40.0;
-/// Steps are at most e³ ticks, whatever a file says.
+/// Steps are at most e³ ticks, whatever a file states.
 const LONGEST_LOG_STEP: f64 = 3.0;
 /// Decay that all modes start with: Re Λ = −½ (S4D-Lin).
 const FIRST_DECAY: f64 = 0.5;
@@ -42,7 +42,7 @@ pub(crate) struct Shape {
     pub copies: usize,
 }
 
-/// Names of a layer's learnable arrays, in the order in which they lie in its slice of weights, and numbers of each: a
+/// Names of a layer's learnable arrays, in the order in which they are in its slice of weights, and numbers of each: a
 /// \[H,N\], ω \[H,N\], B and C \[H,N\] (re, im), D \[H\], log Δ \[H\] (ticks of the grid over the clip: see [`init`]).
 pub(crate) fn arrays(shape: Shape) -> [(&'static str, usize); 6] {
     let (h, n) = (shape.channels, shape.channels * shape.states);

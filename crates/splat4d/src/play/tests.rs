@@ -5,7 +5,7 @@ use crate::math::Rng;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Seconds of the take.
+/// Seconds of the clip.
 const CLIP: f64 = 8.0;
 
 fn primitive(rng: &Rng, center: f64, half_width: f64) -> Primitive {

@@ -55,7 +55,7 @@ impl<'a, F: Real> Shot<'a, F> {
 pub enum Tables {
     /// Everything is sent to a device for every image.
     Changing,
-    /// A layer's own SH table ([`crate::scene::Color::Sh`] with `base`) that lies at the same address and has the same
+    /// A layer's own SH table ([`crate::scene::Color::Sh`] with `base`) that is at the same address and has the same
     /// size as in the last render is the same table, and is not sent again: right for a scene that is played, wrong
     /// for one that learns. Everything else of a time is sent all the same.
     Constant,
@@ -63,7 +63,7 @@ pub enum Tables {
 
 /// Draws splats and takes gradients back; memory is reused from image to image.
 pub trait Backend<F: Real = f32>: Send {
-    /// Whether it has these abilities. Errors: it lacks one; the message names it and says what can.
+    /// Whether it has these abilities. Errors: it lacks one; the message names it and states what can.
     fn can(&self, wanted: &Wanted) -> Result<()>;
 
     /// Draws into `out`, which is resized to the camera's image. Rows that are NaN, infinite, behind the camera or

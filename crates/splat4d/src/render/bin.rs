@@ -29,7 +29,7 @@ pub(crate) const PAIR_BUDGET: usize = 1 << 24;
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Footprint {
-    /// First column of bins; [`LARGE`] says what `cover` is.
+    /// First column of bins; [`LARGE`] states what `cover` is.
     x0: u16,
     /// First row of bins.
     y0: u16,

@@ -1,12 +1,12 @@
 //! Blending one bin of 32² pixels, and the backward pass.
 //!
-//! Its 16 tiles of 8² pixels stay in cache while a batch of splats passes: for each tile the batch's bit map says which
+//! Its 16 tiles of 8² pixels stay in cache while a batch of splats passes: for each tile the batch's bit map states which
 //! splats can touch it, and for each of these its rows of pixels go through one loop over eight lanes.
 //!
 //! α = min(α_max, o·g), g = exp(−½ dᵀ conic d); α < α_min is skipped; a pixel stops before T(1−α) would fall below
 //! T_min. Source: Kerbl et al. 2023; gradients are 0 where α is at its maximum, as in gsplat.
 //!
-//! Backward walks in the same order as forward, so that it meets the same α, T and stops: what lies behind a splat is
+//! Backward walks in the same order as forward, so that it meets the same α, T and stops: what is behind a splat is
 //! what the image holds less what has passed (as in Taming 3DGS, Mallick et al. 2024). It needs no record of the
 //! last splat of a pixel, which would cost the forward pass two memory accesses a pixel and splat.
 
@@ -261,7 +261,7 @@ impl<F: Real> Blend<'_, F> {
     }
 }
 
-/// Tiles before the first splat; bit t of the result: tile t lies in the image.
+/// Tiles before the first splat; bit t of the result: tile t is in the image.
 #[inline(always)]
 pub(super) fn begin<F: Real>(tiles: &mut [Tile<F>], inside: [usize; 2]) -> u32 {
     let mut open = 0;

@@ -72,7 +72,7 @@ impl<F: Real> Kernel for Gather<'_, F> {
         for (records, keys) in self.records.chunks_mut(BLOCK).zip(self.keys.chunks(BLOCK)) {
             let [mut x, mut y, mut a, mut b, mut c] = [zero; 5];
             let [mut half_x, mut half_y, mut tau] = [zero; 3];
-            // Rows lie far apart. What is read first is their two ends, so that sixteen of them are on their way from
+            // Rows are far apart. What is read first is their two ends, so that sixteen of them are on their way from
             // memory at once.
             for (l, key) in keys.iter().enumerate() {
                 let p = &self.projected[id(*key)];

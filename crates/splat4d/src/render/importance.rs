@@ -3,7 +3,7 @@
 //! *Contribution*: Σ over pixels of α_i T_i, T_i = Π_{j<i} (1 − α_j): the gradient of a channel's sum to that channel, which
 //! the backward pass would compute together with eleven other numbers. *Removal*: the change that it makes to be
 //! without the
-//! splat, Σ over pixels and channels of (α_i T_i (b_i − c_i))², b_i the colour of all that lies behind: exact for one splat
+//! splat, Σ over pixels and channels of (α_i T_i (b_i − c_i))², b_i the colour of all that is behind: exact for one splat
 //! alone (pixels that had stopped stay stopped). A splat before others of its colour contributes much and changes little.
 //!
 //! *Sensitivity*: how strongly the image answers to a splat. A pixel's channels depend on its shape through ln α alone,
@@ -94,7 +94,7 @@ impl Importance {
 }
 
 impl<F: Real> Renderer<F> {
-    /// Σ over pixels of α_i Π_{j<i} (1 − α_j) of every splat: how much of the image it is. No colour is looked at.
+    /// Σ over pixels of α_i Π_{j<i} (1 − α_j) of every splat: how much of the image it is. No colour is examined.
     ///
     /// `out` is overwritten, one a splat; exactly 0 where no pixel shows it. Draws no image; no backward may follow.
     /// Costs
@@ -114,7 +114,7 @@ impl<F: Real> Renderer<F> {
     /// exact
     /// for each alone.
     ///
-    /// Neither head nor further channels are looked at: it is the base colours' image that changes. `out` is
+    /// Neither head nor further channels are examined: it is the base colours' image that changes. `out` is
     /// overwritten,
     /// one a splat. Draws by itself; no backward may follow.
     pub(crate) fn removals(&mut self, shot: &Shot<'_, F>, out: &mut Vec<F>) {
@@ -124,7 +124,7 @@ impl<F: Real> Renderer<F> {
 
     /// The strength of the image's answer to each splat: exact sums over its pixels, for splats that stay in front
     /// of and
-    /// behind the same others. Neither head nor further channels are looked at: the image is that of the base colours.
+    /// behind the same others. Neither head nor further channels are examined: the image is that of the base colours.
     ///
     /// `out` is overwritten, one a splat; zeros where no pixel shows it. Draws by itself; no backward may follow.
     pub fn sensitivities(&mut self, shot: &Shot<'_, F>, out: &mut Vec<Sensitivity>) {
@@ -273,7 +273,7 @@ struct Pixel<F> {
     weight: F,
     /// α T c, c the splat's colour; only where the score looks at colours.
     own: [F; CHANNELS],
-    /// α/(1 − α) times what the pixel shows of all that lies behind: α T b. As `own`; 0 where the pixel has stopped.
+    /// α/(1 − α) times what the pixel shows of all that is behind: α T b. As `own`; 0 where the pixel has stopped.
     hidden: [F; CHANNELS],
     /// Whether α follows the splat here: it does not where nothing is drawn or α is at its maximum.
     felt: bool,
@@ -300,7 +300,7 @@ impl<F: Real> Score<F, 1> for Contribution {
     }
 }
 
-/// The squared change without the splat: what lies behind shines through, (1 − α) T b becomes T b.
+/// The squared change without the splat: what is behind shines through, (1 − α) T b becomes T b.
 struct Removal;
 
 impl<F: Real> Score<F, 1> for Removal {

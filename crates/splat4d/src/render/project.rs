@@ -54,7 +54,7 @@ pub struct Projected<F = f32> {
 impl<F: Real> Projected<F> {
     /// About how many pixels of an image of this size (width, height) it may touch: its ellipse's area, times the
     /// share of
-    /// the ellipse's box that lies in the image. 0: culled.
+    /// the ellipse's box that is in the image. 0: culled.
     pub fn pixels(&self, size: [usize; 2]) -> f64 {
         if self.radius <= F::ZERO {
             return 0.0;
@@ -660,7 +660,7 @@ fn met_bins<F: Real>(p: &Projected<F>, first: [usize; 2], lower: usize, view: &V
 
 /// Least dᵀ conic d over a rectangle of offsets from the centre; exact.
 ///
-/// The least point lies on a side that faces the centre, so a clamped minimum along each facing side finds it; for a
+/// The least point is on a side that faces the centre, so a clamped minimum along each facing side finds it; for a
 /// centre inside the range of a side the candidate is an inner point, which is allowed too. `y_slope` = −b/c and
 /// `x_slope` = −b/a are the lines of those minima.
 #[inline(always)]

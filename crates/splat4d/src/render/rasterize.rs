@@ -170,7 +170,7 @@ impl<F: Real> Raster<F> {
         });
     }
 
-    /// Calls `f(tile, row of the tile, its pixels)` for all that lies in one band of bins, which has `count` pixels; a
+    /// Calls `f(tile, row of the tile, its pixels)` for all that is in one band of bins, which has `count` pixels; a
     /// row that the image's edge cuts has fewer pixels than the tile's.
     #[inline(always)]
     fn each_row(&self, band: usize, count: usize, mut f: impl FnMut(&Tile<F>, Range<usize>, Range<usize>)) {

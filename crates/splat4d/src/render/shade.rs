@@ -1,7 +1,7 @@
 //! The colour of every visible splat: spherical harmonics along the viewing direction, or a colour given directly.
 //!
 //! Works on the splats of one block of the SH table at once, so that coefficients are read as whole vectors: sixteen
-//! where all rows are drawn, those that are alive elsewhere. The block's columns lie in as many cache lines as one row
+//! where all rows are drawn, those that are alive elsewhere. The block's columns are in as many cache lines as one row
 //! does, so that nothing is read for the others' sake.
 
 use super::gather::CHANNELS;

@@ -373,7 +373,7 @@ fn one_gaussian_has_the_profile_and_energy_of_its_equation() {
 }
 
 #[test]
-fn what_is_as_near_as_the_cameras_near_is_not_drawn() {
+fn gaussians_nearer_than_the_near_plane_are_not_rendered() {
     let (out, rgb) = simple(&[([0.0, 0.0, 0.5], 1e-3, 0.6), ([0.0, 0.0, 2.0], 0.01, 0.6)]);
     let far = simple(&[([0.0, 0.0, 2.0], 0.01, 0.6)]);
     for (near, alone) in [(0.49, false), (0.5, true), (1.0, true)] {
@@ -407,7 +407,7 @@ fn order_of_rows_does_not_matter_and_alpha_is_one_minus_transmittance() {
 }
 
 #[test]
-fn moving_scene_and_camera_together_changes_nothing() {
+fn moving_scene_and_camera_together_keeps_the_render() {
     let s = scene(4, 30, 0.15);
     let view = camera(48, 48);
     let motion = Se3::look_at([1.0, 2.0, 3.0], [-2.0, 0.5, 0.0], [0.3, 0.9, 0.1]);
@@ -430,7 +430,7 @@ fn moving_scene_and_camera_together_changes_nothing() {
 }
 
 #[test]
-fn degenerate_splats_draw_what_the_oracle_draws() {
+fn degenerate_splats_render_as_the_reference_does() {
     let tiny = 1e-20;
     let cases: Vec<Vec<([f64; 3], f64, f64)>> = vec![
         vec![],
@@ -486,7 +486,7 @@ fn no_gradient_passes_a_ceiling() {
 }
 
 #[test]
-fn tight_boxes_lose_nothing_that_a_three_sigma_circle_would() {
+fn tight_boxes_cover_what_a_three_sigma_circle_covers() {
     // At 3.3σ an opaque splat still has α = .0043 > 1/255: it must be drawn there.
     let (out, rgb) = simple(&[([0.0, 0.0, 2.0], 0.04, 1.0)]);
     let view = frontal(101, 100.0);

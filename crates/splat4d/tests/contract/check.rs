@@ -147,7 +147,7 @@ impl Subject {
     }
 
     /// Central differences of every trainable table (at most [`PROBED`] numbers each) and of t.
-    /// `frozen`: column groups whose gradient is stopped on purpose (the model's documentation says so).
+    /// `frozen`: column groups whose gradient is stopped on purpose (the model's documentation states so).
     pub(crate) fn gradients(&mut self, spaces: &[Space], frozen: &[&str]) {
         let rows: Vec<u32> = (0..self.p.len() as u32).filter(|r| r % 3 != 1).collect();
         let w = Weights(Rng::new(77, "weights", 0));
@@ -257,7 +257,7 @@ impl Subject {
     }
 }
 
-/// The model is as it says: what moves and lives by itself, the SH table, scratch, and the polynomial of its path.
+/// The model is as it states: what moves and lives by itself, the SH table, scratch, and the polynomial of its path.
 pub(crate) fn capabilities(spec: &Spec, rows: usize, life: LifeKind) {
     let s = subject(spec, rows, life, 0.1, 4);
     let told = s.motion.capabilities();
@@ -379,7 +379,7 @@ pub(crate) fn any_threads(spec: &Spec, rows: usize) {
 }
 
 /// A filter around the model: switched off it changes nothing; switched on, a step along a random direction of all
-/// learnable numbers changes the answers as the gradient says.
+/// learnable numbers changes the answers as the gradient states.
 pub(crate) fn filtered(spec: &Spec, rows: usize, life: LifeKind, spaces: &[Space], frozen: &[&str]) {
     let plain = subject(spec, rows, life, 0.1, 1);
     let around = |fusion: Fusion| {

@@ -114,7 +114,7 @@ fn pictures(own: Layer<f64>, placed: Layer<f64>) {
     assert!(seen > 200, "the test must look at something: {seen}");
 }
 
-/// Along a random direction of all learnable numbers the framed answers change as the gradient says.
+/// Along a random direction of all learnable numbers the framed answers change as the gradient states.
 fn gradient(mut layer: Layer<f64>, frozen: &[&str]) {
     let rng = Rng::new(81, "frame", 0);
     let weights = |like: &Table<f64>| {

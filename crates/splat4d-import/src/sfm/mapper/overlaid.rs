@@ -9,7 +9,7 @@ use rayon::prelude::*;
 /// Of a camera with fewer sightings whose windows agree, the others stay too.
 const LEFT: usize = 100;
 
-/// Images in which a point is looked for next to those that show it, at most: a walk has hundreds.
+/// Images in which a point is searched for next to those that show it, at most: a walk has hundreds.
 const LOOKED_IN: usize = 32;
 
 /// What windows about a track's point say.

@@ -28,7 +28,7 @@ pub(super) fn applies(root: &Path) -> bool {
     folders(root).len() > 1
 }
 
-/// Puts all frames of the cameras in the place of the model's images, if these are named as in this layout; says so.
+/// Puts all frames of the cameras in the place of the model's images, if these are named as in this layout; states so.
 pub(super) fn rename(root: &Path, shots: &mut Vec<Shot>, account: &mut Account) -> bool {
     let folders = folders(root);
     let number = |name: &str| {

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 /// Below this part of registered images the reconstruction is probably incomplete, and below the second broken.
 const FEW_REGISTERED: [f64; 2] = [0.9, 0.7];
 
-/// Adds the images that share a pose to `shots` and `files`, and says how many are without one.
+/// Adds the images that share a pose to `shots` and `files`, and states how many are without one.
 ///
 /// A pose can be shared where every camera has exactly one registered image: the usual way to calibrate a fixed rig is to
 /// reconstruct one time.

@@ -1,4 +1,4 @@
-//! Focal lengths: the ones at which matches lie on their epipolar lines and colours of points are those of the images.
+//! Focal lengths: the ones at which matches are on their epipolar lines and colours of points are those of the images.
 
 use super::super::Capture;
 use super::super::account::Severity;
@@ -47,7 +47,7 @@ impl Tried {
 }
 
 /// A warning where points or matches need other focal lengths; a note where matches fit any. `None`: they are right, or there
-/// is no evidence. `matches`: none were looked for where points have shown that poses are right.
+/// is no evidence. `matches`: none were searched for where points have shown that poses are right.
 pub(super) fn check(
     capture: &Capture,
     matches: Option<&[Match]>,

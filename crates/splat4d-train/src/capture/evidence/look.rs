@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use splat4d::math::Se3;
 use splat4d::scene::{Camera, Planes};
 
-/// How closely images are looked at.
+/// How closely images are examined.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Detail {
     /// Longest side of the small image, pixels.
@@ -20,13 +20,13 @@ pub(super) struct Detail {
 
 /// What poses are checked with.
 pub(super) const COARSE: Detail = Detail { side: 320, features: 350 };
-/// What motion is looked for with: a mover is a small part of an image.
+/// What motion is searched for with: a mover is a small part of an image.
 pub(super) const FINE: Detail = Detail { side: 640, features: 800 };
 /// Least contrast of a feature, as structure from motion takes it.
 const CONTRAST: f64 = 0.004;
 /// Weight of a mask or alpha from which a pixel shows something.
 const SHOWN: f32 = 0.5;
-/// Foreground below this share of an image, or above the other, says nothing of a place.
+/// Foreground below this share of an image, or above the other, states nothing of a place.
 const FOREGROUND: [f64; 2] = [0.001, 0.6];
 
 /// A feature: what it looks like, and its ray without distortion (x/z, y/z).

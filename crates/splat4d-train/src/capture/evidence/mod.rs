@@ -24,11 +24,11 @@ pub use motion::Agreement;
 use splat4d::math::Se3;
 use std::collections::BTreeSet;
 
-/// Images that are looked at, at most; and at least, where they are large.
+/// Images that are examined, at most; and at least, where they are large.
 const LOOKS: [usize; 2] = [4, 10];
 /// Pixels that are decoded, at most: a second of one core.
 const PIXELS: usize = 40_000_000;
-/// Part of a moving camera's frames between two that are looked at: neighbours overlap, and are apart.
+/// Part of a moving camera's frames between two that are examined: neighbours overlap, and are apart.
 const STRIDE: usize = 50;
 
 /// The measures of one convention.
@@ -142,7 +142,7 @@ impl Capture {
         self.conclude(&conventions, &measures)
     }
 
-    /// The frames that are looked at: cameras of one time in their order, or frames of a moving camera in a row.
+    /// The frames that are examined: cameras of one time in their order, or frames of a moving camera in a row.
     fn looked_at(&self) -> Vec<usize> {
         let pixels = self.frames.first().map_or(1, |f| f.source.width * f.source.height).max(1);
         let most = (PIXELS / pixels).clamp(LOOKS[0], LOOKS[1]);

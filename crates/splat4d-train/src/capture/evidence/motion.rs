@@ -1,7 +1,7 @@
 //! Whether anything moves in front of moving cameras: matches of frames at different times either agree with one static
-//! scene, or lie next to their epipolar lines.
+//! scene, or are next to their epipolar lines.
 //!
-//! Wrong matches are spread over the image, moved features lie near their lines. Matches near the lines in excess of the
+//! Wrong matches are spread over the image, moved features are near their lines. Matches near the lines in excess of the
 //! expected wrong ones count as moved.
 
 use super::super::{Capture, Timing};

@@ -362,7 +362,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_jump_out_of_a_path_is_told_from_a_path() {
+    fn one_displaced_camera_is_distinguished_from_a_path() {
         let at = |x: f64| Se3::look_at([x, 4.0, 1.0], [x, 0.0, 0.0], [0.0, 0.0, 1.0]);
         let path: Vec<Se3> = (0..12).map(|k| at(0.1 * f64::from(k))).collect();
         assert!(jumps(&path).is_empty());
@@ -380,7 +380,7 @@ mod tests {
     }
 
     #[test]
-    fn the_image_whose_matches_fit_nobody_is_wrong() {
+    fn an_image_whose_matches_fit_no_other_is_reported() {
         let pair = |a: usize, b: usize, fitting: usize| Pair { looks: [a, b], matches: 40, fitting };
         let pairs = [pair(0, 1, 30), pair(1, 2, 2), pair(0, 2, 1), pair(2, 3, 0), pair(3, 4, 28), pair(1, 3, 25)];
         assert_eq!(wrong(5, &pairs), [2]);

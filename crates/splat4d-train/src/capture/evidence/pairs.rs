@@ -12,7 +12,7 @@ const RATIO: f64 = 0.8;
 pub(super) const STRICT: f64 = 0.7;
 /// Distance from an epipolar line, pixels of the small image.
 const NEAR: f64 = 1.5;
-/// Angle between rays below which nothing says which side of the cameras they meet on, radians.
+/// Angle between rays below which nothing states which side of the cameras they meet on, radians.
 const PARALLEL: f64 = 0.006;
 /// Of the cameras' spread: cameras nearer to one another have the same position.
 const ONE_PLACE: f64 = 1e-6;
@@ -217,7 +217,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rays_meet_in_front_or_behind() {
+    fn intersections_in_front_and_behind_are_distinguished() {
         let motion =
             Se3 { rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], translation: [-1.0, 0.0, 0.0] };
         // A point at (0.2, 0.1, 4) before the first camera is at (-0.8, 0.1, 4) before the second.

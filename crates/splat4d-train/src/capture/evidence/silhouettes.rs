@@ -36,7 +36,7 @@ pub(super) enum Masks {
     Fine,
     /// What they hide is at the place that cameras look at: part of the images, share of what is shown, and of the edges.
     Inverted(f64, f64, f64),
-    /// Neither: images with masks that were looked at, and the share of what is shown.
+    /// Neither: images with masks that were examined, and the share of what is shown.
     Unsure(usize, f64),
 }
 

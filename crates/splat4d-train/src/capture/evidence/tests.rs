@@ -211,7 +211,7 @@ fn film(speed: f64) -> (Sample, Capture) {
 }
 
 #[test]
-fn what_moves_before_a_moving_camera_is_seen() {
+fn motion_in_front_of_a_moving_camera_is_detected() {
     let (_folder, still) = film(0.0);
     let found = still.agreement().expect("the scene is full of features");
     assert!(found.is_static() && found.share > 0.99, "{found:?}");
@@ -481,7 +481,7 @@ fn inverted_masks_are_named_and_right_ones_are_not() {
 }
 
 #[test]
-fn fixed_cameras_are_looked_at_once() {
+fn images_of_fixed_cameras_are_checked_once() {
     let mut capture = photos(false);
     let frame = |(t, c): (usize, usize)| Frame { index: t, ..capture.frames[c].clone() };
     capture.frames = (0..4).flat_map(|t| (0..3).map(move |c| (t, c))).map(frame).collect();

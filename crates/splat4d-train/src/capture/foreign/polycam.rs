@@ -81,7 +81,7 @@ fn read(root: &Path, folder: &Path, options: &CaptureOptions) -> Result<RawCaptu
         warnings,
         notes,
     };
-    // Names are time stamps, and what is scanned stands still.
+    // Names are time stamps, and what is scanned is static.
     let sequence = match options.sequence {
         Sequence::Auto => Sequence::Photos,
         told => told,

@@ -58,7 +58,7 @@ fn images(sample: &Sample, name: impl Fn(usize) -> String) {
 fn metashape_cameras_come_back() {
     let sample = Sample::new(&["cameras.xml"]);
     images(&sample, |i| format!("images/IMG_{:04}.png", 7 * i + i));
-    // The chunk lies elsewhere, turned and twice as large.
+    // The chunk is elsewhere, turned and twice as large.
     let turn = samples::pose(3).rotation;
     let (scale, shift) = (2.0, [10.0, -3.0, 1.0]);
     let text = |m: &[f64]| m.iter().map(|v| format!("{v:.17e}")).collect::<Vec<_>>().join(" ");
@@ -107,7 +107,7 @@ fn metashape_cameras_come_back() {
     assert_eq!((k.fx, k.fy, k.cx, k.cy), (FOCAL + 1.0, FOCAL, 12.5, 7.75));
     assert!(matches!(source.lens, Lens::Brown { k, p: [0.002, 0.001], .. } if k[0] == -0.1));
     assert!(capture.warnings.iter().any(|w| w.contains("1 of 6 images have no pose")), "{:?}", capture.warnings);
-    // Any name, given by its path; a lens that is not read says what to do.
+    // Any name, given by its path; a lens that is not read states what to do.
     std::fs::rename(sample.path("cameras.xml"), sample.path("export.xml")).unwrap();
     assert_eq!(Capture::open(&sample.path("export.xml"), &CaptureOptions::default()).unwrap().frames.len(), COUNT);
     sample.write("export.xml", xml.replace("<p1>", "<k4>0.1</k4><p1>").as_bytes());

@@ -143,7 +143,7 @@ fn bad_poses_and_focal_lengths() {
 }
 
 #[test]
-fn copies_of_poses_and_instants() {
+fn duplicate_poses_and_times_are_reported() {
     let sample = samples::own();
     sample.edit("capture.json", |v| v["cameras"][2]["world_to_camera"] = v["cameras"][1]["world_to_camera"].clone());
     assert_says(&message(&sample), &["cam01 and cam02", "one pose"]);
@@ -241,10 +241,10 @@ fn masks_that_exclude_everything() {
 }
 
 #[test]
-fn layouts_say_what_they_miss() {
+fn missing_files_of_a_layout_are_named() {
     let sample = samples::n3dv();
     std::fs::remove_dir_all(sample.path("cam01")).unwrap();
-    // With numbers in names the rows are known, and what is missing is noted; without, nothing says whose poses are whose.
+    // With numbers in names the rows are known, and what is missing is noted; without, nothing states whose poses are whose.
     std::fs::rename(sample.path("cam00"), sample.path("front")).unwrap();
     assert_says(&message(&sample), &["2 cameras", "1 folders"]);
     sample.write("cam01.mp4", b"");

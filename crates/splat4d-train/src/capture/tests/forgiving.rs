@@ -107,7 +107,7 @@ fn resized_images_scale_their_intrinsics_and_cropped_ones_are_refused() {
     assert!(says(&capture.warnings, &["9 images", "cam00.png is 24x16, not 48x32"]), "{:?}", capture.warnings);
     sample.edit("transforms.json", |v| v["h"] = json!(2 * HEIGHT + 6));
     assert_says(&refuse(&sample), &["cam00", "24x16", "48x38"]);
-    // Any image is looked at, not only the first.
+    // Any image is examined, not only the first.
     let sample = samples::photos(9, cam, None);
     sample.save("images/cam07.png", image::ImageBuffer::from_fn(16, 24, |_, _| image::Luma([9u8])));
     assert_says(&refuse(&sample), &["cam07.png", "16x24", "24x16"]);
@@ -147,7 +147,7 @@ fn points_of_a_model_next_to_the_poses() {
 }
 
 #[test]
-fn one_of_several_layouts_is_read_and_said() {
+fn one_of_several_layouts_is_read_and_reported() {
     let sample = samples::own();
     sample.write("transforms.json", br#"{"fl_x": 20, "frames": []}"#);
     std::fs::create_dir_all(sample.path("sparse")).unwrap();
@@ -232,7 +232,7 @@ fn split_files_without_times_are_one_time_even_where_they_share_poses() {
 }
 
 #[test]
-fn broken_transforms_say_what_and_where() {
+fn broken_transforms_are_errors_with_key_and_file() {
     let broken = |change: &dyn Fn(&mut serde_json::Value)| {
         let sample = samples::photos(9, cam, None);
         sample.edit("transforms.json", change);

@@ -128,7 +128,7 @@ fn workspaces_of_colmap_are_read_and_named() {
 }
 
 #[test]
-fn what_is_no_capture_leads_to_one() {
+fn a_folder_near_a_capture_names_the_capture() {
     let sample = photos();
     assert_has(&refuse(&sample.path("images")), &["The folder that holds it is a capture"]);
     rename(&sample, "transforms.json", "transforms_all.json");
@@ -346,7 +346,7 @@ fn images_of_one_name_and_two_endings_are_read_once() {
         assert_eq!(told.len(), 1, "{:?}", after.account);
         assert_has(told[0], &[&format!("{} images", names.len()), ".png is read"]);
     }
-    // The size decides which is meant, and nothing here says it.
+    // The size decides which is meant, and nothing here states it.
     let sample = samples::n3dv();
     image::RgbImage::new(6, 4).save(sample.path("cam01/images/0000.jpg")).unwrap();
     assert_has(&refuse(sample.root()), &["0000.jpg", "another size (6x4, here 24x16)", "Remove"]);

@@ -27,7 +27,7 @@ fn open(sample: &Sample, downscale: usize) -> splat4d::Result<Capture> {
 }
 
 #[test]
-fn values_number_labels_and_the_largest_is_nobodys() {
+fn mask_values_are_label_numbers_and_the_largest_is_unlabelled() {
     let sample = sample();
     let capture = open(&sample, 1).unwrap();
     assert_eq!(capture.labels, ["floor", "hand"]);

@@ -203,7 +203,7 @@ fn nerfstudio() {
     let store = ImageStore::new(Arc::clone(&capture), 1 << 20);
     assert!(store.load(0).unwrap().to_picture().mask.is_some());
     assert!(store.load(1).unwrap().to_picture().mask.is_none());
-    // The corner ray of the pinhole image lies inside the barrel-distorted one, so all pixels are valid, and the
+    // The corner ray of the pinhole image is inside the barrel-distorted one, so all pixels are valid, and the
     // corner shows what was nearer the middle.
     let picture = store.load(2).unwrap().to_picture();
     assert!(picture.valid.is_none() && picture.color.get(0, 0, 0) > 0.02, "{}", picture.color.get(0, 0, 0));
@@ -358,7 +358,7 @@ impl Center for splat4d::math::Se3 {
 }
 
 #[test]
-fn preflight_speaks_of_few_cameras() {
+fn preflight_warns_of_few_cameras() {
     let findings = open(&samples::own()).preflight();
     assert!(findings.iter().any(|f| f.severity == Severity::Warning && f.what.contains("extrapolated views")));
     assert!(findings.iter().any(|f| f.what.contains("unevenly spaced")), "offsets of 10 ms in a 100 ms grid");

@@ -212,7 +212,7 @@ fn black_borders_are_neither_trained_nor_scored() {
 }
 
 #[test]
-fn every_part_of_a_take_has_the_borders_of_the_whole() {
+fn every_part_of_a_capture_has_the_borders_of_the_whole() {
     // Six fixed cameras whose first frame has a letterbox; a bright flash fills the second.
     let sample = samples::own();
     sample.edit("capture.json", |v| {
@@ -247,7 +247,7 @@ fn every_part_of_a_take_has_the_borders_of_the_whole() {
     let second = part(1..2, &Lenses::default());
     assert_eq!((second.frames.len(), &second.lenses), (6, &whole.lenses));
     assert_eq!(second.frames[0].recorded, whole.frames[0].recorded);
-    // What is known is not looked for again.
+    // What is known is not searched for again.
     let flash = ImageBuffer::from_pixel(WIDTH as u32, HEIGHT as u32, image::Rgb([200u8; 3]));
     (0..6).for_each(|c| sample.save(&format!("images/cam{c:02}/0005.png"), flash.clone()));
     assert!(part(1..2, &Lenses::default()).frames[0].recorded.is_none());

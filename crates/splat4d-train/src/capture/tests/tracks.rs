@@ -44,7 +44,7 @@ fn crc32(bytes: &[u8]) -> u32 {
 }
 
 #[test]
-fn tables_and_arrays_say_the_same() {
+fn tables_and_arrays_give_the_same_tracks() {
     let sample = sample("point, frame, x, y, visible\n7,0,3.5,4,1\n7,1,5,6.25,1\n2,1,9,9,0\n2,0,1,1,1\n");
     let capture = open(&sample).unwrap();
     assert!(capture.frames.iter().enumerate().all(|(i, f)| f.tracks.is_some() == [2, 3].contains(&i)));

@@ -131,7 +131,7 @@ fn names_in_every_spelling_lead_to_the_same_capture() {
 }
 
 #[test]
-fn byte_order_marks_are_no_part_of_any_text() {
+fn byte_order_marks_are_skipped_in_every_text_file() {
     for (layout, sample) in samples::all() {
         let expected = open(&sample);
         for file in sample.files.iter().filter(|f| f.ends_with(".json") || f.ends_with(".txt")) {
@@ -300,7 +300,7 @@ fn lists_of_splits_are_kept() {
 }
 
 #[test]
-fn times_are_read_as_what_they_count() {
+fn times_are_interpreted_by_their_unit() {
     let with = |times: &[f64], fps: Option<f64>, name: &dyn Fn(usize) -> String| {
         let sample = samples::photos(times.len(), name, None);
         sample.edit("transforms.json", |v| {
@@ -679,7 +679,7 @@ fn unregistered_images_share_a_pose_in_rigs_alone() {
 }
 
 #[test]
-fn what_nerfstudio_renames_says_nothing_of_time() {
+fn nerfstudios_frame_names_are_not_times() {
     let photos = open(&samples::photos(9, |c| format!("frame_{:05}.png", c + 1), None));
     assert_eq!((photos.timing, photos.cameras.len(), photos.warnings.len()), (Timing::Moment, 9, 0));
     assert!(photos.notes.iter().any(|n| n.contains("capture.sequence=video")));

@@ -1,5 +1,5 @@
-//! One frame of a transforms file: its image, pose, lens and time. What a frame says of itself goes before what the
-//! file says for all.
+//! One frame of a transforms file: its image, pose, lens and time. What a frame states of itself goes before what the
+//! file states for all.
 
 use super::super::convention::{Convention, Poses};
 use super::super::json::Node;
@@ -36,7 +36,7 @@ pub(super) struct Entry {
 pub(super) struct File<'a> {
     /// Its folder, and how its files are found.
     pub lookup: &'a Lookup,
-    /// Where images are looked for.
+    /// Where images are searched for.
     pub bases: &'a [PathBuf],
     /// The whole file.
     pub top: &'a Node<'a>,
@@ -85,7 +85,7 @@ pub(super) fn posed(file: &File<'_>, node: &Node<'_>) -> Result<(String, Camera)
     Ok((name.replace('\\', "/"), camera(file, node, &image)?.0))
 }
 
-/// Pose, intrinsics and lens, and whether the focal length is an angle of view. `image` is looked at where no size is
+/// Pose, intrinsics and lens, and whether the focal length is an angle of view. `image` is examined where no size is
 /// stated.
 fn camera(file: &File<'_>, node: &Node<'_>, image: &Path) -> Result<(Camera, bool)> {
     let top = file.top;

@@ -103,7 +103,7 @@ impl Codec<f32> for Quantised {
             }
         }
         // A step changes some entries, and with them perhaps the range of all: of colours above degree 0 only those are
-        // kept up that are about to be looked at.
+        // kept up that are about to be examined.
         let Some(shared) = &mut m.shared else { return };
         let palette = shared.packed();
         let mut ids = Vec::new();

@@ -63,7 +63,7 @@ fn begun(rows: usize, depths: Depths) -> (Arc<Quantised>, Scene<f32>, Pages) {
     (codec, scene, pages)
 }
 
-/// Gradients as if the rows alive at t had been looked at.
+/// Gradients as if the rows alive at t had been examined.
 fn gradients(scene: &Scene<f32>, t: Time, seed: u64) -> Vec<Grads<f32>> {
     let mut ids = Vec::new();
     let one = |(l, layer): (usize, &Layer<f32>)| {
@@ -203,7 +203,7 @@ fn tuning(iterations: usize, codec: Option<Arc<Quantised>>) -> Stage {
 }
 
 #[test]
-fn the_gradient_of_what_is_shown_moves_what_learns() {
+fn gradients_of_quantised_values_reach_the_parameters() {
     let (codec, scene, _) = begun(300, coarse());
     let whole = codec.whole(&scene);
     let stage = Stage { batch: 1, ..tuning(1, Some(codec)) };
@@ -259,7 +259,7 @@ fn the_gradient_of_what_is_shown_moves_what_learns() {
 }
 
 #[test]
-fn tuning_makes_up_for_coarse_codes() {
+fn tuning_recovers_quality_lost_to_coarse_codes() {
     let pages = read_pages(&file(400)).unwrap();
     let mut plain = trainer(pages.scene(), vec![tuning(220, None)]);
     let mut losses = Vec::new();

@@ -28,7 +28,7 @@ fn psnr_of_known_errors() {
 }
 
 #[test]
-fn psnr_of_a_region_sees_only_the_region() {
+fn psnr_of_a_region_ignores_pixels_outside() {
     let (mut a, b) = (constant(0.5), constant(0.5));
     let region: Vec<bool> = (0..20).map(|p| p < 7).collect();
     (0..3).for_each(|c| a.plane_mut(c)[7..].fill(0.0));
@@ -98,7 +98,7 @@ fn contrast_term_equals_the_definition() {
 }
 
 #[test]
-fn what_moves_is_dynamic() {
+fn changing_pixels_are_the_dynamic_region() {
     let mut mean = TemporalMean::default();
     assert!(mean.mean().is_none());
     let frames: Vec<Planes<f32>> = (0..4)

@@ -70,7 +70,7 @@ fn rigid_motion_has_no_energy_and_either_frame_may_turn() {
 }
 
 #[test]
-fn the_envelope_gradient_is_that_of_the_least_energy() {
+fn the_envelope_gradient_equals_the_gradient_of_the_minimal_energy() {
     let rest = cloud("rest", 1.0);
     let g = graph(&rest);
     let at = [moved(&shaken(&rest, "a"), [0.9, 0.1, 0.4, 0.0], 0.3), shaken(&rest, "b")];
@@ -95,7 +95,7 @@ fn rotations_are_those_of_the_motion_and_never_mirror() {
 }
 
 #[test]
-fn elastic_divides_by_itself_and_ignores_rigid_motion() {
+fn elastic_loss_is_relative_and_ignores_rigid_motion() {
     let rest = cloud("rest", 1.0);
     let g = graph(&rest);
     let at = [rest.clone(), shaken(&rest, "a"), shaken(&rest, "b")];
@@ -114,7 +114,7 @@ fn elastic_divides_by_itself_and_ignores_rigid_motion() {
 }
 
 #[test]
-fn acceleration_is_felt_and_steady_motion_is_free() {
+fn acceleration_is_penalised_and_uniform_motion_is_not() {
     let rest = cloud("rest", 1.0);
     let step = cloud("step", 0.3);
     let steady: Vec<Vec<[f64; 3]>> = (0..3)

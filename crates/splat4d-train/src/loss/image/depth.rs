@@ -1,4 +1,4 @@
-//! Known depth: what a pixel shows is as far away as the capture's depth map says, as far as the map knows that.
+//! Known depth: what a pixel shows is as far away as the capture's depth map states, as far as the map knows that.
 
 use super::{ImageTerm, Needs, PictureGrads, SEEN, Shown, View, expected_depth_backward, over_rows};
 use crate::capture::DepthKind;
@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_right_is_free_up_to_scale_and_shift() {
+    fn correct_depth_up_to_scale_and_shift_has_no_loss() {
         let p = pictures();
         let expected: Vec<f64> = p[0].data.iter().zip(&p[1].data).map(|(d, a)| d / a).collect();
         let map = |f: &dyn Fn(f64) -> f64| Planes { data: expected.iter().map(|z| f(*z)).collect(), ..p[0].clone() };
@@ -213,7 +213,7 @@ mod tests {
         assert!(of(map(&|z| 3.0 * z - 7.0), r) < 1e-9 && of(map(&|z| 40.0 / z + 3.0), i) < 1e-9);
         // Upside down, and of the other kind.
         assert!(of(map(&|z| -z), r) > 0.5 && of(map(&|z| 1.0 / z), r) > 0.5 && of(map(&|z| z), i) > 0.5);
-        // A flat map says nothing.
+        // A flat map states nothing.
         assert_eq!(of(map(&|_| 2.0), r), 0.0);
     }
 

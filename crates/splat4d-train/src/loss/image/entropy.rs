@@ -49,7 +49,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn gradient_equals_finite_differences_and_certainty_is_free() {
+    fn gradient_equals_finite_differences_and_alpha_of_0_or_1_has_no_loss() {
         let alpha = check::planes("alpha", [1, 6, 9], 0.01, 0.99);
         let run = |p: &[Planes<f64>], d: &mut [Planes<f64>]| mask_entropy(&p[0], 0.7, &mut d[0]);
         let value = |p: &[Planes<f64>]| run(p, &mut [Planes::new(1, 6, 9)]);

@@ -1,4 +1,4 @@
-//! Flow and tracks: what a pixel shows goes where the truth says, by the next frame or by any other.
+//! Flow and tracks: what a pixel shows goes where the truth states, by the next frame or by any other.
 
 use super::{Channel, ImageTerm, Needs, PictureGrads, SEEN, Shown, View, over_rows};
 use crate::loss::terms::StepInfo;

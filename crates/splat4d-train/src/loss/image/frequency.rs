@@ -67,7 +67,7 @@ impl<F: Real> Frequency<F> {
         let side = w.max(h).next_power_of_two().max(16);
         let radius = (FIRST + (1.0 - FIRST) * progress / FULL).min(1.0) * 0.5 * side as f64;
         let wave = |u: usize| if 2 * u > side { u as f64 - side as f64 } else { u as f64 };
-        // Of the two frequencies ±(u, v) of a real image one says all.
+        // Of the two frequencies ±(u, v) of a real image one states all.
         let in_band = |u: usize, v: usize| wave(u).hypot(wave(v)) <= radius * std::f64::consts::SQRT_2;
         let count: usize =
             (0..side).into_par_iter().map(|u| (0..side).filter(|&v| in_band(u, v)).count()).sum::<usize>();
@@ -212,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn equal_images_are_free_and_the_band_grows() {
+    fn equal_images_have_no_loss_and_the_band_grows() {
         let truth = check::planes("truth", [1, 16, 16], 0.0, 1.0);
         assert!(run(&truth, &truth, 1.0, &mut Planes::new(1, 16, 16)) < 1e-12);
         // A chequerboard is the highest frequency there is: only the whole band sees it.

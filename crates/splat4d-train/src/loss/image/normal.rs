@@ -167,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn splats_flat_on_a_plane_cost_nothing() {
+    fn splats_flat_on_a_plane_have_no_loss() {
         // The plane n·x = 3 with a tilted normal that faces the camera.
         let n = splat4d::math::se3::normalize([0.3, -0.2, -0.9]);
         let c = camera();

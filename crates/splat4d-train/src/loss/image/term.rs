@@ -1,4 +1,4 @@
-//! The contract of losses on rendered images, [`ImageTerm`]: it says which channels it needs, looks at an image and its
+//! The contract of losses on rendered images, [`ImageTerm`]: it states which channels it needs, looks at an image and its
 //! truth, and adds its gradient.
 
 use crate::capture::frames::{DepthTruth, FlowTruth};

@@ -94,7 +94,7 @@ fn the_mask_pulls_alpha_where_there_is_a_mask() {
 }
 
 #[test]
-fn what_terms_need_is_drawn_once_and_in_one_order() {
+fn channels_that_terms_need_are_rendered_once_in_a_fixed_order() {
     let (camera, truth) = (camera(), Planes::new(3, SIZE[0], SIZE[1]));
     let mask = Planes::new(1, SIZE[0], SIZE[1]);
     let mut needs = Needs::default();

@@ -154,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn flat_is_free_and_an_edge_of_the_truth_frees_the_depth() {
+    fn constant_images_have_no_loss_and_image_edges_allow_depth_edges() {
         let step = |at: usize| {
             let mut p = Planes::new(1, 6, 6);
             (0..36).for_each(|i| p.data[i] = if i % 6 < at { 1.0 } else { 2.0 });

@@ -132,7 +132,7 @@ fn equal_images_have_ssim_one_and_no_gradient() {
 }
 
 #[test]
-fn excluded_pixels_reach_nothing() {
+fn excluded_pixels_change_neither_value_nor_gradient() {
     let (a, b, m) = (image::<f32>(3, 40, 31, 6), image::<f32>(3, 40, 31, 7), mask::<f32>(40, 31));
     let mut other = a.clone();
     for c in 0..3 {

@@ -31,7 +31,7 @@ fn loss(p: &Params<f64>, weights: PlaneWeights) -> f64 {
 }
 
 #[test]
-fn planes_that_are_straight_cost_nothing_and_time_planes_of_ones_no_l1() {
+fn straight_planes_have_no_smoothness_loss_and_time_planes_of_ones_no_l1() {
     let (mut p, planes) = planes();
     let l1 = PlaneWeights { l1_time: 1.0, ..Default::default() };
     assert!(loss(&p, l1) > 0.1, "time planes start around 1");

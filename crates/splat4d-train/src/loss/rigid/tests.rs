@@ -56,7 +56,7 @@ fn eval(loss: Loss, case: &Case) -> (f64, Vec<[f64; 3]>, Vec<[f64; 4]>) {
 }
 
 #[test]
-fn a_rigid_motion_costs_nothing() {
+fn a_rigid_motion_has_no_loss() {
     let case = rigid([0.5, -0.7, 0.1, 0.4], [3.0, 1.0, -2.0]);
     for (name, loss) in LOSSES {
         let value = eval(loss, &case).0;
@@ -106,7 +106,7 @@ fn rotation_and_stretch_are_distinguished() {
 }
 
 #[test]
-fn a_rotation_of_the_world_changes_nothing() {
+fn a_rotation_of_the_world_keeps_the_loss() {
     let world = quat::normalize([0.2, 0.5, -0.6, 0.3]).0;
     let r = quat::to_rotation(world);
     let case = shaken();

@@ -90,7 +90,7 @@ fn gradients_equal_finite_differences_and_reach_the_newest_page_alone() {
 }
 
 #[test]
-fn a_rigid_motion_costs_nothing_and_other_units_change_nothing() {
+fn rigid_motion_has_no_loss_in_any_unit() {
     let mut s = scene(30);
     let weights = Weights { bg: 0.0, floor: 0.0, soft_col: 0.0, ..ALL };
     let turn = quat::normalize([0.9, 0.3, -0.2, 0.1]).0;
@@ -142,7 +142,7 @@ fn a_checkpoint_holds_the_colours_that_the_frame_began_with() {
 }
 
 #[test]
-fn only_what_masks_call_foreground_is_tied_and_the_rest_is_held() {
+fn only_masked_foreground_is_tied_and_the_background_held() {
     let s = scene(30);
     let frame0 = Tracking::new(ties(ALL)).frame0(&s.layers[0]);
     assert_eq!((frame0.foreground.len(), frame0.background.len()), (20, 10));

@@ -26,7 +26,7 @@ impl Align {
         Self { settings, layer }
     }
 
-    /// The schedule's factor in a step, if the step is one of those that are looked at.
+    /// The schedule's factor in a step, if the step is one of those that are examined.
     fn due(&self, info: &StepInfo) -> Option<f64> {
         let rng = Rng::new(info.seed, "transport align", info.iteration as u64).fork(self.layer as u64);
         let factor = self.settings.factor(info.progress);

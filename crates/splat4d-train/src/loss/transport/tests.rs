@@ -64,7 +64,7 @@ fn gradients_equal_differences() {
 }
 
 #[test]
-fn steady_motion_costs_the_second_order_nothing_and_the_first_its_length() {
+fn uniform_motion_has_no_second_order_loss_and_its_length_as_first_order_loss() {
     let grown = |t: f64| {
         let s = 1.0 + 0.2 * t;
         Normal { mean: [3.0 * t, 0.0, -t], cov: spd::IDENTITY.map(|r| r.map(|x| x * s * s)) }
@@ -86,7 +86,7 @@ fn steady_motion_costs_the_second_order_nothing_and_the_first_its_length() {
 }
 
 #[test]
-fn it_begins_when_it_should_and_looks_at_a_share_of_the_steps() {
+fn transport_loss_starts_at_its_step_and_samples_a_share_of_the_steps() {
     let loss = Transport::new(TransportConfig { start: 0.2, ramp: 0.1, every: 0.25, ..settings() }, 0);
     assert_eq!(
         [0.0, 0.19, 0.25, 0.3, 0.9].map(|p| (100.0 * loss.settings.factor(p)).round()),

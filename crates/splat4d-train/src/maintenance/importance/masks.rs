@@ -47,7 +47,7 @@ pub(super) fn keys(interval: usize, times: &[f64], fps: f64) -> Vec<f64> {
 }
 
 /// Gives every layer of `scene` masks: at a key time, the Gaussians that any training view of that time shows (weight
-/// above 0, behind what hides them). One whose life lies between two key times and meets none is admitted at both; one
+/// above 0, behind what hides them). One whose life is between two key times and meets none is admitted at both; one
 /// that lives wholly before or after all training frames at none. Masks that the layers have count for nothing.
 /// `progress` hears of views done and in all.
 ///

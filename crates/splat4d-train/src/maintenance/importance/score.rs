@@ -40,7 +40,7 @@ pub(crate) struct ScoreConfig {
     pub cost: f64,
     /// Frames of a unit of time, in which derivatives of the life are measured (`UNIT_FRAMES`).
     pub unit: f64,
-    /// Every so many of the views at a time are looked at, another choice at each time, and at least one.
+    /// Every so many of the views at a time are examined, another choice at each time, and at least one.
     pub every: usize,
     /// As the scene was trained.
     pub antialias: Antialias,
@@ -67,9 +67,9 @@ impl Default for ScoreConfig {
 pub struct Scores {
     /// A score a row, by layer.
     pub layers: Vec<Vec<f64>>,
-    /// The spatial score over all views looked at, a row, by layer.
+    /// The spatial score over all views examined, a row, by layer.
     pub spatial: Vec<Vec<f64>>,
-    /// Views looked at.
+    /// Views examined.
     pub views: usize,
 }
 

@@ -2,8 +2,8 @@
 //! and its variants.
 //!
 //! The paper's S^TV = Σ_t 1/(½ tanh p''(t) + ½), p the life, summed over the whole clip, ranks the other way round than
-//! its text says: a term is 1 + exp(−2p''), so that it overflows at the peak of a short life, and a time at which
-//! the Gaussian is not there counts 2, the most that |p''| could give. The reading that does what the text says takes
+//! its text states: a term is 1 + exp(−2p''), so that it overflows at the peak of a short life, and a time at which
+//! the Gaussian is not there counts 2, the most that |p''| could give. The reading that does what the text states takes
 //! the product with the spatial score time by time: absent times vanish, and each present one weighs 1
 //! (flickers) to 2 (lasts). That is [`Temporal::InstantAbs`], the default; the others are kept for comparison.
 
@@ -46,7 +46,7 @@ pub enum Spatial {
     /// Σ over pixels and channels of the squared change that its removal alone would make. Neighbours of one colour
     /// stand in for each other, and may all go.
     Change,
-    /// The geometric mean of both in each view: neither what covers nor what differs from what lies behind goes first.
+    /// The geometric mean of both in each view: neither what covers nor what differs from what is behind goes first.
     Both,
     /// Opacity at every time at which a view shows it (3DGS).
     Opacity,
@@ -217,7 +217,7 @@ mod tests {
 
     /// The default score of lives whose spatial score at a time is p.
     #[test]
-    fn the_default_grows_with_life() {
+    fn the_default_score_grows_with_lifespan() {
         let score = |frames: f64| {
             let (lives, times) = life(frames);
             let at = |t: &Time| lives.instant(Temporal::InstantAbs, 0, *t) * lives.kind.eval(lives.rows[0], *t).sigma;
@@ -225,7 +225,7 @@ mod tests {
         };
         let scores = LIVES.map(score);
         assert!(scores.windows(2).all(|w| w[0] < w[1]), "{scores:?}");
-        // Computed apart from this code, from the formula; where a short life lies between frames matters by 3 %.
+        // Computed apart from this code, from the formula; where a short life is between frames matters by 3 %.
         for (s, expected) in scores.iter().zip([2.5, 7.5, 18.2, 41.8, 106.0, 296.0, 545.0]) {
             assert!((s / expected - 1.0).abs() < 0.04, "{scores:?}");
         }
@@ -233,7 +233,7 @@ mod tests {
 
     /// Why the printed score is not the default.
     #[test]
-    fn the_printed_score_overflows_and_prefers_short_lives_and_its_absolute_value_says_nothing() {
+    fn the_published_score_overflows_and_prefers_short_lifespans() {
         let sum = |frames: f64, term: &dyn Fn(f64) -> f64| {
             let (lives, times) = life(frames);
             times.iter().map(|t| term(lives.kind.d2_time(lives.rows[0], *t))).sum::<f64>()
@@ -253,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn variants_that_follow_the_life_grow_with_it() {
+    fn variants_by_lifespan_grow_with_lifespan() {
         for temporal in [Temporal::Width, Temporal::ActiveFraction] {
             let scores = LIVES.map(|f| {
                 let (lives, times) = life(f);

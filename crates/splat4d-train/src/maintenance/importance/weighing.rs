@@ -130,7 +130,7 @@ pub(super) fn root_of_determinant(upper: &[f64; 21]) -> f64 {
     if !diagonal.iter().all(|d| *d > 0.0 && d.is_finite()) {
         return 0.0;
     }
-    // Over its own diagonal the block knows no unit, and its pivots lie between 0 and 1.
+    // Over its own diagonal the block knows no unit, and its pivots are between 0 and 1.
     for (i, row) in m.iter_mut().enumerate() {
         for (j, x) in row.iter_mut().enumerate() {
             *x /= diagonal[i].sqrt() * diagonal[j].sqrt();

@@ -35,7 +35,7 @@ fn two_stages_make_one_schedule() {
 }
 
 #[test]
-fn networks_come_in_slowly_and_the_cloud_learns_on() {
+fn networks_are_blended_in_while_gaussians_keep_training() {
     let moving = stages(&["deform_trunk=hash"]).remove(1);
     let group = |column: &str| moving.groups.iter().find(|g| g.column == column).unwrap();
     let (network, late) = (group("deform_trunk.0.weight"), group("deform_xyz.7"));

@@ -24,7 +24,7 @@ fn spline() -> TrajectorySpec {
 }
 
 #[test]
-fn images_teach_nodes_and_everything_that_drives_them() {
+fn image_gradients_reach_nodes_and_all_their_parameters() {
     let mut scene = skinned::<f64>(12, 7, spline());
     let p = &mut scene.layers[0].params;
     let keys = p.find("node_keys").unwrap();
@@ -163,7 +163,7 @@ fn a_scene_on_nodes_learns_with_every_trajectory() {
 
 /// Shaken nodes come to rest in training, whatever the images say.
 #[test]
-fn losses_on_nodes_calm_them() {
+fn losses_on_nodes_reduce_jitter() {
     let clip = [0.0, 0.2];
     type Make = fn([f64; 2]) -> Box<dyn ProbeLoss<f32>>;
     let losses: [Make; 3] = [

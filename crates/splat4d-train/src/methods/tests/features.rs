@@ -40,7 +40,7 @@ fn every_gradient_of_features_and_head_equals_finite_differences() {
 
 /// With `detach` Δ is a constant to features too: the life's centre learns from opacity alone.
 #[test]
-fn detached_features_do_not_move_lives() {
+fn detached_features_give_lifespans_no_gradient() {
     let gradient = |detach: bool| {
         let scene = featured::<f64>(LifeKind::GaussHalf, detach, false);
         let (layer, mut d) = (&scene.layers[0], Grads::new(&scene.layers[0].params));

@@ -173,7 +173,7 @@ pub(super) fn made_plan(recipe: &Recipe) -> TrainContext {
 }
 
 #[test]
-fn a_recipe_wraps_any_program_and_leaves_no_trace() {
+fn a_filter_wraps_any_program_and_is_removed_exactly() {
     let recipe = |text: &str| {
         let mut r = Recipe::default().with(|r| {
             r.run.iterations = 40;
@@ -237,7 +237,7 @@ fn a_recipe_wraps_any_program_and_leaves_no_trace() {
 }
 
 #[test]
-fn hooks_of_the_program_inside_see_its_own_model() {
+fn hooks_of_the_wrapped_program_get_its_own_model() {
     struct Hooked;
     impl Method for Hooked {
         fn spec(&self, _: &TrainContext) -> Spec {

@@ -178,7 +178,7 @@ const GHOST: f64 = 0.06;
 const OFF: f64 = 0.12;
 
 #[test]
-fn nobody_leaves_a_ghost() {
+fn gaussians_outside_their_lifespan_leave_no_ghost() {
     for motion in ["deform-mlp", "hexplane", "control", "ssm"] {
         let [ghost, there] = errors(motion, "interval");
         assert!(ghost < GHOST, "{motion}: a ghost of {ghost}");

@@ -55,7 +55,7 @@ fn every_built_in_model_has_a_program() {
 }
 
 #[test]
-fn lasting_clouds_come_and_go_before_fixed_cameras() {
+fn models_of_lasting_gaussians_get_lifespans_only_with_fixed_cameras() {
     let life = |motion: &str, fixed_cameras: usize, change: &dyn Fn(&mut Recipe)| {
         let recipe = Recipe::default().with(|r| {
             r.run.motion = crate::recipe::MotionName::of(motion);

@@ -24,7 +24,7 @@ fn a_deformation_model_is_scored_pruned_masked_and_trained_on() {
     let scene = deformed(120);
     let scores = score(&scene, &made, &ScoreConfig::default(), &mut |_, _| {}).unwrap();
     assert!(scores.layers[0].iter().filter(|s| **s > 0.0).count() > 60);
-    // Its times are looked at with the nodes where they are then, not at rest.
+    // Its times are examined with the nodes where they are then, not at rest.
     let mut rested = scene.clone();
     let key = rested.layers[0].params.find("poses@1").unwrap();
     rested.layers[0].params[key].fill(0.0);

@@ -31,7 +31,7 @@ impl Recurrence {
         Self { controls, decay }
     }
 
-    /// The step before t, the share of the next, and whether t lies inside the scan.
+    /// The step before t, the share of the next, and whether t is inside the scan.
     fn place(t: Time) -> (usize, f64, bool) {
         let u = t.0 / STEP_SECONDS;
         let inside = u > 0.0 && u < STEPS as f64;

@@ -5,7 +5,7 @@ use crate::maintenance::At;
 use crate::recipe::MotionName;
 
 #[test]
-fn the_last_stage_splits_where_it_is_asked_to() {
+fn the_last_stage_splits_gaussians_if_enabled() {
     let at = |static_split: f64, motion: &str| {
         let mut recipe = Recipe::default().with(|r| {
             r.run.iterations = 1000;

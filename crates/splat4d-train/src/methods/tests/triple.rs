@@ -64,7 +64,7 @@ fn two_layers() -> Scene<f64> {
 }
 
 #[test]
-fn probes_and_views_share_their_questions() {
+fn probes_and_views_share_their_queries() {
     let scene = two_layers();
     // Two views, one at the triple's middle time: layer 0 answers at 0, 0.1, 0.2 and 0.15, layer 1 at 0.1 and 0.15.
     let shots = shots(&[(0, 0.1), (1, 0.15), (2, 0.15)]);

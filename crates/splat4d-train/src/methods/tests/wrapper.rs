@@ -207,7 +207,7 @@ fn wrapping_changes_neither_output_nor_gradient() {
 }
 
 #[test]
-fn direct_colours_and_a_life_of_its_own_have_gradients() {
+fn direct_colours_and_own_lifespans_have_gradients() {
     let shots = shots(&[(0, 0.05), (1, 0.1)]);
     let reached = check_gradients(&glow_scene(), &shots, &Vec::new());
     assert_reached(&reached[0], &["geometry", "glow"]);

@@ -193,7 +193,7 @@ fn error(s: &Scene<f32>, truth: &Scene<f32>, frame: usize, rows: std::ops::Range
 }
 
 #[test]
-fn a_turning_ball_is_followed_and_without_ties_it_is_not() {
+fn a_turning_ball_is_tracked_only_with_ties() {
     const FRAMES: usize = 20;
     let params = ball(260, 0);
     let world = truth(&params, 260, FRAMES, 3f64.to_radians());
@@ -214,7 +214,7 @@ fn a_turning_ball_is_followed_and_without_ties_it_is_not() {
 }
 
 #[test]
-fn even_motion_needs_no_steps() {
+fn uniform_motion_is_extrapolated_without_steps() {
     let params = ball(50, 0);
     let world = truth(&params, 50, 6, 0.0);
     let (program, plan) = plan(6, 4, false, &["iterations=1", "first_share=0"]);
@@ -233,7 +233,7 @@ fn even_motion_needs_no_steps() {
 }
 
 #[test]
-fn masks_identify_static_parts_which_stay() {
+fn parts_that_masks_call_static_stay() {
     let params = ball(200, 60);
     let world = truth(&params, 200, 3, 0.05);
     let frames: Arc<dyn Frames> = Arc::new(draw(&world, cameras(8, 32), 3, Some(200)));
@@ -326,7 +326,7 @@ fn exposures_are_learnt_on_frame_0_and_kept() {
 }
 
 #[test]
-fn tuning_looks_at_every_frame_and_moves_every_page() {
+fn tuning_uses_every_frame_and_changes_every_page() {
     let (program, plan) = plan(5, 4, false, &["static_split=0.01", "crowding=merge"]);
     let stage = super::super::tuning(&program, &plan);
     assert_eq!(stage.sampler, Sampler::Uniform);

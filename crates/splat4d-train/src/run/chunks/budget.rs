@@ -14,7 +14,7 @@ use crate::run::open::OpenCapture;
 use crate::{Error, ErrorKind, Result};
 use std::sync::Arc;
 
-/// Share of the time that timing steps may take (as for takes that are learnt at once).
+/// Share of the time that timing steps may take (as for captures that are learnt at once).
 const PROBES: f64 = 0.06;
 /// Seconds that timing steps takes where only the length is asked for.
 const PREDICTION: f64 = 6.0;
@@ -26,7 +26,7 @@ const LESS: f64 = 0.8;
 const PICTURES: u64 = 64 << 20;
 /// Shortest chunk, in overlaps: in a shorter one there is hardly a frame that is not shared.
 const SHORTEST: usize = 3;
-/// Share of the time that is kept for putting the take together, and for what training takes next to its steps.
+/// Share of the time that is kept for putting the capture together, and for what training takes next to its steps.
 const JOIN: f64 = 0.1;
 
 /// A take in chunks before it is begun.
@@ -70,7 +70,7 @@ impl ChunkEstimate {
     /// Looks at a take as `train` would before its first step, of which at least [`look_ahead`](super::look_ahead) is listed.
     /// Within `minutes`, if there are any, from the start of `clock` on, and within the recipe's memory limit. What the caller
     /// does after training takes as long as `finish` steps at its end. `timed`: steps are timed even without `minutes`.
-    /// `None`: the take is learnt at once.
+    /// `None`: the capture is learnt at once.
     ///
     /// Errors: what the recipe asks for cannot be had in chunks, or not within these limits; images that cannot be
     /// read.

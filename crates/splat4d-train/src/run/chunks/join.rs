@@ -28,7 +28,7 @@ const CAMERAS: usize = 2;
 /// 8-bit steps in [0, 1]: the unit of flicker.
 const LEVELS: f64 = 255.0;
 
-/// A take that was put together.
+/// A capture that was put together.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Joined {
     /// Its chunks.
@@ -51,7 +51,7 @@ pub struct Seams {
     pub across: f64,
     /// In the middle of chunks.
     pub inside: f64,
-    /// Cuts that were looked at.
+    /// Cuts that were examined.
     pub cuts: usize,
     /// Whether cameras looked that training never saw.
     pub held_out: bool,
@@ -103,7 +103,7 @@ impl Chunked {
         Ok(joined)
     }
 
-    /// The whole take without what was learnt. Errors: the capture, or what chunks share, cannot be read.
+    /// The whole capture without what was learnt. Errors: the capture, or what chunks share, cannot be read.
     pub fn shell(&self) -> Result<Scene<f32>> {
         let [first, end] = self.plan.take;
         let ends = self.capture(vec![first..first + 1, end - 1..end])?;
@@ -120,7 +120,7 @@ impl Chunked {
         Ok([from - 0.5 / capture.fps, to + 0.5 / capture.fps])
     }
 
-    /// A finished chunk as a scene of one layer, which is seen as it will be in the whole take; what all share is left out.
+    /// A finished chunk as a scene of one layer, which is seen as it will be in the whole capture; what all share is left out.
     ///
     /// Errors: files that cannot be read.
     pub fn alone(&self, chunk: usize) -> Result<Scene<f32>> {
@@ -142,7 +142,7 @@ impl Chunked {
         Ok(Scene { layers: vec![layer], ..scene })
     }
 
-    /// Some neighbouring chunks and what all share, as the whole take shows them. Errors: files that cannot be read.
+    /// Some neighbouring chunks and what all share, as the whole capture shows them. Errors: files that cannot be read.
     pub fn some(&self, chunks: Range<usize>) -> Result<Scene<f32>> {
         let mut whole = Scene::default();
         for chunk in chunks {
@@ -158,7 +158,7 @@ impl Chunked {
         Ok(whole)
     }
 
-    /// What all chunks share; none: nothing stands still. Errors: the file cannot be read.
+    /// What all chunks share; none: nothing is static. Errors: the file cannot be read.
     pub fn still(&self) -> Result<Option<Layer<f32>>> {
         Ok(shared::read(&self.folder(Part::Shared))?.still)
     }

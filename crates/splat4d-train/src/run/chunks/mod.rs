@@ -39,13 +39,13 @@ use std::time::Duration;
 
 /// Frames of a chunk where the recipe leaves it open (STG: 50).
 const FRAMES: usize = 60;
-/// A take of so many frames is learnt at once where the recipe leaves it open: the cap's Gaussians are enough for it.
+/// A capture of so many frames is learnt at once where the recipe leaves it open: the cap's Gaussians are enough for it.
 const WHOLE: usize = 300;
 /// Seconds between two looks whether other workers are done.
 const POLL: Duration = Duration::from_secs(1);
 /// Folder of the chunks in a run.
 const FOLDER: &str = "chunks";
-/// Folder in it whose lock says who writes the playback file.
+/// Folder in it whose lock states who writes the playback file.
 const FILM: &str = "film";
 /// Time between two looks whether it may be written.
 const TURNS: Duration = Duration::from_millis(200);
@@ -56,7 +56,7 @@ const SCENE: &str = "scene.safetensors";
 /// What made runs of chunks.
 pub(super) const MADE_BY: &str = "train --chunk";
 
-/// A part of the work on a take.
+/// A part of the work on a capture.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Part {
     /// The static background, and the cameras' exposures.
@@ -77,20 +77,20 @@ impl std::fmt::Display for Part {
 /// The right to write what workers share; given back when it is dropped.
 pub struct Turn(#[expect(dead_code, reason = "it is held, not looked at")] Owner);
 
-/// A run of a long take.
+/// A run of a long capture.
 pub struct Chunked {
     run: PathBuf,
     source: PathBuf,
     recipe: Recipe,
     plan: ChunkPlan,
-    /// What the lenses of the take recorded, from the part that was opened first: it is the same for all.
+    /// What the lenses of the capture recorded, from the part that was opened first: it is the same for all.
     lenses: Lenses,
     /// Keeps what this worker does to its minutes.
     pacing: Option<Pacing>,
 }
 
 impl Chunked {
-    /// Begins the run of a take in the folder `run`, or finds it begun, by whichever worker. `None`: the take is learnt at once.
+    /// Begins the run of a capture in the folder `run`, or finds it begun, by whichever worker. `None`: the capture is learnt at once.
     ///
     /// Errors: what the recipe asks for cannot be had in chunks; the folder holds the run of another recipe, capture or version.
     pub fn begin(
@@ -101,7 +101,7 @@ impl Chunked {
     ) -> Result<Option<Self>> {
         let Some(even) = ChunkPlan::even(capture, recipe)? else { return Ok(None) };
         let mut listen = listen;
-        // What is looked at before the first step is the take's beginning, however much of it the caller has listed.
+        // What is examined before the first step is the capture's beginning, however much of it the caller has listed.
         let first = Arc::new(beginning(capture, &even));
         let recipe = chosen(&first, recipe.clone(), &mut listen)?;
         recipe.check()?;
@@ -130,7 +130,7 @@ impl Chunked {
         Ok(Some(begun))
     }
 
-    /// Whether a folder is the run of a long take.
+    /// Whether a folder is the run of a long capture.
     pub fn is(run: &Path) -> bool {
         run.join(FOLDER).join(PLAN).is_file()
     }
@@ -352,7 +352,7 @@ impl Chunked {
         self.pacing.map(|pacing| (pacing, [now, pacing.due(now, share)]))
     }
 
-    /// The images of some frames of the take, as the recipe opens them.
+    /// The images of some frames of the capture, as the recipe opens them.
     fn capture(&self, frames: Vec<Range<usize>>) -> Result<Capture> {
         open_frames(&self.source, &self.recipe, frames, &self.lenses)
             .map_err(|e| e.remedy("The run needs its capture where it was when it was begun"))
@@ -382,7 +382,7 @@ impl Chunked {
     }
 }
 
-/// The first part of a take, whose length does not depend on how much of the take is listed.
+/// The first part of a capture, whose length does not depend on how much of the capture is listed.
 fn beginning(capture: &Capture, plan: &ChunkPlan) -> Capture {
     let end = plan.take[0] + WHOLE;
     let train = capture.train.iter().copied().filter(|&i| capture.frames[i].index < end).collect();

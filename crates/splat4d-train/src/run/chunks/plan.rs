@@ -1,4 +1,4 @@
-//! Where a take is cut: evenly, moved to where least moves.
+//! Where a capture is cut: evenly, moved to where least moves.
 
 use super::{FRAMES, WHOLE};
 use crate::capture::{Capture, ImageStore};
@@ -13,10 +13,10 @@ use std::sync::Arc;
 
 /// Share of a chunk's frames by which a cut is moved, at most.
 const MOVED: f64 = 0.1;
-/// Cameras that are looked at for it.
+/// Cameras that are examined for it.
 const LOOKED_AT: usize = 2;
 
-/// The chunks of a take. Frames are counted as the capture counts them.
+/// The chunks of a capture. Frames are counted as the capture counts them.
 #[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct ChunkPlan {
     /// The splat4d that made it.
@@ -25,7 +25,7 @@ pub struct ChunkPlan {
     pub recipe: String,
     /// Fingerprint of the capture.
     pub capture: String,
-    /// First frame of the take, and the one after its last.
+    /// First frame of the capture, and the one after its last.
     pub take: [usize; 2],
     /// Frames that neighbours share.
     pub overlap: usize,
@@ -70,7 +70,7 @@ impl ChunkPlan {
     }
 
     /// The plan with its cuts where least moves, as a few of the fixed cameras see it.
-    /// `open` lists some frames of the take.
+    /// `open` lists some frames of the capture.
     pub(super) fn at_rest(
         mut self,
         open: &dyn Fn(Range<usize>) -> Result<Capture>,
@@ -119,7 +119,7 @@ impl ChunkPlan {
         self.cuts.len() + 1
     }
 
-    /// Never: a take has one chunk at least.
+    /// Never: a capture has one chunk at least.
     pub fn is_empty(&self) -> bool {
         false
     }

@@ -1,6 +1,6 @@
 //! What chunks share: the layer of the static background all the time, and the cameras' exposures.
 //!
-//! Temporal medians of every fixed camera over parts of the take are a capture of their own, on which a still scene is trained
+//! Temporal medians of every fixed camera over parts of the capture are a capture of their own, on which a still scene is trained
 //! as any other run is. Of its Gaussians those stay that most cameras see where next to nothing ever changes: what is left out
 //! is learnt by the chunks, what would be wrong in there they could not mend.
 
@@ -30,27 +30,27 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-/// The file whose being there says that the part is done: the layer, or a scene without layers.
+/// The file whose being there states that the part is done: the layer, or a scene without layers.
 pub(super) const FILE: &str = "still.safetensors";
 /// Name of the layer.
 pub(super) const LAYER: &str = "still";
 /// Folder of the medians.
 const CAPTURE: &str = "capture";
-/// Parts of the take, each of which has a median: more than one, so that exposures can be separated from the scene.
+/// Parts of the capture, each of which has a median: more than one, so that exposures can be separated from the scene.
 const PARTS: usize = 4;
 /// Frames whose median that is.
 const MEDIAN_OF: usize = 9;
 /// A pixel that differs by more from the median (mean of the channels, in [0, 1]) has changed: above the noise of ordinary
 /// cameras.
 const CHANGED: f32 = 0.06;
-/// A pixel is calm where at most this share of the frames that are looked at has changed.
+/// A pixel is calm where at most this share of the frames that are examined has changed.
 const CALM: f64 = 0.1;
 /// Steps of the layer, in those of a chunk: every chunk shows it and none can mend it (docs/scale.md has the figures).
 pub(super) const STEPS: usize = 4;
 /// A Gaussian stays where at least this share of the cameras that look at it finds it calm.
 const AGREED: f64 = 0.5;
 
-/// What a finished part says.
+/// What a finished part states.
 pub(super) struct Shared {
     /// The static background, as it was learnt; none: nothing does.
     pub still: Option<Layer<f32>>,
@@ -171,7 +171,7 @@ fn of_medians(recipe: &Recipe) -> Recipe {
     })
 }
 
-/// The frames of each part of a take whose median is taken.
+/// The frames of each part of a capture whose median is taken.
 fn looked_at([first, end]: [usize; 2]) -> [Vec<usize>; PARTS] {
     let border = |part: usize| first + part * (end - first) / PARTS;
     std::array::from_fn(|part| {

@@ -35,7 +35,7 @@ fn files(run: &Chunked) -> Vec<Vec<u8>> {
 }
 
 #[test]
-fn the_scene_does_not_depend_on_who_does_which_chunk_when_and_how_often_they_are_stopped() {
+fn the_scene_does_not_depend_on_workers_order_or_interruptions() {
     let (place, recipe) = (Place::of(MOMENTS), of_chunks(&[]));
     let (options, never) = (TrainOptions::default(), AtomicBool::new(false));
     let one = begin(&place, "one", &recipe).unwrap().unwrap();
@@ -82,7 +82,7 @@ fn the_scene_does_not_depend_on_who_does_which_chunk_when_and_how_often_they_are
 }
 
 #[test]
-fn what_is_missing_or_of_another_take_is_named() {
+fn missing_and_foreign_chunks_are_named() {
     let (place, recipe) = (Place::of(MOMENTS), of_chunks(&["iterations=2"]));
     let (options, never) = (TrainOptions::default(), AtomicBool::new(false));
     let run = begin(&place, "run", &recipe).unwrap().unwrap();
@@ -126,7 +126,7 @@ fn what_is_missing_or_of_another_take_is_named() {
 }
 
 #[test]
-fn a_take_that_fits_is_not_cut_and_others_are_cut_where_they_rest() {
+fn short_captures_are_not_cut_and_long_ones_at_rest() {
     let place = Place::of(MOMENTS);
     for recipe in [of_chunks(&["chunks.frames=20"]), of_chunks(&["chunks.frames=0"])] {
         assert!(begin(&place, "whole", &recipe).unwrap().is_none());
@@ -136,7 +136,7 @@ fn a_take_that_fits_is_not_cut_and_others_are_cut_where_they_rest() {
     let capture = place.open(&recipe);
     let even = ChunkPlan::even(&capture, &recipe).unwrap().unwrap();
     assert_eq!((even.cuts.clone(), even.frames(0), even.frames(1), even.shared(0)), (vec![10], 0..11, 9..20, 9..11));
-    // The ball stands still from frame 10 to 11 only.
+    // The ball is static from frame 10 to 11 only.
     for camera in 0..4 {
         let picture = |k: usize| capture.root.join(format!("images/{camera}/{k:04}.png"));
         std::fs::copy(picture(10), picture(11)).unwrap();
@@ -233,7 +233,7 @@ fn the_parts_end_on_time_on_a_machine_that_is_slower_than_it_was_timed() {
 }
 
 #[test]
-fn a_plan_keeps_to_its_memory_and_its_minutes() {
+fn a_plan_stays_within_memory_and_minutes() {
     let place = Place::of(MOMENTS);
     let outlook = |changes: &[&str], minutes: Option<f64>| {
         let recipe = of_chunks(changes);
@@ -259,7 +259,7 @@ fn a_plan_keeps_to_its_memory_and_its_minutes() {
 }
 
 #[test]
-fn every_motion_model_goes_through_two_chunks() {
+fn every_motion_model_trains_in_two_chunks() {
     let place = Place::of(12);
     for motion in ["spacetime", "deform-mlp", "hexplane", "tracked", "native4d", "control", "ssm"] {
         let recipe = recipe(&["chunks.frames=6", "chunks.overlap=2", "iterations=8", &format!("motion={motion}")]);

@@ -82,7 +82,7 @@ pub(super) fn train(
     Ok(refine(job, &folder, options, stop, listen)?.outcome)
 }
 
-/// The recipe of a part of the take.
+/// The recipe of a part of the capture.
 pub(super) fn of_frames(recipe: &Recipe, frames: Range<usize>) -> Recipe {
     recipe.clone().with(|r| {
         (r.capture.first_frame, r.capture.max_frames) = (frames.start, frames.len());

@@ -34,7 +34,7 @@ fn a_run_reports_its_device_and_where_it_resumes() {
     assert_eq!(info()["finished"], true);
     assert_eq!(told.len(), usize::from(!missed), "{told:?}");
     assert!(missed || told[0].contains(&format!("before it was {device}")), "{told:?}");
-    // A run on the CPU, as all were, says nothing.
+    // A run on the CPU, as all were, states nothing.
     let mut silent = |event: &Event| assert!(!matches!(event, Event::Device { .. }));
     let (run, options) = (place.run("cpu"), TrainOptions::default());
     train(place.open(&recipe), recipe, &run, &options, &AtomicBool::new(false), &mut silent).unwrap();

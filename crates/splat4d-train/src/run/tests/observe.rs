@@ -58,7 +58,7 @@ fn a_capture_is_split_at_given_times() {
     assert_eq!(cut.train.len() + cut.held.len() + cut.future.len(), whole.frames.len());
     assert!(cut.future.iter().all(|&i| cut.split(i) == Split::Future && cut.frames[i].time.0 > 0.15));
     assert!(open("0").unwrap_err().to_string().contains("leaves nothing"));
-    // The first time alone is enough for a scene; that it is not for motion, `predict` says.
+    // The first time alone is enough for a scene; that it is not for motion, `predict` states.
     assert_eq!(last(&open("0.0001").unwrap(), &open("0.0001").unwrap().train), 0.0);
     let photos = recipe(&["capture.observe=0.5", "max_frames=1"]);
     let message = open_capture(place.capture.path(), &photos).unwrap_err().to_string();

@@ -33,7 +33,7 @@ fn saved(place: &Place, name: &str) -> Recipe {
 }
 
 #[test]
-fn a_machine_that_turns_slower_or_faster_ends_on_time_with_a_plan_that_repeats() {
+fn runs_end_on_time_on_changing_machines_with_a_repeatable_plan() {
     let place = Place::new();
     type Machine = fn(usize) -> usize;
     let machines: [(&str, Machine); 2] = [
@@ -73,7 +73,7 @@ fn a_machine_that_turns_slower_or_faster_ends_on_time_with_a_plan_that_repeats()
 }
 
 #[test]
-fn a_resumed_run_keeps_its_time_and_its_past() {
+fn a_resumed_run_keeps_its_time_limit_and_history() {
     let place = Place::new();
     train_slowly(&place, "whole", |n| 1 + usize::from(n > 30), &mut |e| {
         if let Event::Checkpoint { iteration: 100, .. } = e {
@@ -89,7 +89,7 @@ fn a_resumed_run_keeps_its_time_and_its_past() {
     };
     let whole = saved(&place, "whole").run.replans;
     assert!(whole.rows()[0].at < 100, "{whole:?}");
-    // A clock that stands still asks for no plan of its own.
+    // A clock that is static asks for no plan of its own.
     let run = crashed("crashed");
     let options = TrainOptions { clock: Stopwatch::of(|| 0.0), ..TrainOptions::default() };
     resume_with(&run, &options, &AtomicBool::new(false), &mut |_| {}).unwrap();

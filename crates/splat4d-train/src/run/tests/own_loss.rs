@@ -37,7 +37,7 @@ fn darker(fails: Option<&Arc<AtomicBool>>) -> TrainOptions {
 }
 
 #[test]
-fn a_loss_of_ones_own_counts_and_one_that_fails_costs_no_bit() {
+fn a_custom_loss_is_applied_and_an_interrupted_run_resumes_bit_for_bit() {
     let place = Place::new();
     let recipe = recipe(&[STEPS, "checkpoint_interval=10"]);
     let never = AtomicBool::new(false);

@@ -37,7 +37,7 @@ pub(super) fn on_gpu(bed: &Bed, recipe: &Recipe) -> Option<Trainer<'static>> {
     Some(trainer)
 }
 
-/// Whether a line says only that not all of a step is the device's.
+/// Whether a line states only that not all of a step is the device's.
 fn is_of_tables(notice: &str) -> bool {
     notice.contains("the CPU keeps the tables")
 }

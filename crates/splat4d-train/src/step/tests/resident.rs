@@ -172,7 +172,7 @@ fn a_number_that_is_not_finite_is_found_and_named() {
     resumed.step().unwrap().unwrap();
 }
 
-/// What a device that fails says, and one that has no room.
+/// What a device that fails states, and one that has no room.
 const GONE: &str = "the driver is gone";
 const FULL: &str = "too many for one buffer";
 /// As often as it is called.
@@ -271,7 +271,7 @@ impl Resident for Failing {
 }
 
 #[test]
-fn a_device_that_fails_costs_the_steps_since_it_was_settled_and_nothing_else() {
+fn a_failing_device_loses_only_steps_since_the_last_settle() {
     let bed = Bed::new();
     let recipe = settings("motion=spacetime strategy=none");
     let start = saved(&bed.start(&recipe));
@@ -307,7 +307,7 @@ fn a_device_that_fails_costs_the_steps_since_it_was_settled_and_nothing_else() {
 }
 
 #[test]
-fn a_device_without_room_for_the_tables_goes_on_drawing() {
+fn a_device_without_memory_for_tables_still_renders() {
     let bed = Bed::new();
     for line in ["motion=tracked strategy=none rigid_neighbours=5", "motion=spacetime strategy=adc"] {
         let recipe = settings(line);

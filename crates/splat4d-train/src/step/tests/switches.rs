@@ -1,4 +1,4 @@
-//! Every switch of the recipe in real training: each must do what it says, and the scene must still learn.
+//! Every switch of the recipe in real training: each must do what it states, and the scene must still learn.
 
 use super::bed::{Bed, Ran, bytes, places};
 use crate::loss::graph::{Graph, Weigh};
@@ -85,7 +85,7 @@ fn unease(ran: &Ran) -> [f64; 2] {
 }
 
 #[test]
-fn losses_on_nodes_do_what_they_are_for() {
+fn losses_on_nodes_reduce_what_they_measure() {
     let bed = Bed::new();
     let base = "motion=control control_nodes=20 control_shift_lr_init=5e-3 strategy=none";
     let plain = unease(&bed.run(base));
@@ -109,7 +109,7 @@ fn a_motion_mask_shrinks_with_its_weight() {
 }
 
 #[test]
-fn relocation_moves_the_faint_and_keeps_their_number() {
+fn relocation_moves_faint_gaussians_and_keeps_the_count() {
     let line = "strategy=none relocate_interval=5 relocate_from_iter=5 relocate_opacity=0.15 relocate_share=0.1";
     let ran = Bed::new().run(line);
     assert!(ran.change.moved > 10 && ran.change.added + ran.change.removed == 0, "{:?}", ran.change);
@@ -159,7 +159,7 @@ fn crowds_are_thinned_and_the_rest_learns() {
 }
 
 #[test]
-fn what_stands_still_becomes_a_layer_and_both_layers_learn() {
+fn static_gaussians_become_a_layer_and_both_layers_train() {
     let bed = Bed::new();
     for (motion, reach) in [
         ("spacetime", 0.003),
@@ -186,7 +186,7 @@ fn what_stands_still_becomes_a_layer_and_both_layers_learn() {
 }
 
 #[test]
-fn tracked_and_central_velocities_are_drawn_after_training() {
+fn tracked_and_central_velocities_render_after_training() {
     let bed = Bed::new();
     let camera = splat4d::scene::Camera::with_fov_y(
         splat4d::math::Se3::look_at([0.0, 1.0, 4.0], [0.0; 3], [0.0, 1.0, 0.0]),

@@ -44,7 +44,7 @@ fn twists_move_rigidly_and_have_the_gradient_of_perturbations() {
 }
 
 #[test]
-fn what_all_cameras_do_alike_is_no_correction() {
+fn a_correction_common_to_all_cameras_is_removed() {
     let cameras: Vec<Camera> = (0..6).map(camera).collect();
     let mut c = corrections(&on(), &cameras, true);
     // The world turns, shifts and grows by a little about a point of its own.
@@ -68,7 +68,7 @@ fn what_all_cameras_do_alike_is_no_correction() {
 }
 
 #[test]
-fn only_what_was_seen_moves_within_its_time_and_its_limits() {
+fn corrections_respect_start_end_and_limits() {
     let cameras: Vec<Camera> = (0..3).map(camera).collect();
     let mut c = corrections(&RefineSettings { time_init: 10.0, ..on() }, &cameras, true);
     let d = [[1.0, 0.0, 0.0, 0.0, 0.5, 0.0]];

@@ -112,7 +112,7 @@ fn what_is_missing_or_strange_costs_no_page() {
     assert_eq!(page(folder.path()), "", "a run that was not compressed");
     std::fs::write(folder.path().join(FILE), "{}").unwrap();
     let html = page(folder.path());
-    assert!(html.contains("<table>") && !html.contains("NaN") && !html.contains("Stages"), "{html}");
+    assert!(html.contains("<table class=\"numbers\">") && !html.contains("NaN") && !html.contains("Stages"), "{html}");
     std::fs::write(folder.path().join(FILE), "{\"after\": 3}").unwrap();
     assert!(page(folder.path()).contains("written by another version"));
     std::fs::write(folder.path().join(FILE), "{\"after\":").unwrap();

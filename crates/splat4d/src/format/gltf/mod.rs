@@ -2,7 +2,7 @@
 //!
 //! `KHR_gaussian_splatting:ROTATION` is a unit quaternion x y z w, `:SCALE` and `:OPACITY` are **activated** (lengths,
 //! alpha), `:SH_DEGREE_l_COEF_n` are the coefficients of red, green and blue with the signs of 3DGS. World axes: **y up**;
-//! unit: metre. Nodes place meshes. A `.glb` holds JSON and numbers, a `.gltf` is the JSON, whose numbers lie in a data
+//! unit: metre. Nodes place meshes. A `.glb` holds JSON and numbers, a `.gltf` is the JSON, whose numbers are in a data
 //! URI or in files next to it. KHR_gaussian_splatting_compression_spz_2 (a draft) puts an .spz of version 2 in their place.
 //! Source: KhronosGroup/glTF, specification 2.0 and extensions/2.0/Khronos/KHR_gaussian_splatting; pull request 2531.
 

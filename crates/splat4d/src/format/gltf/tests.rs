@@ -146,7 +146,7 @@ fn quantised_numbers_and_drafts_are_read() {
 }
 
 #[test]
-fn numbers_of_a_gltf_may_lie_in_another_file() {
+fn a_gltf_with_an_external_buffer_is_read() {
     let p = gaussians(5, 1);
     let (mut json, bin) = parts(&written(DIALECT, &p));
     json["buffers"][0]["uri"] = json!("scene%20a.bin");
@@ -159,7 +159,7 @@ fn numbers_of_a_gltf_may_lie_in_another_file() {
 }
 
 #[test]
-fn lies_and_foreign_files_are_refused() {
+fn inconsistent_and_foreign_files_are_refused() {
     let p = gaussians(5, 1);
     let says = |change: &dyn Fn(&mut Value)| changed(&p, change).unwrap_err().to_string();
     assert!(says(&|j| j["accessors"][2]["count"] = json!(9)).contains("one value for each"));

@@ -47,7 +47,7 @@ fn foreign_types_orders_and_versions() {
 }
 
 #[test]
-fn lies_are_errors_with_a_reason() {
+fn inconsistent_headers_are_errors_with_a_reason() {
     let cases = [
         (b"PK\x03\x04 something else".to_vec(), "not a NumPy array"),
         (file("{'descr': '<f4', 'fortran_order': False, 'shape': (1152921504606846976, 8)}", &[]), "cut short"),

@@ -17,7 +17,7 @@ const ONE_LEVEL: usize = 256;
 const COARSE: f64 = 0.7;
 /// Rounds of the coarse level, which only has to divide the work.
 const COARSE_ROUNDS: usize = 4;
-/// Coarse clusters in which every point looks for its entry finally.
+/// Coarse clusters in which every point searches for its entry finally.
 const NEAREST: usize = 3;
 /// Points a task assigns.
 const TASK: usize = 1024;
@@ -316,7 +316,7 @@ mod tests {
     }
 
     #[test]
-    fn two_levels_lose_little_and_threads_change_nothing() {
+    fn two_levels_lose_little_and_any_threads_give_the_same_bits() {
         let points = clouds(6000, 24, 3000, 0.2);
         let weights: Vec<f32> = (0..6000).map(|i| 0.1 + (i % 7) as f32).collect();
         let run = |threads: usize| {

@@ -1,4 +1,4 @@
-//! Deflates byte planes one by one: each gets codes of its own, and the way of looking for repetitions that suits it.
+//! Deflates byte planes one by one: each gets codes of its own, and the way of searching for repetitions that suits it.
 //!
 //! Planes of one section differ: the low bits of positions are noise, a label's high byte is nearly constant. One encoder
 //! over all of them begins blocks anywhere; blocks that begin with planes made the pages of the bundled capture 4 % and
@@ -85,7 +85,7 @@ mod tests {
     }
 
     #[test]
-    fn planes_of_their_own_are_smaller_than_one_encoder_over_all() {
+    fn one_encoder_per_plane_is_smaller_than_one_for_all() {
         let rng = Rng::new(6, "planes", 0);
         let body: Vec<u8> = (0..32_000u64).map(|i| (rng.below(i, 1 << (i / 4000 + 1))) as u8).collect();
         let own = deflate(&body, 0, 4000, 6).len();

@@ -1,4 +1,4 @@
-//! Files of takes that are not finished: sections are appended, and a new index behind them; then the header names the new
+//! Files of clips that are not finished: sections are appended, and a new index behind them; then the header names the new
 //! index. A reader of the old header continues with the old index, of which nothing was touched. What is finished is written
 //! again as any other file, its index in front.
 

@@ -129,7 +129,7 @@ pub struct Entry {
 pub struct Index {
     /// Major and minor version of the format.
     pub version: [u16; 2],
-    /// Bytes of the whole file, as its header says.
+    /// Bytes of the whole file, as its header states.
     pub file_len: u64,
     /// The JSON.
     pub meta: Meta,
@@ -160,7 +160,7 @@ impl Index {
         Ok(Self::place(prefix)?.end as usize)
     }
 
-    /// Whether a file's first bytes say that it is of a take that is not finished.
+    /// Whether a file's first bytes say that it is of a clip that is not finished.
     pub fn grows(header: &[u8]) -> bool {
         header.get(..10).is_some_and(|h| h[..8] == MAGIC && h[8..] == GROWING[0].to_le_bytes())
     }
@@ -319,7 +319,7 @@ impl Index {
         [&self.header(HEADER_BYTES as u64, &index)[..], &index].concat()
     }
 
-    /// The start of a file that grows, and its index, which is to lie behind everything else, `at`; sections stay where they
+    /// The start of a file that grows, and its index, which is to be behind everything else, `at`; sections stay where they
     /// are. Panics: as [`bytes`](Self::bytes).
     pub(super) fn growing(&mut self, at: u64, generator: &str) -> ([u8; HEADER_BYTES], Vec<u8>) {
         let index = self.table(&self.json(generator));
@@ -366,7 +366,7 @@ impl Index {
     }
 }
 
-/// Writes both checksums of a file's start, whose index lies behind its header. Panics: fewer bytes than header and index have.
+/// Writes both checksums of a file's start, whose index is behind its header. Panics: fewer bytes than header and index have.
 #[cfg(test)]
 pub(super) fn seal(file: &mut [u8]) {
     let index_bytes = read_u32(file, 12).expect("a header") as usize;
@@ -410,7 +410,7 @@ impl Header {
 }
 
 impl Entry {
-    /// An optional section of these bytes as they are, wherever it will lie.
+    /// An optional section of these bytes as they are, wherever it will be.
     pub(super) fn plain(kind: Kind, bytes: &[u8]) -> Self {
         let length = u32::try_from(bytes.len()).expect("a section has less than 4 GiB");
         Self {

@@ -281,7 +281,7 @@ pub(super) fn columns(
     let (velocities, rates) = (&layer.params[velocities], &layer.params[rates]);
     let tables = [geometry, colors, lives, velocities, rates];
     for at in (0..rows).step_by(BLOCK) {
-        // Numbers behind the last row are read as well, and not looked at again.
+        // Numbers behind the last row are read as well, and not examined again.
         let [geometry, colors, lives, velocities, rates]: [&[f32]; TABLES] =
             [0, 1, 2, 3, 4].map(|k| tables[k].block((first + at) / BLOCK));
         let lane = |block: &[f32], col: usize| -> Lane {
@@ -336,7 +336,7 @@ pub(super) fn columns(
 }
 
 /// The angular velocity about the world's axes of a unit quaternion that changes at `rate`: twice the vector part of
-/// rate⊗q*. What lies along q changes no rotation.
+/// rate⊗q*. What is along q changes no rotation.
 #[inline(always)]
 fn angular([w, x, y, z]: [f64; 4], [a, b, c, d]: [f64; 4]) -> [f64; 3] {
     [

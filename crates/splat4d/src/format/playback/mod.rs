@@ -60,7 +60,7 @@ pub(crate) const VERSION: [u16; 2] = [1, 2];
 const MASKED: [u16; 2] = [1, 1];
 /// The version of a file without either.
 const FIRST_VERSION: [u16; 2] = [1, 0];
-/// The version of a file that grows, which readers of version 1 refuse: its index is not where they look for it.
+/// The version of a file that grows, which readers of version 1 refuse: its index is not where they search for it.
 const GROWING: [u16; 2] = [2, 0];
 /// Bytes of the header.
 pub const HEADER_BYTES: usize = 64;

@@ -21,7 +21,7 @@ pub(super) const WIDTH_LEVELS: u32 = 253;
 pub(super) const FOR_EVER: u32 = 255;
 /// Standard deviations of its tails that a life's reach holds (docs/format.md).
 const REACH: f64 = 3.0;
-/// Logarithms of a header lie within ± this (docs/format.md), so that squares of what they stand for fit an f32.
+/// Logarithms of a header are within ± this (docs/format.md), so that squares of what they stand for fit an f32.
 pub(super) const MAX_LOG: f64 = 40.0;
 /// A scale below this share of the Gaussian's largest is raised to it: 1/1000 of what is seen is never seen, and the
 /// block's range of scales would pay for it.
@@ -114,7 +114,7 @@ pub(super) fn parse_page(bytes: &[u8], entry: &Entry) -> Result<Page> {
 }
 
 /// The decoded bytes of a section. Errors: another number of stored bytes, a wrong checksum, a stream that does not
-/// inflate to exactly what the entry says.
+/// inflate to exactly what the entry states.
 pub(super) fn unpack<'a>(entry: &Entry, stored: &'a [u8]) -> Result<std::borrow::Cow<'a, [u8]>> {
     if stored.len() != entry.stored as usize {
         return Err(broken(format!("a section has {} bytes instead of {}", stored.len(), entry.stored)));

@@ -55,7 +55,7 @@ pub struct PagesDraft<'a> {
     pub layers: &'a [Layer<f32>],
     /// Of every layer its rows' entries of the palette.
     pub labels: &'a [Vec<u16>],
-    /// The entries that the labels number; none: base colours only, and labels are not looked at.
+    /// The entries that the labels number; none: base colours only, and labels are not examined.
     pub palette: Option<&'a Palette>,
     /// Of every layer.
     pub tiers: &'a [u16],

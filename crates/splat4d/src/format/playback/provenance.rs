@@ -131,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn it_comes_back_and_goes_again_and_nothing_else_changes() {
+    fn provenance_round_trips_and_is_removed_exactly() {
         let plain = file();
         assert_eq!(provenance(&plain).unwrap(), None);
         let with = with_provenance(&plain, Some(&words())).unwrap();
@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn it_may_stand_anywhere() {
+    fn provenance_is_found_at_any_position_in_the_file() {
         // As another program might write it: before the pages, whose palette then has another number.
         let with = with_provenance(&file(), Some(&words())).unwrap();
         let mut index = Index::parse(&with, None).unwrap();

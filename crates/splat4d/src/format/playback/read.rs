@@ -86,7 +86,7 @@ impl Parts {
     }
 }
 
-/// A section's bytes. The index has seen that they lie within the file.
+/// A section's bytes. The index has seen that they are within the file.
 fn stored<'a>(bytes: &'a [u8], entry: &super::Entry) -> &'a [u8] {
     let first = entry.offset as usize;
     &bytes[first..first + entry.stored as usize]

@@ -302,7 +302,7 @@ fn images_of_the_file_are_those_of_the_floats() {
 }
 
 #[test]
-fn sections_come_in_the_order_in_which_a_player_wants_them() {
+fn sections_are_ordered_as_a_player_needs_them() {
     let draft = made_up(40_000, 1, 5);
     let config = WriteConfig { kmeans_rounds: 1, ..WriteConfig::default() };
     let (bytes, summary) = bytes_of(&draft, &config);
@@ -354,7 +354,7 @@ fn the_same_bytes_with_any_number_of_threads() {
 }
 
 #[test]
-fn the_start_of_a_file_is_enough_to_draw_something() {
+fn the_first_pages_of_a_file_render() {
     let (bytes, _) = bytes_of(&made_up(40_000, 1, 8), &WriteConfig { kmeans_rounds: 1, ..WriteConfig::default() });
     assert_eq!(Index::needed(b"").unwrap(), 64);
     assert_eq!(Index::needed(&bytes[..63]).unwrap(), 64);

@@ -64,7 +64,7 @@ fn a_foreign_file_in_another_order_is_read() {
 }
 
 #[test]
-fn lies_are_errors_that_name_the_array() {
+fn inconsistent_arrays_are_errors_that_name_the_array() {
     let one = |body: &str| file(&format!("{{\"a\":{body}}}"), &[0; 8]);
     let cases = [
         (vec![1, 2, 3], "shorter"),
@@ -111,7 +111,7 @@ fn mutants_are_read_or_refused() {
     assert!(0 < read && read < 1000, "{read} of 1000 mutants were readable");
 }
 
-/// One bit anywhere: the file is refused, or says what it said.
+/// One bit anywhere: the file is refused, or states what it said.
 #[test]
 fn a_flipped_bit_is_found_by_the_checksums() {
     let whole = sample();

@@ -40,7 +40,7 @@ pub const DIALECT: Dialect = Dialect {
 
 /// The version this library reads.
 pub(crate) const VERSION: u64 = 2;
-/// The file that says what the others are.
+/// The file that states what the others are.
 pub const META: &str = "meta.json";
 /// Most Gaussians that are believed, a byte of the files: real ones take eight bytes and more each.
 const PER_BYTE: usize = 1;

@@ -157,7 +157,7 @@ fn archives_are_inflated_no_further_than_a_scene_needs() {
 }
 
 #[test]
-fn lies_are_errors_with_a_reason() {
+fn inconsistent_headers_are_errors_with_a_reason() {
     let with = |change: &dyn Fn(&mut Value)| {
         let mut files = files();
         let mut meta: Value = serde_json::from_slice(&files[META]).unwrap();

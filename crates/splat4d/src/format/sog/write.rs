@@ -175,7 +175,7 @@ fn cells(sorted: &[f32]) -> Vec<f32> {
         let (_, cell) = all.swap_remove(widest);
         let middle = mean(&cell) as f32;
         let cut = cell.start + sorted[cell.clone()].partition_point(|x| *x <= middle);
-        // Nor is a cell cut whose mean, rounded, lies below all of its numbers: an empty cell has no mean.
+        // Nor is a cell cut whose mean, rounded, is below all of its numbers: an empty cell has no mean.
         match cut == cell.start || cut == cell.end {
             true => whole.push(cell),
             false => all.extend([cell.start..cut, cut..cell.end].map(|part| (spread(&part), part))),
@@ -190,7 +190,7 @@ fn cells(sorted: &[f32]) -> Vec<f32> {
 /// A file of the archive: name and bytes.
 type NamedFile = (&'static str, Vec<u8>);
 
-/// The colours above degree 0: an image of entries, one of labels, and what `meta.json` says of them.
+/// The colours above degree 0: an image of entries, one of labels, and what `meta.json` states of them.
 fn palette(params: &Params, rows: &[usize]) -> Result<(Value, [NamedFile; 2])> {
     let sh = &params[SH];
     let (width, coefficients) = (sh.width() - 3, sh.width() / 3 - 1);

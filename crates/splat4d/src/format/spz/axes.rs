@@ -1,6 +1,6 @@
 //! The axes of a file: an extension names them, and without it those of .ply are assumed.
 //!
-//! The SPZ library says "right, up, back" where no extension says otherwise, but five other converters (splat-transform 3.7,
+//! The SPZ library states "right, up, back" where no extension states otherwise, but five other converters (splat-transform 3.7,
 //! gaussforge 0.6, gsply 0.4, NVIDIA's usd-convert-gsplat 0.1, GaussianSplats3D 0.4) copy the axes of the .ply, so that most
 //! files that people exchange have these. Source of the extension: github.com/nianticlabs/spz (MIT), extensions/README.
 

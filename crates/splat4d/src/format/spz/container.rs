@@ -1,4 +1,4 @@
-//! How the streams lie in the file: one gzip stream (versions 2, 3) or a table of contents and zstd frames (version 4).
+//! How the streams are in the file: one gzip stream (versions 2, 3) or a table of contents and zstd frames (version 4).
 
 use super::axes::{self, Axes};
 use super::streams::{STREAMS, Streams, lengths};
@@ -14,7 +14,7 @@ use ruzstd::encoding::{CompressionLevel, compress_to_vec};
 use std::borrow::Cow;
 use std::io::{Read, Write};
 
-/// Length of the header of versions 2 and 3, which lies inside the gzip stream.
+/// Length of the header of versions 2 and 3, which is inside the gzip stream.
 const OLD_HEADER: usize = 16;
 /// Length of the plain header of version 4.
 const NEW_HEADER: usize = 32;
@@ -102,7 +102,7 @@ fn believe(header: &Header, bytes: usize) -> Result<()> {
     Ok(())
 }
 
-/// The axes that the extensions name, where the header says that there are extensions.
+/// The axes that the extensions name, where the header states that there are extensions.
 fn extensions(header: &Header, bytes: &[u8], warnings: &mut Warnings) -> Option<Axes> {
     if header.flags & EXTENDED == 0 { None } else { axes::read(bytes, warnings) }
 }

@@ -63,7 +63,7 @@ pub struct SpzInfo {
     pub antialiased: bool,
     /// Bits behind the point of a coordinate.
     pub fraction_bits: u8,
-    /// Which way is up: as the file says, else as in .ply.
+    /// Which way is up: as the file states, else as in .ply.
     pub up: [f64; 3],
 }
 
@@ -125,7 +125,7 @@ pub fn read(bytes: &[u8]) -> Result<(Params, SpzInfo, Warnings)> {
     Ok((params, info, warnings))
 }
 
-/// Writes a file of the given version that names its axes, where `up` lies along one. Says what was clipped or left out.
+/// Writes a file of the given version that names its axes, where `up` is along one. Says what was clipped or left out.
 ///
 /// Errors: the sink's; no Gaussians (readers refuse such files). Panics: the version is not one of 2 to 4.
 pub(crate) fn write(params: &Params, version: u32, up: [f64; 3], out: &mut impl Write) -> Result<Warnings> {

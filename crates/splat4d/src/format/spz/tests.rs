@@ -119,7 +119,7 @@ fn version_4() -> Vec<u8> {
         body[at - n..at].to_vec()
     });
     let mut extensions = Vec::new();
-    // The second one says right, up, back.
+    // The second one states right, up, back.
     for (kind, payload) in [(0xADBE_0002u32, vec![0; 12]), (0xADBE_0003, vec![4, 0, 0, 0])] {
         extensions.extend(kind.to_le_bytes());
         extensions.extend((payload.len() as u32).to_le_bytes());
@@ -179,12 +179,12 @@ fn gzip_streams_end_like_any_other() {
     flate2::read::GzDecoder::new(&file[..]).read_to_end(&mut plain).unwrap();
     let streams = 16 + 100 * (20 + 9);
     assert_eq!(plain[..8], *b"NGSP\x03\0\0\0");
-    // The header's flag, and behind the streams the extension that says right, down, front.
+    // The header's flag, and behind the streams the extension that states right, down, front.
     assert_eq!((plain[14], &plain[streams..]), (EXTENDED, &[3, 0, 0xBE, 0xAD, 4, 0, 0, 0, 6, 0, 0, 0][..]));
 }
 
 #[test]
-fn files_say_which_way_is_up_but_in_version_2() {
+fn files_store_the_up_direction_except_in_version_2() {
     let written = |version, up| {
         let mut file = Vec::new();
         let said = write(&gaussians(5, 4), version, up, &mut file).unwrap().lines().join("\n");
@@ -228,7 +228,7 @@ fn sentence<'a>(said: &'a str, part: &str) -> &'a str {
 }
 
 #[test]
-fn lies_are_errors_with_a_reason() {
+fn inconsistent_headers_are_errors_with_a_reason() {
     let plain = |version, degree| [header(version, degree), vec![0], body(&OLD_ROTATION)].concat();
     let error = |file: &[u8]| read(file).unwrap_err().to_string();
     assert!(error(&gzipped(&plain(9, 1))).contains("version 9"));

@@ -15,7 +15,7 @@ pub(super) enum Value {
     Array(Vec<f32>),
     /// Texts, tokens, paths or assets.
     Words(Vec<String>),
-    /// `None`, or what is not looked at.
+    /// `None`, or what is not examined.
     Nothing,
 }
 

@@ -29,7 +29,7 @@ pub(super) struct Prim {
     pub(super) name: String,
     /// Whether it is defined and active.
     pub(super) shown: bool,
-    /// Whether parts of it lie in other files.
+    /// Whether parts of it are in other files.
     pub(super) composed: bool,
     pub(super) attributes: BTreeMap<String, Attribute>,
 }

@@ -257,7 +257,7 @@ impl GpuRenderer {
                 drop(recorder);
                 self.write_uniforms(&shot, band, across, Way { further: i > 0, ..way })?;
                 recorder = Recorder::new(&self.gpu, &self.queries, clock);
-                // The lists of another band lie there.
+                // The lists of another band are there.
                 self.frame().band(&mut recorder, band, across, None)?;
             }
             self.back(room).band(&mut recorder, band, across)?;

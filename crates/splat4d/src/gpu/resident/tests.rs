@@ -317,7 +317,7 @@ fn a_device_that_is_lost_under_way_is_an_error() {
 type Asked<'a> = &'a dyn Fn(&mut GpuRenderer) -> Result<()>;
 
 #[test]
-fn a_device_that_is_lost_with_steps_under_way_is_an_error_whatever_is_asked() {
+fn a_device_lost_with_steps_in_flight_is_an_error_for_every_call() {
     let camera = camera([0.0, 0.0, -4.0], 33, 20);
     let finish = |r: &mut GpuRenderer| r.finish().map(|_| ());
     let fetch = |r: &mut GpuRenderer| r.fetch(0).map(|_| ());
@@ -338,7 +338,7 @@ fn a_device_that_is_lost_with_steps_under_way_is_an_error_whatever_is_asked() {
 }
 
 #[test]
-fn ties_of_more_rows_than_a_page_are_refused_and_nothing_else_is() {
+fn only_ties_of_more_rows_than_a_page_are_refused() {
     let Some(mut r) = own_renderer() else { return };
     r.page_rows = Some(ROWS.next_multiple_of(BLOCK) - BLOCK);
     let refused = |r: &mut GpuRenderer, ties: Option<&ResidentTies>| kept(r, ties).err().map(|e| e.to_string());

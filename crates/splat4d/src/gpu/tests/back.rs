@@ -146,7 +146,7 @@ fn gradients_equal_the_cpus() {
 }
 
 #[test]
-fn every_kind_of_colour_goes_back() {
+fn every_kind_of_colour_backpropagates() {
     let Some(mut r) = renderer() else { return };
     let camera = camera([0.0, 0.5, -4.0], 70, 50);
     let (n, pulled) = (300, Pulled::new(33, &camera));

@@ -61,7 +61,7 @@ fn images_equal_the_cpus() {
 }
 
 #[test]
-fn every_kind_of_colour_is_drawn() {
+fn every_kind_of_colour_is_rendered() {
     let Some(mut r) = renderer() else { return };
     let camera = camera([0.0, 0.5, -4.0], 100, 60);
     let n = 500;
@@ -105,7 +105,7 @@ fn every_kind_of_colour_is_drawn() {
 }
 
 #[test]
-fn nothing_to_draw_is_the_background() {
+fn an_empty_scene_renders_the_background() {
     let Some(mut r) = renderer() else { return };
     let camera = camera([0.0, 0.0, -4.0], 40, 30);
     let empty = Scenery::new(17, 0, 1.0, 1.0);

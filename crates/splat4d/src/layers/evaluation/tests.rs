@@ -75,7 +75,7 @@ fn equal_questions_are_one_and_rows_are_united() {
 }
 
 #[test]
-fn the_rows_alive_join_those_that_were_asked_for() {
+fn active_rows_are_merged_with_requested_rows() {
     let layer = &layers()[0];
     let (t, mut alive) = (Time(0.3), Vec::new());
     assert!(!layer.active(t, &mut alive) && !alive.is_empty() && alive.len() < ROWS);
@@ -210,7 +210,7 @@ fn gradients_through_two_layers_equal_finite_differences() {
 }
 
 #[test]
-fn what_was_asked_before_leaves_no_trace() {
+fn earlier_queries_do_not_change_results() {
     let layers = layers();
     let scene = Scene { layers, ..Scene::default() };
     let (mut used, mut fresh) = (Evaluation::default(), Evaluation::default());

@@ -19,7 +19,7 @@ fn far(a: &[[f64; 3]], b: &[[f64; 3]]) -> f64 {
 }
 
 #[test]
-fn rigid_drags_are_rigid_and_no_drag_changes_nothing() {
+fn rigid_drags_are_rigid_and_a_zero_drag_keeps_the_scene() {
     let rest = rod(120, [0.3, -0.2, 0.1], 1);
     let motion = Se3 { rotation: turned(1.1), translation: [0.4, -1.0, 2.0] };
     let handle = |k: usize, m: &Se3| Handle { node: k, target: m.apply(rest[k]), rotation: None };
@@ -39,7 +39,7 @@ fn rigid_drags_are_rigid_and_no_drag_changes_nothing() {
 }
 
 #[test]
-fn energy_never_rises_and_handles_stand_where_they_were_put() {
+fn energy_never_rises_and_handles_stay_at_their_targets() {
     let rest = rod(150, [0.0; 3], 2);
     // One end is bent far round, the other one held.
     let mut handles: Vec<Handle> = (0..6).map(|k| Handle { node: k, target: rest[k], rotation: None }).collect();

@@ -1,4 +1,4 @@
-//! One row of a deformation: from a learnable Gaussian and what the network says of it to a splat, and back.
+//! One row of a deformation: from a learnable Gaussian and what the network states of it to a splat, and back.
 
 use crate::math::twist::{move_point, move_point_backward};
 use crate::math::{Real, quat, sym3};

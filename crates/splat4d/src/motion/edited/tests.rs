@@ -41,7 +41,7 @@ fn a_path_passes_its_keys_and_turns_shapes() {
 }
 
 #[test]
-fn nodes_that_move_as_one_body_carry_what_they_pull_and_nothing_else() {
+fn rigidly_moving_nodes_move_their_gaussians_alone() {
     let turn = quat::normalize([0.8, 0.1, -0.3, 0.4]).0;
     let (r, shift) = (quat::to_rotation(turn), [0.2, -0.1, 0.4]);
     let places = [[0.0, 0.1, 0.0], [0.6, 0.0, 0.2], [1.1, 0.0, 0.0]];

@@ -55,7 +55,7 @@ fn constant_velocity_is_predicted_exactly() {
 }
 
 #[test]
-fn kalman_halves_what_agrees_and_keeps_what_is_certain() {
+fn kalman_halves_the_variance_of_agreeing_values_and_keeps_certain_ones() {
     let (seen, predicted) = (ball([1.0, 0.0, 0.0], 0.2), ball([0.0; 3], 0.2));
     let merged = Fused::new(Fusion::Literal, &seen, &predicted, 0.3, 1.0, 0.0).point;
     assert!((merged.mean[0] - 0.5).abs() < 1e-9);
@@ -78,7 +78,7 @@ fn kalman_halves_what_agrees_and_keeps_what_is_certain() {
 }
 
 #[test]
-fn the_safe_form_shrinks_nothing_and_ends_at_its_ends() {
+fn geodesic_fusion_returns_its_ends_exactly_and_rejects_jumps() {
     let (seen, predicted) = (normal(4, 0, 0.3), normal(4, 1, 0.3));
     let at = |gain: f64| Fused::new(Fusion::Geodesic, &seen, &predicted, gain, 1.0, 0.0).point;
     assert_near(&at(1.0).cov, &seen.cov, 1e-10);
@@ -152,7 +152,7 @@ fn check_row(at: [Normal; 3], w: &Normal, fusion: Fusion, predictor: Predictor, 
     usize::from(f.open > 0.0 && f.open < trust)
 }
 
-/// Means that a table of frames says, linear in between: tracked balls.
+/// Means that a table of frames states, linear in between: tracked balls.
 struct Watched {
     frames: Vec<[f64; 3]>,
 }
@@ -233,7 +233,7 @@ fn noise_around_a_steady_path_is_calmed_and_an_onset_is_not_lagged() {
     let raw = rmse(&seen, &truth);
     let calm = followed(seen.clone(), |s| (s.baseline, s.history, s.gain) = (4, 24, 0.4));
     assert!(rmse(&calm, &truth) < 0.7 * raw, "{} of {raw}", rmse(&calm, &truth));
-    // As published, from what the model says two frames back: extrapolation doubles the noise, so that less is won.
+    // As published, from what the model states two frames back: extrapolation doubles the noise, so that less is won.
     let short = followed(seen, |s| s.gain = 5.0 / 6.0);
     assert!(rmse(&short, &truth) < 0.98 * raw, "{} of {raw}", rmse(&short, &truth));
 
@@ -246,7 +246,7 @@ fn noise_around_a_steady_path_is_calmed_and_an_onset_is_not_lagged() {
 }
 
 #[test]
-fn answers_are_continuous_in_time() {
+fn results_are_continuous_in_time() {
     let frames: Vec<[f64; 3]> = (0..30).map(|i| [(0.4 * i as f64).sin(), 0.02 * i as f64, 0.0]).collect();
     let mut p = Params::<f64>::new(1, 1, &[]);
     p[GEOMETRY].write(0, 3, [1.0, 0.0, 0.0, 0.0]);
@@ -375,7 +375,7 @@ fn gradients_run_through_the_history() {
 }
 
 #[test]
-fn off_changes_nothing_around_any_model() {
+fn a_filter_that_is_off_keeps_every_models_bits() {
     let mut met = Vec::new();
     for inner in models() {
         let (p, plain) = filled::<f64>(&inner, 20);

@@ -53,7 +53,7 @@ fn time_outside_the_clip_is_its_end_and_within_it_things_move() {
 }
 
 #[test]
-fn while_coarse_the_cloud_is_as_it_is_and_planes_learn_nothing() {
+fn the_coarse_stage_is_static_and_trains_no_plane() {
     let (p, model) = cloud::<f64>(spec(), 20);
     let phase = Phase { rests: true, ..Phase::default() };
     let resting = Motion::<f64>::with_phase(&model, &phase).expect("the model has phases");
@@ -66,7 +66,7 @@ fn while_coarse_the_cloud_is_as_it_is_and_planes_learn_nothing() {
     assert_ne!(splats(&p, &model, 3.0), splats(&p, &Still, 3.0));
 }
 
-/// A finished scene's file says nothing of phases; files from before said both numbers always.
+/// A finished scene's file states nothing of phases; files from before said both numbers always.
 #[test]
 fn files_hold_a_phase_only_while_training_is_not_over() {
     let (_, model) = cloud::<f64>(spec(), 20);

@@ -57,7 +57,7 @@ pub struct Native4dSpec {
     pub harmonics: usize,
     /// T of those blocks, seconds.
     pub period: f64,
-    /// Whether the parts of a split also lie apart in time, along the parent's path, and live shorter.
+    /// Whether the parts of a split also are apart in time, along the parent's path, and live shorter.
     pub split_time: bool,
 }
 
@@ -116,7 +116,7 @@ pub fn set_velocity(spec: &Native4dSpec, params: &mut Params<f32>, row: usize, v
 }
 
 impl Native4d {
-    /// New Gaussians stand still and live for a second around t = 0. With harmonics, the layer's SH table grows by their
+    /// New Gaussians are static and live for a second around t = 0. With harmonics, the layer's SH table grows by their
     /// blocks, which start at zero.
     ///
     /// Errors: numbers of the spec out of their ranges; loaded arrays of the wrong shape.
@@ -232,7 +232,7 @@ impl<F: Real> Motion<F> for Native4d {
         d_time
     }
 
-    /// The parts of a split lie apart in time as a Gaussian of four dimensions does: δt ~ N(0, Σ_tt), and the mean goes
+    /// The parts of a split are apart in time as a Gaussian of four dimensions does: δt ~ N(0, Σ_tt), and the mean goes
     /// along its path; a split adds what lies across it.
     fn on_edit(&self, p: &mut Params<F>, edit: &RowEdit, rng: &Rng) {
         if edit.space != Space::Gaussians || !self.spec.split_time {

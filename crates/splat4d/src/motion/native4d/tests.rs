@@ -256,7 +256,7 @@ fn conversions_agree_in_single_precision_for_thin_long_lived_fast_gaussians() {
 }
 
 #[test]
-fn without_a_tilt_nothing_moves_and_velocity_is_the_slope_of_the_mean() {
+fn without_tilt_gaussians_are_static_and_velocity_is_the_slope_of_the_mean() {
     let mut l = layer(20, SPEC);
     let own = l.params.find(TABLE).unwrap();
     let h = 1e-5;
@@ -279,7 +279,7 @@ fn without_a_tilt_nothing_moves_and_velocity_is_the_slope_of_the_mean() {
 }
 
 #[test]
-fn the_life_shown_is_the_life_drawn_and_its_integral_is_that_of_the_marginal() {
+fn the_reported_lifespan_equals_the_rendered_one_and_integrates_to_the_marginal() {
     let l = layer(30, SPEC);
     let mut life = Table::new(&[("life", 2)], 0);
     assert!(l.motion.life(&l.params, &mut life));
@@ -306,7 +306,7 @@ fn the_life_shown_is_the_life_drawn_and_its_integral_is_that_of_the_marginal() {
 }
 
 #[test]
-fn a_moving_frame_adds_its_velocity_and_a_slower_clock_changes_nothing() {
+fn a_moving_frame_adds_its_velocity_and_results_do_not_depend_on_clock_speed() {
     let l = layer(20, SPEC);
     let own = l.params.find(TABLE).unwrap();
     let push = [0.4, -0.3, 0.9];
@@ -394,7 +394,7 @@ fn splits_keep_the_distribution_and_resizing_keeps_velocity_and_life() {
     assert!((mean - own[0]).abs() < 0.1 * before.width && (spread / before.width - 1.0).abs() < 0.05);
     for s in &parts {
         assert!((s.width * SPLIT_SHRINK / before.width - 1.0).abs() < 1e-9);
-        // Each part lies on the parent's path.
+        // Each part is on the parent's path.
         for k in 0..3 {
             let on = before.mean[k] + before.velocity[k] * (s.time - before.time);
             assert!((s.mean[k] - on).abs() < 1e-9 * (1.0 + on.abs()));

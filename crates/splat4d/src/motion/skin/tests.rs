@@ -180,7 +180,7 @@ fn an_edit_of_nodes_keeps_the_image() {
     motion.on_edit(&mut p, &edit, &rng);
     let after = ask(&motion, &p, 0.37);
     assert!(before.data().iter().zip(after.data()).all(|(a, b)| (a - b).abs() < 1e-12));
-    // A file says how many nodes there are now, whatever the spec began with.
+    // A file states how many nodes there are now, whatever the spec began with.
     let mut edit = RowEdit::identity(Space::Nodes, 14);
     edit.push(3, crate::scene::Born::Clone);
     p.apply(&edit);

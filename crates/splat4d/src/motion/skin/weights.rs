@@ -407,7 +407,7 @@ impl<F: Real> NodeLanes<F> {
         let mut data = Vec::new();
         for b in 0..count.div_ceil(BLOCK) {
             for c in 0..HEAD + coordinates {
-                // The head lies in the first run of a row, coordinates in those after it.
+                // The head is in the first run of a row, coordinates in those after it.
                 let c = if c < HEAD { c } else { RUN + c - HEAD };
                 let of = |node: usize| rows.of(node).as_flattened()[c];
                 data.push(each(|l| if b * BLOCK + l < count { of(b * BLOCK + l) } else { F::ZERO }));

@@ -1,4 +1,4 @@
-//! From what the network says at ticks to poses at any time: interpolation, rotation vectors, composed rates.
+//! From what the network states at ticks to poses at any time: interpolation, rotation vectors, composed rates.
 
 use crate::math::{Real, quat};
 use crate::nn::ssm::{LANES, Lane};
@@ -43,7 +43,7 @@ impl<F: Real> Knots<F> {
         }
     }
 
-    /// The last tick that is looked at.
+    /// The last tick that is examined.
     pub(crate) fn last(&self) -> usize {
         self.ticks[3]
     }

@@ -73,7 +73,7 @@ fn a_step_is_carried_on_no_further_than_the_cap() {
 }
 
 #[test]
-fn velocities_are_slopes_within_and_nothing_outside() {
+fn velocities_are_slopes_within_the_clip_and_zero_outside() {
     let (mut p, model) = start(1);
     let mut model = model;
     for (t, x) in [(1.0, 2.0), (3.0, 10.0)] {

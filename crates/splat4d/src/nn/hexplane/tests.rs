@@ -44,7 +44,7 @@ fn features(p: &Params<f64>, planes: &Planes, unlocked: usize, x: &[[f64; 3]], t
 }
 
 #[test]
-fn affine_planes_are_met_exactly_and_the_border_goes_on() {
+fn affine_planes_are_interpolated_exactly_and_clamped_at_the_border() {
     let (mut p, planes) = planes(shape());
     let affine =
         |plane: usize, [u, v]: [f64; 2], c: usize| 1.0 + 0.3 * plane as f64 + 0.5 * u - 0.2 * v + 0.01 * c as f64;
@@ -62,7 +62,7 @@ fn affine_planes_are_met_exactly_and_the_border_goes_on() {
 }
 
 #[test]
-fn a_grid_point_gives_its_own_numbers() {
+fn a_query_at_a_grid_point_returns_its_values() {
     let (mut p, planes) = planes(shape());
     random(&mut p, &planes);
     // Places 2, 1, 3 of 4 and time step 2 of 5 are grid points of level 0.
@@ -80,7 +80,7 @@ fn a_grid_point_gives_its_own_numbers() {
 }
 
 #[test]
-fn time_planes_of_ones_know_no_time() {
+fn time_planes_of_ones_give_features_independent_of_time() {
     let (mut p, planes) = planes(shape());
     set(
         &mut p,
@@ -196,7 +196,7 @@ fn swapped_axes_of_points_and_planes_are_swapped_features() {
 }
 
 #[test]
-fn locked_levels_give_zeros_and_learn_nothing() {
+fn locked_levels_output_zero_and_get_no_gradient() {
     let (mut p, planes) = planes(shape());
     random(&mut p, &planes);
     let x = points(200);

@@ -24,7 +24,7 @@ fn norms_have_mean_zero_and_variance_one_and_their_gradient() {
 }
 
 #[test]
-fn gelu_bends_and_has_its_gradient() {
+fn gelu_and_its_gradient_equal_the_definition() {
     let x = random(40, 2);
     let of = |x: &[Lane<f64>]| {
         let mut out = x.to_vec();

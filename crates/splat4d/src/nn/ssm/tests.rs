@@ -29,7 +29,7 @@ fn worst(a: &[Lane<f64>], b: &[Lane<f64>]) -> f64 {
 }
 
 #[test]
-fn the_scan_is_the_recursion_and_the_convolution_with_its_response() {
+fn the_scan_equals_the_recursion_and_the_convolution() {
     let (ticks, w) = (41, weights_of(SHAPE, 1));
     let of = Discrete::new(SHAPE, &w, &[1.0]);
     let u = random(3 * ticks, 2);
@@ -208,7 +208,7 @@ fn uneven_ticks_sample_the_same_response_to_first_order() {
 }
 
 #[test]
-fn chunks_and_ticks_without_a_gradient_change_nothing() {
+fn missing_gradients_of_chunks_and_ticks_equal_zero_gradients() {
     // Marks and chunks give the same gradient as one chunk would: a scan shorter than a chunk, and the same as a part of
     // a longer one whose rest has no gradient.
     let of = Discrete::new(SHAPE, &weights_of(SHAPE, 15), &[1.0]);

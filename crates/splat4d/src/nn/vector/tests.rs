@@ -30,7 +30,7 @@ fn distance(a: &[Lane<f64>], b: &[Lane<f64>]) -> f64 {
 }
 
 #[test]
-fn relu_turns_and_mirrors_and_has_its_gradient() {
+fn vector_relu_is_equivariant_and_its_gradient_is_right() {
     let (q, k) = (random(4 * 3 * TICKS, 1), random(4 * 3 * TICKS, 2));
     let of = |q: &[Lane<f64>], k: &[Lane<f64>]| {
         let mut out = q.to_vec();
@@ -74,7 +74,7 @@ impl Toy {
 }
 
 #[test]
-fn a_block_turns_and_mirrors_with_its_input() {
+fn a_vector_block_is_equivariant_to_rotations_and_reflections() {
     let toy = toy();
     let x = random(4 * 3 * TICKS, 5);
     let out = toy.run(&toy.w, &x, &mut VectorTape::default());

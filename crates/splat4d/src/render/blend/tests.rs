@@ -73,7 +73,7 @@ fn strips_of_two_rows_are_twice_a_row() {
 }
 
 #[test]
-fn bit_maps_are_the_masks_turned_over() {
+fn bit_maps_are_the_transposed_masks() {
     let records = records(57);
     let maps = bit_maps(&records);
     for (t, map) in maps.iter().enumerate() {

@@ -59,7 +59,7 @@ fn blocks_are_projected_as_single_rows_are() {
 }
 
 #[test]
-fn footprints_are_the_bins_that_ellipses_meet() {
+fn footprints_are_the_bins_that_ellipses_intersect() {
     let (out, view) = (cloud(700), view(500, 333, Antialias::Off));
     let (mut slanted, mut large) = (0, 0);
     for j in 0..700 {

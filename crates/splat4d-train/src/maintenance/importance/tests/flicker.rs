@@ -74,7 +74,7 @@ fn quality(scene: &Scene<f32>, frames: &Drawn) -> f64 {
 }
 
 #[test]
-fn a_flickering_copy_of_the_backdrop_goes_and_the_image_stays() {
+fn a_flickering_copy_of_the_background_is_pruned_and_the_image_stays() {
     let still = |rows: usize, seed: u64| Scene {
         layers: vec![layer(rows, LifeKind::GaussHalf, seed)],
         clip: [0.0, 0.8],

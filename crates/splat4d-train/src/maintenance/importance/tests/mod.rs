@@ -158,7 +158,7 @@ fn scores_do_not_depend_on_the_unit_of_the_clock() {
 }
 
 #[test]
-fn what_no_view_shows_scores_nothing_and_is_not_missed() {
+fn gaussians_in_no_view_score_zero_and_pruning_them_keeps_the_images() {
     let (mut s, made) = (scene(300), made());
     // Some behind every camera, some dead before the clip, some not finite.
     for r in 0..40 {
@@ -180,7 +180,7 @@ fn what_no_view_shows_scores_nothing_and_is_not_missed() {
 }
 
 #[test]
-fn pruning_goes_by_rank_over_all_layers_and_leaves_one() {
+fn pruning_ranks_all_layers_together_and_keeps_one_gaussian() {
     let s = scene(6);
     let scores = Scores {
         layers: vec![vec![5.0, 1.0, 2.0, 2.0, 9.0, 0.0], vec![2.0, 7.0, 0.5]],
@@ -196,7 +196,7 @@ fn pruning_goes_by_rank_over_all_layers_and_leaves_one() {
 
 /// The rows that a life leaves draw the very image of all rows: what it hides is below the blend's cut-off.
 #[test]
-fn interval_buckets_lose_nothing() {
+fn interval_buckets_return_every_active_row() {
     let (s, made) = (scene(400), made());
     let buckets: Vec<_> = s.layers.iter().map(|l| l.buckets(s.clip, 7)).collect();
     let mut hidden = 0;
@@ -239,7 +239,7 @@ fn keys_are_times_of_frames_with_both_ends() {
 }
 
 #[test]
-fn masks_hold_what_key_views_show_and_lives_between_keys() {
+fn masks_contain_gaussians_visible_at_keys_and_between_keys() {
     let (mut s, made) = (scene(500), made());
     // Three rows that live between two keys (at 0, .4 and .8 s) and one that is long over.
     for (row, center) in [(0, 0.2), (1, 0.55), (2, 0.6), (3, -5.0)] {
@@ -283,7 +283,7 @@ fn masks_hold_what_key_views_show_and_lives_between_keys() {
 }
 
 #[test]
-fn no_views_is_an_error_that_says_so() {
+fn scoring_without_views_is_an_error() {
     let none = Made::new(3, 0, 8);
     let error = score(&scene(4), &none, &ScoreConfig::default(), &mut |_, _| {}).unwrap_err().to_string();
     assert!(error.contains("no training views") && error.contains("hold_out"), "{error}");

@@ -9,7 +9,7 @@ fn of(spatial: Spatial) -> ScoreConfig {
 }
 
 #[test]
-fn the_recipe_knows_every_score() {
+fn every_score_is_a_setting_of_the_recipe() {
     let names: Vec<&str> = Spatial::ALL.iter().map(|s| s.name()).collect();
     assert_eq!(names, <Spatial as crate::settings::Value>::choices());
 }

@@ -13,7 +13,7 @@ const ORB_RADIUS: f64 = 0.32;
 const CRATE_LEAVES: usize = 18;
 /// Middle of the crate, and a radius about it that its corners leave.
 const CRATE: ([f64; 3], f64) = ([-0.55, 0.4, 1.75], 0.5);
-/// Frames of the take, of which every third is measured.
+/// Frames of the capture, of which every third is measured.
 const FRAMES: usize = 30;
 const EVERY: usize = 3;
 

@@ -3,7 +3,7 @@
 use super::*;
 use std::io::{Cursor, ErrorKind as Io, Read, Seek, SeekFrom, Write};
 
-/// Half a second of a take, and the static background.
+/// Half a second of a clip, and the static background.
 fn part(seed: u64, from: f64) -> Vec<u8> {
     let mut draft = made_up(900, 1, seed);
     draft.nodes = vec![Node { from, to: from + 0.5, primitives: draft.nodes.swap_remove(0).primitives }];

@@ -1,4 +1,4 @@
-//! Files that lie: never a panic, never an allocation that the bytes do not bear out, and a reason in words.
+//! Files with false claims: never a panic, never an allocation that the bytes do not bear out, and a reason in words.
 
 use super::*;
 use crate::format::mutate::mutants;
@@ -140,7 +140,7 @@ fn newer_versions() {
 }
 
 #[test]
-fn lies_about_sizes_are_refused_by_name() {
+fn inconsistent_sizes_are_refused_by_name() {
     let (sample, _) = bytes_of(&tiny(), &WriteConfig::default());
     let (page, palette) = (1, 3);
     let told = |i: usize, at: usize, bytes: &[u8]| read(&with_entry(&sample, i, at, bytes)).unwrap_err().to_string();

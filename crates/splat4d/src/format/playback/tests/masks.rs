@@ -31,7 +31,7 @@ fn file(pages: &Pages, level: u32) -> Vec<u8> {
 }
 
 #[test]
-fn masks_come_back_whatever_the_number_of_rows_and_keys() {
+fn masks_round_trip_with_any_number_of_rows_and_keys() {
     for (n, keys) in [(4, 1), (60, 2), (64, 5), (130, 3), (1030, 9)] {
         let pages = masked(n, keys, n as u64);
         let bytes = file(&pages, 6);
@@ -56,7 +56,7 @@ fn masks_come_back_whatever_the_number_of_rows_and_keys() {
 }
 
 #[test]
-fn a_player_draws_whom_the_masks_admit() {
+fn a_player_renders_the_gaussians_that_masks_admit() {
     let pages = masked(3000, 6, 50);
     let bytes = file(&pages, 6);
     let scene = read(&bytes).unwrap();
@@ -161,7 +161,7 @@ fn damaged_masks_are_refused_by_name() {
 }
 
 #[test]
-fn what_cannot_be_written_as_masks_is_named() {
+fn masks_that_cannot_be_written_are_named() {
     let mut pages = masked(64, 5, 53);
     pages.layers[0].masks = Some(Arc::new(KeyMasks::new(vec![0.0], 5)));
     let error = write_pages(&pages.draft(None), &WriteConfig::default(), &mut Vec::new()).unwrap_err().to_string();

@@ -65,7 +65,7 @@ impl Adam {
     }
 }
 
-/// Root mean square error within the take and in the ticks after it, and numbers that learn.
+/// Root mean square error within the clip and in the ticks after it, and numbers that learn.
 struct Score {
     within: f64,
     ahead: f64,
@@ -100,7 +100,7 @@ fn at_rest_in(p: &mut Params<f32>) -> Key {
     nodes
 }
 
-/// `samples` evenly spaced times of the take are learnt.
+/// `samples` evenly spaced times of the clip are learnt.
 fn fit_ssm(spec: &SsmSpec, path: Path, samples: usize, steps: usize) -> Score {
     let mut p = Params::<f32>::new(0, 1, &[]);
     let nodes = at_rest_in(&mut p);
