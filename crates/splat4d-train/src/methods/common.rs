@@ -28,6 +28,10 @@ settings! {
 
 settings! {
     /// Learning rates of parameters that all Gaussians have.
+    ///
+    /// Those of colours, scales and rotations are two to five times as high as in Kerbl et al. 2023, whose runs have 30,000 steps. They
+    /// were chosen on seven captures together with [`Settling`](super::Settling), which takes back the noise of high rates
+    /// (studies/records/2026-11-27-rates.md).
     pub struct RateSettings {
         /// Rate of positions at the start, of the extent; 0: 0.002, and less in proportion if `densify.max_cap` is above
         /// 30,000.
@@ -39,13 +43,13 @@ settings! {
         /// Share of the steps at the end over which all rates fall to a tenth; 0: they do not.
         settle: f64 = 0.15 => share();
         /// Rate of base colour; higher SH degrees learn 20 times more slowly.
-        feature: f64 = 6e-3 => positive();
+        feature: f64 = 0.012 => positive();
         /// Rate of opacity logits.
         opacity: f64 = 0.05 => positive();
         /// Rate of log scales.
-        scaling: f64 = 0.015 => positive();
+        scaling: f64 = 0.03 => positive();
         /// Rate of quaternions.
-        rotation: f64 = 1e-3 => positive();
+        rotation: f64 = 4e-3 => positive();
     }
 }
 

@@ -12,6 +12,7 @@ fn default_of_then() -> Recipe {
     Recipe::default().with(|r| {
         (r.densify.max_cap, r.init.count, r.adc.percent_dense) = (30_000, 10_000, 0.01);
         (r.rates.position_init, r.rates.position_final) = (2e-3, 5e-5);
+        (r.rates.feature, r.rates.scaling, r.rates.rotation) = (6e-3, 0.015, 1e-3);
     })
 }
 
