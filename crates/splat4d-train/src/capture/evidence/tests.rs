@@ -499,6 +499,11 @@ fn inverted_masks_are_named_and_right_ones_are_not() {
     assert_eq!(warned(&capture), [""; 0]);
     let said = |f: &Finding| f.aspect == Some(Aspect::NotChecked) && f.what.contains("Whether masks are inverted");
     assert!(capture.check_poses().more.iter().any(said));
+    // Numbers of classes: all above 0 count.
+    let classes = folder.path().join("classes.png");
+    ImageBuffer::from_fn(WIDTH, HEIGHT, |x, _| image::Luma([1 + (x % 2) as u8])).save(&classes).unwrap();
+    capture.frames.iter_mut().for_each(|f| f.mask = Some(classes.clone()));
+    assert!(capture.check_poses().more.iter().any(|f| f.what.contains("Masks hide nothing")));
 }
 
 #[test]
