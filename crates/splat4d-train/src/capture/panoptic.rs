@@ -59,16 +59,16 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
 fn check_order(found: &[(usize, RawFrame)], fps: f64, account: &mut Account) {
     let number = |f: &RawFrame| rig::trailing_number(&f.image.file_name()?.to_string_lossy());
     // From one time to the next of the same camera: entries of the lists, and numbers of the names.
-    let steps: Option<Vec<(usize, i64)>> = found
+    let steps: Option<Vec<(usize, i128)>> = found
         .windows(2)
         .filter(|pair| pair[0].0 == pair[1].0)
         .map(|pair| {
             let [a, b] = [&pair[0].1, &pair[1].1];
-            Some((b.index - a.index, number(b)? as i64 - number(a)? as i64))
+            Some((b.index - a.index, number(b)? as i128 - number(a)? as i128))
         })
         .collect();
     let Some(steps) = steps.filter(|s| !s.is_empty()) else { return };
-    if steps.iter().all(|&(entries, numbers)| entries as i64 == numbers) {
+    if steps.iter().all(|&(entries, numbers)| entries as i128 == numbers) {
         return;
     }
     let back = steps.iter().filter(|(_, numbers)| *numbers <= 0).count();
