@@ -198,7 +198,7 @@ pub(super) fn is_model(folder: &Path) -> bool {
 
 /// Whether a marker of models is one: a folder that holds some, or a model's file with the other two.
 pub(super) fn is_marker(marker: &Path) -> bool {
-    let with_images = |folder: &Path| ["images.bin", "images.txt"].iter().any(|n| rig::spelled(folder, n).is_file());
+    let with_images = |folder: &Path| rig::has_any(folder, &["images.bin", "images.txt"]);
     match marker.is_file() {
         true => marker.parent().is_some_and(with_images),
         false => is_model(marker),
@@ -206,7 +206,7 @@ pub(super) fn is_marker(marker: &Path) -> bool {
 }
 
 fn has_cameras(folder: &Path) -> bool {
-    ["cameras.bin", "cameras.txt"].iter().any(|n| rig::spelled(folder, n).is_file())
+    rig::has_any(folder, &["cameras.bin", "cameras.txt"])
 }
 
 /// The model folder (`sparse` itself or a numbered one in it) with the most registered images.

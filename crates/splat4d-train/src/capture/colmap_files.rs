@@ -197,12 +197,13 @@ pub(super) fn images(folder: &Path) -> Result<Vec<Registered>> {
 
 /// Reads `points3D.bin` or `points3D.txt`; an empty list where neither exists.
 pub(super) fn points(folder: &Path) -> Result<Vec<Point>> {
-    let there = ["points3D.bin", "points3D.txt"].iter().any(|n| rig::spelled(folder, n).is_file());
+    let there = rig::has_any(folder, &["points3D.bin", "points3D.txt"]);
     if there { load(folder, "points3D", points_bin, points_txt) } else { Ok(Vec::new()) }
 }
 
 fn load<T>(folder: &Path, stem: &str, bin: impl Fn(&[u8]) -> Result<T>, txt: impl Fn(&str) -> Result<T>) -> Result<T> {
-    let [binary, text] = ["bin", "txt"].map(|ending| rig::spelled(folder, &format!("{stem}.{ending}")));
+    let at = rig::Folder::new(folder);
+    let [binary, text] = ["bin", "txt"].map(|ending| at.spelled(&format!("{stem}.{ending}")));
     let path = if binary.is_file() { &binary } else { &text };
     let bytes = read_bytes(path)?;
     let read = if path == &binary { bin(&bytes) } else { text::decode(&bytes).and_then(|text| txt(&text)) };

@@ -62,11 +62,12 @@ pub(super) fn read(path: &Path, options: &CaptureOptions) -> Result<RawCapture> 
     if MODELS[..3].iter().any(|name| path.ends_with(name)) && colmap::is_model(path) {
         return colmap::read(path, path, options);
     }
-    let there: Vec<&(&str, Reader)> = READERS.iter().filter(|(marker, _)| is_there(path, marker)).collect();
+    let folder = rig::Folder::new(path);
+    let there: Vec<&(&str, Reader)> = READERS.iter().filter(|(marker, _)| is_there(path, &folder, marker)).collect();
     let Some(((marker, reader), others)) = there.split_first() else {
         return foreign::read(path, options).unwrap_or_else(|| Err(unknown_layout(path, path)));
     };
-    let mut take = reader(path, &rig::spelled(path, marker), options)?;
+    let mut take = reader(path, &folder.spelled(marker), options)?;
     // Of several models the first is the capture's.
     let models = |m: &&str| MODELS.contains(m) && MODELS.contains(marker);
     let (unread, others): (Vec<&str>, Vec<&str>) = others.iter().map(|(marker, _)| *marker).partition(models);
@@ -92,12 +93,12 @@ fn remark_models(take: &mut RawCapture, path: &Path, marker: &str, unread: &[&st
     take.notes.push(note);
 }
 
-fn is_there(path: &Path, marker: &str) -> bool {
+fn is_there(path: &Path, folder: &rig::Folder, marker: &str) -> bool {
     // A single camera's LLFF folder (LLFF, Mip-NeRF 360) is read from its COLMAP model.
     let llff = || MODELS.iter().any(|model| colmap::is_marker(&path.join(model))) && !n3dv::applies(path);
     // Others call their files so too.
     let foreign = marker == nerfies::MARKER && !nerfies::applies(path);
-    let file = rig::spelled(path, marker);
+    let file = folder.spelled(marker);
     file.exists() && !(marker == BOUNDS && llff()) && !foreign && is_model(path, marker, &file)
 }
 
@@ -133,7 +134,8 @@ pub(super) fn read_bounds(root: &Path, marker: &Path, options: &CaptureOptions) 
 
 /// Whether a folder holds a capture of one of these layouts, or another program's export.
 pub(super) fn is_capture(folder: &Path) -> bool {
-    READERS.iter().any(|(marker, _)| is_there(folder, marker)) || foreign::is_there(folder)
+    let names = rig::Folder::new(folder);
+    READERS.iter().any(|(marker, _)| is_there(folder, &names, marker)) || foreign::is_there(folder)
 }
 
 /// Says which of several layouts was read, why, and how to choose another.

@@ -1,7 +1,7 @@
 //! PanopticSports captures (Luiten 2024): `train_meta.json`, `test_meta.json`, `ims/`, `seg/`; fixed cameras, OpenCV
 //! axes, world to camera.
 
-use super::account::Account;
+use super::account::{Account, Aspect, Severity};
 use super::convention::Convention;
 use super::json::{self, Node};
 use super::lookup::{self, Lookup};
@@ -41,6 +41,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     let points = read_points(root, &mut warnings)?;
     let mut account = Account::default();
     lookup.report(&mut account);
+    check_order(&found, fps, &mut account);
     Ok(RawCapture {
         cameras: ids.iter().map(ToString::to_string).collect(),
         frames: found.into_iter().map(|(_, f)| f).collect(),
@@ -52,6 +53,39 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
         account,
         ..RawCapture::new(root, CaptureKind::Panoptic, Convention::OPENCV)
     })
+}
+
+/// Reports image names whose numbers do not follow the lists, which give the times.
+fn check_order(found: &[(usize, RawFrame)], fps: f64, account: &mut Account) {
+    let number = |f: &RawFrame| rig::trailing_number(&f.image.file_name()?.to_string_lossy());
+    // From one time to the next of the same camera: entries of the lists, and numbers of the names.
+    let steps: Option<Vec<(usize, i128)>> = found
+        .windows(2)
+        .filter(|pair| pair[0].0 == pair[1].0)
+        .map(|pair| {
+            let [a, b] = [&pair[0].1, &pair[1].1];
+            Some((b.index - a.index, number(b)? as i128 - number(a)? as i128))
+        })
+        .collect();
+    let Some(steps) = steps.filter(|s| !s.is_empty()) else { return };
+    if steps.iter().all(|&(entries, numbers)| entries as i128 == numbers) {
+        return;
+    }
+    let back = steps.iter().filter(|(_, numbers)| *numbers <= 0).count();
+    if back > 0 {
+        let what = format!(
+            "Times are the order of the lists, and {back} of {} image names have a lower or equal number than the one before: \
+             sort the lists if the numbers count the frames.",
+            steps.len()
+        );
+        account.add(Aspect::Assumed, Severity::Warning, what);
+    } else {
+        let what = format!(
+            "Times are the order of the lists, {fps} entries a second; the numbers of image names leave some out. If all frames \
+             count, set capture.fps to the rate of the frames that are listed."
+        );
+        account.add(Aspect::Assumed, Severity::Note, what);
+    }
 }
 
 fn read_meta(

@@ -1,5 +1,6 @@
 //! Names and files: which images are in a folder, and what an image's name states about camera and frame number.
 
+use std::cell::OnceCell;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
@@ -18,22 +19,44 @@ pub(super) fn file_names(folder: &Path) -> Vec<String> {
     names
 }
 
-/// A file or folder below `folder`, whichever letter case its names have; where it should be if it is missing. Of several
-/// spellings the exact one goes first, and none is taken if two others fit.
-pub(super) fn spelled(folder: &Path, name: &str) -> PathBuf {
-    let exact = folder.join(name);
-    if exact.exists() {
-        return exact;
+/// A folder whose names are listed once, when the first name is looked for that is not there as it is spelled.
+pub(super) struct Folder<'a> {
+    path: &'a Path,
+    names: OnceCell<Vec<String>>,
+}
+
+impl<'a> Folder<'a> {
+    pub(super) fn new(path: &'a Path) -> Self {
+        Self { path, names: OnceCell::new() }
     }
-    let mut at = folder.to_path_buf();
-    for part in name.split('/') {
-        let mut fitting = file_names(&at).into_iter().filter(|n| n.eq_ignore_ascii_case(part));
-        match (fitting.next(), fitting.next()) {
-            (Some(only), None) => at.push(only),
-            _ => return exact,
+
+    /// A file or folder below this one, whichever letter case its names have; where it should be if it is missing. Of
+    /// several spellings the exact one goes first, and none is taken if two others fit.
+    pub(super) fn spelled(&self, name: &str) -> PathBuf {
+        let exact = self.path.join(name);
+        if exact.exists() {
+            return exact;
         }
+        let (part, below) = name.split_once('/').map_or((name, None), |(part, below)| (part, Some(below)));
+        let names = self.names.get_or_init(|| file_names(self.path));
+        let mut fitting = names.iter().filter(|n| n.eq_ignore_ascii_case(part));
+        let (Some(only), None) = (fitting.next(), fitting.next()) else { return exact };
+        let found = self.path.join(only);
+        let Some(below) = below else { return found };
+        let inner = spelled(&found, below);
+        if inner.exists() { inner } else { exact }
     }
-    at
+}
+
+/// [`Folder::spelled`] of one name.
+pub(super) fn spelled(folder: &Path, name: &str) -> PathBuf {
+    Folder::new(folder).spelled(name)
+}
+
+/// Whether a folder has one of these files, whichever letter case its name has.
+pub(super) fn has_any(folder: &Path, names: &[&str]) -> bool {
+    let folder = Folder::new(folder);
+    names.iter().any(|name| folder.spelled(name).is_file())
 }
 
 /// Whether a name ends like an image.

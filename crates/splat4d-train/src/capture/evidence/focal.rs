@@ -1,10 +1,11 @@
-//! Focal lengths: the ones at which matches are on their epipolar lines and colours of points are those of the images.
+//! Focal lengths and distortion: those at which matches are on their epipolar lines and colours of points are those of the
+//! images.
 
 use super::super::Capture;
 use super::super::account::Severity;
 use super::super::preflight::Finding;
 use super::Aspect;
-use super::look::SmallImage;
+use super::look::{SmallImage, Trial};
 use super::pairs::{self, Match};
 use super::points;
 use splat4d::math::Se3;
@@ -14,7 +15,7 @@ const STEP: f64 = 1.189_207_115_002_721;
 const STEPS: i32 = 8;
 /// Steps to half and to twice the length.
 const OCTAVE: i32 = 4;
-/// Steps from the focal length as read within which it is right.
+/// Steps from the focal length as read within which it is right by matches.
 const RIGHT: i32 = 1;
 /// Distance from its epipolar line at which a match counts nothing, pixels of the small image; nearer ones count more.
 const REACH: f64 = 1.0;
@@ -59,14 +60,38 @@ pub(super) fn check(
 
 fn by_points(capture: &Capture, looks: &[SmallImage], poses: &[Se3]) -> Option<Finding> {
     capture.points.as_ref()?;
-    let gains = Tried::new(|times| points::gain_of_focal(capture, looks, poses, times).unwrap_or(0.0));
-    let best = gains.best();
-    let wrong = best.abs() > RIGHT && gains.at(best) >= points::CONVINCES.1 && gains.at(best) >= gains.at(0) + COLOURS;
-    let percent = |step: i32| 100.0 * gains.at(step).max(0.0);
-    wrong.then(|| {
-        let how = format!("colours of initial points fit their images by {:.0} %", percent(best));
-        warning(&how, best, looks, &format!("by {:.0} % as read", percent(0)))
-    })
+    let gain = |trial: Trial| points::gain_if(capture, looks, poses, trial).unwrap_or(0.0);
+    let own = gain(Trial::AS_READ);
+    let percent = |gain: f64| 100.0 * gain.max(0.0);
+    let as_read = format!("by {:.0} % as read", percent(own));
+    let how = |gain: f64| format!("colours of initial points fit their images by {:.0} %", percent(gain));
+    let wrong = |gain: f64| gain >= points::CONVINCES.1 && gain >= own + COLOURS;
+    // Images that were undistorted, with the cameras of the originals.
+    if looks.iter().any(SmallImage::is_distorted) {
+        let straight = gain(Trial { straight: true, ..Trial::AS_READ });
+        if wrong(straight) {
+            let what = format!(
+                "The distortion of the lenses is probably none of these images: {} without it, {as_read}.",
+                how(straight)
+            );
+            let remedy =
+                "If the images are undistorted, export the undistorted cameras, or set the distortion to zero.";
+            return Some(warned(what, remedy));
+        }
+    }
+    let both = Tried::new(|times| gain(Trial { times: [times; 2], ..Trial::AS_READ }));
+    let across = Tried::new(|times| gain(Trial { times: [times, 1.0], ..Trial::AS_READ }));
+    let (best, wide) = (both.best(), across.best());
+    if wrong(across.at(wide)) && across.at(wide) >= both.at(best) + COLOURS {
+        let what = format!(
+            "The focal length across (fx) is probably wrong: {} if it is {:.2} times as long, {as_read}.",
+            how(across.at(wide)),
+            STEP.powi(wide)
+        );
+        let remedy = "Images that were stretched, such as to 16:9, have another focal length across than down.";
+        return Some(warned(what, remedy));
+    }
+    (best != 0 && wrong(both.at(best))).then(|| warning(&how(both.at(best)), best, looks, &as_read))
 }
 
 fn by_matches(matches: &[Match], looks: &[SmallImage], poses: &[Se3]) -> Option<Finding> {
@@ -102,6 +127,9 @@ fn warning(how: &str, step: i32, looks: &[SmallImage], as_read: &str) -> Finding
         "Focal lengths are probably wrong: {how} if they are {times:.2} times as long ({:.0} px in place of {own:.0} px), {as_read}.",
         times * own
     );
-    let remedy = "State the focal length for images of this size, in pixels of these images.".into();
-    Finding { severity: Severity::Warning, aspect: Some(Aspect::Assumed), what, remedy }
+    warned(what, "State the focal length for images of this size, in pixels of these images.")
+}
+
+fn warned(what: String, remedy: &str) -> Finding {
+    Finding { severity: Severity::Warning, aspect: Some(Aspect::Assumed), what, remedy: remedy.into() }
 }

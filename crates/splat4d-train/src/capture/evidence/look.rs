@@ -7,7 +7,7 @@ use crate::keypoints::features::{Feature, Limits, find};
 use crate::keypoints::raster::grey;
 use rayon::prelude::*;
 use splat4d::math::Se3;
-use splat4d::scene::{Camera, Planes};
+use splat4d::scene::{Camera, Lens, Planes};
 
 /// How closely images are examined.
 #[derive(Clone, Copy, Debug)]
@@ -116,6 +116,20 @@ fn box_sums<T: Copy + Into<u64>>(samples: &[T], raster: &Raster, channel: usize,
     out
 }
 
+/// Intrinsics that are compared with those as read.
+#[derive(Clone, Copy)]
+pub(super) struct Trial {
+    /// How many times as long focal lengths are, across and down.
+    pub(super) times: [f64; 2],
+    /// Without the lens's distortion.
+    pub(super) straight: bool,
+}
+
+impl Trial {
+    /// As they were read.
+    pub(super) const AS_READ: Self = Self { times: [1.0; 2], straight: false };
+}
+
 impl SmallImage {
     fn read(number: usize, frame: &Frame, background: Option<[f32; 3]>, side: usize) -> Option<Self> {
         let raster = picture::decode_as(&frame.image, Some(&frame.source), frame.upright).ok()?;
@@ -194,18 +208,28 @@ impl SmallImage {
         self.camera.intrinsics.fx / self.factor as f64
     }
 
-    /// The camera of its file if the focal length were `times` as long.
-    pub(super) fn zoomed(&self, times: f64) -> Camera {
+    /// The camera of its file, and its lens, if intrinsics were others.
+    pub(super) fn tried(&self, trial: Trial) -> (Camera, Distortion) {
         let mut camera = self.camera.clone();
-        camera.intrinsics.fx *= times;
-        camera.intrinsics.fy *= times;
-        camera
+        camera.intrinsics.fx *= trial.times[0];
+        camera.intrinsics.fy *= trial.times[1];
+        (camera, if trial.straight { Distortion::new(Lens::Pinhole) } else { self.lens })
     }
 
-    /// The colour at which a point of the world is seen from `pose` by this camera of the file; `None`: outside, or
-    /// hidden by its mask or alpha.
-    pub(super) fn color_of(&self, camera: &Camera, pose: &Se3, point: [f64; 3]) -> Option<[f32; 3]> {
-        let [u, v] = pixel_of(camera, &self.lens, pose, point)?;
+    /// Whether its lens distorts.
+    pub(super) fn is_distorted(&self) -> bool {
+        self.camera.lens != Lens::Pinhole
+    }
+
+    /// The colour at which a point of the world is seen from `pose` by this camera and lens of the file; `None`: outside,
+    /// or hidden by its mask or alpha.
+    pub(super) fn color_of(
+        &self,
+        (camera, lens): &(Camera, Distortion),
+        pose: &Se3,
+        point: [f64; 3],
+    ) -> Option<[f32; 3]> {
+        let [u, v] = pixel_of(camera, lens, pose, point)?;
         let (x, y) = (u as usize / self.factor, v as usize / self.factor);
         let inside = x < self.color.width && y < self.color.height;
         // Points of what was cut out have the colours of another image.

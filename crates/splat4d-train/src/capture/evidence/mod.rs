@@ -28,6 +28,8 @@ use std::collections::BTreeSet;
 const LOOKS: [usize; 2] = [4, 10];
 /// Pixels that are decoded, at most: a second of one core.
 const PIXELS: usize = 40_000_000;
+/// Mean part of images that their masks show, from which these hide nothing: less than half a level of 8 bits.
+const HIDES_NOTHING: f64 = 0.999;
 /// Part of a moving camera's frames between two that are examined: neighbours overlap, and are apart.
 const STRIDE: usize = 50;
 
@@ -267,6 +269,14 @@ fn check_masks(looks: &[SmallImage], poses: &[Se3]) -> Option<Finding> {
                 percent(of_edge)
             ),
             "Invert them, unless what they hide is not wanted.",
+        ),
+        silhouettes::Masks::Unsure(images, share) if share >= HIDES_NOTHING => (
+            Severity::Note,
+            Aspect::Assumed,
+            format!(
+                "Masks hide nothing: all {images} that were looked at are white everywhere; every value above 0 may count as white."
+            ),
+            "Masks of classes: set the class that is hidden to 0, and all others to 255.",
         ),
         silhouettes::Masks::Unsure(images, share) => (
             Severity::Note,

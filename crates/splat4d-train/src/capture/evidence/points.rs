@@ -4,7 +4,7 @@ use super::super::account::Severity;
 use super::super::lens::Distortion;
 use super::super::preflight::Finding;
 use super::super::{Aspect, Capture, DepthFile, DepthKind, Frame, PointCloud, depth};
-use super::look::{SmallImage, pixel_of};
+use super::look::{SmallImage, Trial, pixel_of};
 use super::pairs;
 use rayon::prelude::*;
 use splat4d::Error;
@@ -128,7 +128,7 @@ pub(super) fn measure(
         seen += chosen.iter().filter(|&&p| pixel_of(camera, &lens, pose, cloud.points[p]).is_some()).count();
     }
     let share = seen as f64 / (chosen.len() * frames.len()).max(1) as f64;
-    let (gain, compared) = gain(capture, &chosen, looks, look_poses, 1.0).unzip();
+    let (gain, compared) = gain(capture, &chosen, looks, look_poses, Trial::AS_READ).unzip();
     Measure { asked: chosen.len(), seen: share, gain, compared: compared.unwrap_or(0) }
 }
 
@@ -331,19 +331,25 @@ pub(super) fn unreadable_depth(capture: &Capture) -> Option<Error> {
 
 /// How much nearer colours of some points are to the images there than to those at other points.
 pub(super) fn gain_of(capture: &Capture, looks: &[SmallImage], poses: &[Se3]) -> Option<f64> {
-    gain_of_focal(capture, looks, poses, 1.0)
+    gain_if(capture, looks, poses, Trial::AS_READ)
 }
 
-/// The same if focal lengths are `times` as long.
-pub(super) fn gain_of_focal(capture: &Capture, looks: &[SmallImage], poses: &[Se3], times: f64) -> Option<f64> {
+/// The same with other intrinsics.
+pub(super) fn gain_if(capture: &Capture, looks: &[SmallImage], poses: &[Se3], trial: Trial) -> Option<f64> {
     let cloud = capture.points.as_ref()?;
     let chosen: Vec<usize> = (0..cloud.points.len()).step_by(step(cloud)).collect();
-    gain(capture, &chosen, looks, poses, times).map(|(gain, _)| gain)
+    gain(capture, &chosen, looks, poses, trial).map(|(gain, _)| gain)
 }
 
-/// How much nearer colours are to the image there than to that at other points, and how many were compared; focal lengths
-/// are `times` as long as read. `None`: points have one colour, or too few are in images.
-fn gain(capture: &Capture, chosen: &[usize], looks: &[SmallImage], poses: &[Se3], times: f64) -> Option<(f64, usize)> {
+/// How much nearer colours are to the image there than to that at other points, and how many were compared, with
+/// these intrinsics. `None`: points have one colour, or too few are in images.
+fn gain(
+    capture: &Capture,
+    chosen: &[usize],
+    looks: &[SmallImage],
+    poses: &[Se3],
+    trial: Trial,
+) -> Option<(f64, usize)> {
     let cloud = capture.points.as_ref()?;
     let apart = |a: &[f32; 3], b: &[f32; 3]| a.iter().zip(b).map(|(x, y)| f64::from((x - y).abs())).sum::<f64>();
     let (mut own, mut other, mut count) = (0.0, 0.0, 0);
@@ -353,7 +359,7 @@ fn gain(capture: &Capture, chosen: &[usize], looks: &[SmallImage], poses: &[Se3]
         return None;
     }
     for (look, pose) in looks.iter().zip(poses) {
-        let camera = look.zoomed(times);
+        let camera = look.tried(trial);
         let there = |p: usize| look.color_of(&camera, pose, cloud.points[p]);
         let pairs: Vec<([f32; 3], [f32; 3])> =
             chosen.iter().filter_map(|&p| Some((cloud.colors[p], there(p)?))).collect();

@@ -6,6 +6,7 @@ use super::*;
 use image::{ImageBuffer, Rgb, Rgba};
 use serde_json::json;
 use splat4d::math::se3::{add, dot, mat_mul, norm, scale, sub, transpose};
+use splat4d::scene::{Camera, Lens};
 use std::sync::OnceLock;
 
 const WIDTH: u32 = 160;
@@ -419,6 +420,26 @@ fn focal_lengths_are_named_by_points_and_by_matches() {
 }
 
 #[test]
+fn crops_stretched_images_and_foreign_distortion_are_named_by_points() {
+    let warned_of = |change: &dyn Fn(&mut Camera)| {
+        let mut capture = photos(true);
+        capture.frames.iter_mut().for_each(|f| change(&mut f.source));
+        let words = ["Focal lengths are", "focal length across", "distortion of the lenses"];
+        let found = warned(&capture);
+        words.map(|words| found.iter().any(|w| w.contains(words)))
+    };
+    assert_eq!(warned_of(&|_| ()), [false; 3]);
+    // A crop that was scaled back to the size of the image.
+    let zoomed = |c: &mut Camera| {
+        (c.intrinsics.fx, c.intrinsics.fy) = (c.intrinsics.fx / 1.35, c.intrinsics.fy / 1.35);
+    };
+    assert_eq!(warned_of(&zoomed), [true, false, false]);
+    assert_eq!(warned_of(&|c| c.intrinsics.fx *= 0.6), [false, true, false]);
+    let k = [-0.5, 0.2, 0.0, 0.0, 0.0, 0.0];
+    assert_eq!(warned_of(&|c| c.lens = Lens::Brown { k, p: [0.0; 2], s: [0.0; 4] }), [false, false, true]);
+}
+
+#[test]
 fn black_turned_and_copied_images_are_named() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
@@ -478,6 +499,11 @@ fn inverted_masks_are_named_and_right_ones_are_not() {
     assert_eq!(warned(&capture), [""; 0]);
     let said = |f: &Finding| f.aspect == Some(Aspect::NotChecked) && f.what.contains("Whether masks are inverted");
     assert!(capture.check_poses().more.iter().any(said));
+    // Numbers of classes: all above 0 count.
+    let classes = folder.path().join("classes.png");
+    ImageBuffer::from_fn(WIDTH, HEIGHT, |x, _| image::Luma([1 + (x % 2) as u8])).save(&classes).unwrap();
+    capture.frames.iter_mut().for_each(|f| f.mask = Some(classes.clone()));
+    assert!(capture.check_poses().more.iter().any(|f| f.what.contains("Masks hide nothing")));
 }
 
 #[test]

@@ -285,10 +285,28 @@ fn intrinsics_of_other_images_are_named() {
 }
 
 #[test]
+fn panoptic_lists_that_names_do_not_follow_are_named() {
+    let sample = samples::panoptic();
+    let backwards = |found: &Capture| found.warnings.iter().any(|w| w.contains("order of the lists"));
+    assert!(!backwards(&open(&sample)));
+    for file in ["train_meta.json", "test_meta.json"] {
+        sample.edit(file, |v| {
+            ["k", "w2c", "fn", "cam_id"].iter().for_each(|key| v[*key].as_array_mut().unwrap().reverse());
+        });
+    }
+    assert!(backwards(&open(&sample)));
+}
+
+#[test]
 fn keys_that_are_like_others_are_named() {
-    for (key, meant) in
-        [("K1", "k1"), ("Depth_File_Path", "depth_file_path"), ("mask", "mask_path"), ("frame_rate", "fps")]
-    {
+    for (key, meant) in [
+        ("K1", "k1"),
+        ("Depth_File_Path", "depth_file_path"),
+        ("mask", "mask_path"),
+        ("frame_rate", "fps"),
+        ("timestamp", "time"),
+        ("timestep_index", "time"),
+    ] {
         let sample = photos();
         sample.edit("transforms.json", |v| v["frames"][0][key] = json!(0.1));
         assert_warns(&open(&sample), &[key, &format!("meant {meant}?")]);
