@@ -399,6 +399,8 @@ fn what_cannot_be_imported_is_explained() {
     filmed(&films);
     let one = films.join("cam06");
     assert!(refused(&one, &["--rig", "fixed"]).contains("one fixed camera"));
+    let alone = refused(&one, &[]);
+    assert!(alone.contains("stays in place") && alone.contains("--rig moving"), "{alone}");
     assert!(refused(&films, &["--from", "3", "--to", "2"]).contains("come after"));
     assert!(refused(&films, &["--apart", "cam06"]).contains("left,right=2.4"));
     assert!(refused(&films, &["--apart", "cam06,cam99=2"]).contains("cam99"));

@@ -175,8 +175,10 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
         Rig::Fixed => false,
         Rig::Moving => true,
     };
-    if cameras.len() == 1 && !moving {
-        return Err(Error::input("one fixed camera gives no depth")
+    let still = request.rig == Rig::Auto && moving && video::is_fixed(&*cameras[0].source, &request.selection)?;
+    if cameras.len() == 1 && (!moving || still) {
+        let why = if still { "the background of the images stays in place: " } else { "" };
+        return Err(Error::input(format!("{why}one fixed camera gives no depth"))
             .remedy("Give the videos of at least two cameras, or use --rig moving if this camera moved."));
     }
     // It can be corrected even if the calibration does not fit.

@@ -1,18 +1,14 @@
 //! Parts of images that are kept: a rectangle that the user gives, or what black bars leave.
 
-use super::{Frame, Selection, Source};
+use super::{EXAMINED, Frame, Selection, Source};
 use crate::calibration::bars;
 use splat4d::scene::Planes;
 use splat4d::{Error, Result};
 
-/// Frames in which black bars are searched for: dark content is dark in all of them hardly ever.
-const LOOKED_AT: usize = 12;
 /// Pixels next to a bar that codecs mix with it; they are cut off too.
 const MIXED: usize = 2;
 /// Share of a side that bars take at most: a film that is darker was filmed with the cap on.
 const MOST: f64 = 0.6;
-/// Frames per second and seconds where a file states none.
-const GUESSED: [f64; 2] = [30.0, 10.0];
 
 /// A rectangle of an upright image, pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -60,17 +56,14 @@ pub enum Cropping {
     At(Crop),
 }
 
-/// Finds what black bars leave of a source's images; `None`: there are none.
+/// Finds what black bars leave of a source's images; `None`: there are none. Dark content is hardly ever dark in all examined frames.
 ///
 /// Errors: those of reading.
 pub(crate) fn without_bars(source: &dyn Source, selection: &Selection) -> Result<Option<Crop>> {
-    let info = source.info();
-    let rate = info.average_rate.or(info.nominal_rate).unwrap_or(GUESSED[0]);
-    let span = selection.to.or(info.duration).unwrap_or(GUESSED[1]) - selection.from.unwrap_or(0.0);
-    let every = ((span * rate) as usize / LOOKED_AT).max(1);
-    let mut reader = source.frames(&Selection { every, size: None, crop: None, ..selection.clone() })?;
+    let selection = Selection { size: None, crop: None, ..selection.clone() };
+    let mut reader = source.frames(&selection.spread(source.info()))?;
     let (mut frame, mut grey) = (Frame::default(), Vec::new());
-    while grey.len() < LOOKED_AT && reader.next(&mut frame)? {
+    while grey.len() < EXAMINED && reader.next(&mut frame)? {
         let p = &frame.picture;
         // The brightest channel: a saturated colour is content.
         let data = p.data.chunks_exact(3).map(|c| f32::from(c[0].max(c[1]).max(c[2])) / 255.0).collect();

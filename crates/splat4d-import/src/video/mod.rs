@@ -10,6 +10,7 @@ mod clock;
 mod crop;
 mod ffmpeg;
 mod filters;
+mod fixed;
 mod folder;
 mod probe;
 mod program;
@@ -19,6 +20,7 @@ pub(crate) use clock::mean_difference;
 pub use clock::{Clock, Gap};
 pub(crate) use crop::without_bars;
 pub use crop::{Crop, Cropping};
+pub(crate) use fixed::is_fixed;
 pub(crate) use folder::ENDINGS as PICTURE_ENDINGS;
 pub(crate) use folder::Folder;
 pub use probe::{Color, Info, Range, Transfer};
@@ -99,12 +101,23 @@ impl Selection {
         }
     }
 
+    /// [`EXAMINED`] frames or a few more, evenly over the chosen part.
+    fn spread(&self, info: &Info) -> Self {
+        let rate = info.average_rate.or(info.nominal_rate).unwrap_or(GUESSED[0]);
+        let span = self.to.or(info.duration).unwrap_or(GUESSED[1]) - self.from.unwrap_or(0.0);
+        Self { every: ((span * rate) as usize / EXAMINED).max(1), ..self.clone() }
+    }
+
     /// Whether a time is in the chosen part.
     fn holds(&self, time: f64) -> bool {
         self.from.is_none_or(|from| time >= from) && self.to.is_none_or(|to| time < to)
     }
 }
 
+/// Frames in which black bars, and motion of the camera, are searched for.
+const EXAMINED: usize = 12;
+/// Frames per second and seconds where a file states none.
+const GUESSED: [f64; 2] = [30.0, 10.0];
 /// Shorter side of the smallest images that anything can be made of.
 const MIN_SIDE: usize = 16;
 

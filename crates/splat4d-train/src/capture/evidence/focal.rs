@@ -71,7 +71,7 @@ fn by_points(capture: &Capture, looks: &[SmallImage], poses: &[Se3]) -> Option<F
         let straight = gain(Trial { straight: true, ..Trial::AS_READ });
         if wrong(straight) {
             let what = format!(
-                "The distortion of the lenses is probably none of these images: {} without it, {as_read}.",
+                "The distortion of the lenses probably does not apply to these images: {} without it, {as_read}.",
                 how(straight)
             );
             let remedy =
