@@ -7,6 +7,7 @@
 mod cache;
 mod clocks;
 mod colmap;
+mod fixed;
 mod geometry;
 mod given;
 mod inputs;
@@ -175,7 +176,7 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
         Rig::Fixed => false,
         Rig::Moving => true,
     };
-    let still = request.rig == Rig::Auto && moving && video::is_fixed(&*cameras[0].source, &request.selection)?;
+    let still = request.rig == Rig::Auto && moving && fixed::is_fixed(&*cameras[0].source, &request.selection)?;
     if cameras.len() == 1 && (!moving || still) {
         let why = if still { "the background of the images stays in place: " } else { "" };
         return Err(Error::input(format!("{why}one fixed camera gives no depth"))

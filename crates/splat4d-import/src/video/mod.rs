@@ -10,7 +10,6 @@ mod clock;
 mod crop;
 mod ffmpeg;
 mod filters;
-mod fixed;
 mod folder;
 mod probe;
 mod program;
@@ -20,7 +19,6 @@ pub(crate) use clock::mean_difference;
 pub use clock::{Clock, Gap};
 pub(crate) use crop::without_bars;
 pub use crop::{Crop, Cropping};
-pub(crate) use fixed::is_fixed;
 pub(crate) use folder::ENDINGS as PICTURE_ENDINGS;
 pub(crate) use folder::Folder;
 pub use probe::{Color, Info, Range, Transfer};
@@ -102,7 +100,7 @@ impl Selection {
     }
 
     /// [`EXAMINED`] frames or a few more, evenly over the chosen part.
-    fn spread(&self, info: &Info) -> Self {
+    pub(crate) fn spread(&self, info: &Info) -> Self {
         let rate = info.average_rate.or(info.nominal_rate).unwrap_or(GUESSED[0]);
         let span = self.to.or(info.duration).unwrap_or(GUESSED[1]) - self.from.unwrap_or(0.0);
         Self { every: ((span * rate) as usize / EXAMINED).max(1), ..self.clone() }
@@ -115,7 +113,7 @@ impl Selection {
 }
 
 /// Frames in which black bars, and motion of the camera, are searched for.
-const EXAMINED: usize = 12;
+pub(crate) const EXAMINED: usize = 12;
 /// Frames per second and seconds where a file states none.
 const GUESSED: [f64; 2] = [30.0, 10.0];
 /// Shorter side of the smallest images that anything can be made of.

@@ -28,10 +28,6 @@ settings! {
 
 settings! {
     /// Learning rates of parameters that all Gaussians have.
-    ///
-    /// Those of colours, scales and rotations are two to five times as high as in Kerbl et al. 2023, whose runs have 30,000 steps. They
-    /// were chosen on seven captures together with [`Settling`](super::Settling), which takes back the noise of high rates
-    /// (studies/records/2026-11-27-rates.md).
     pub struct RateSettings {
         /// Rate of positions at the start, of the extent; 0: 0.002, and less in proportion if `densify.max_cap` is above
         /// 30,000.
@@ -40,6 +36,8 @@ settings! {
         position_final: f64 = 0.0 => any().unit("extents");
         /// Share to which rates without a final value (colour, opacity, scale, rotation, lifespan) decay.
         decay: f64 = 1.0 => positive();
+        // Colours, scales and rotations learn two to five times as fast as in Kerbl et al. 2023, whose runs have 30,000 steps; chosen
+        // on seven captures together with the fall at the end (studies/records/2026-11-27-rates.md).
         /// Share of the steps at the end over which all rates fall to a tenth; 0: they do not.
         settle: f64 = 0.15 => share();
         /// Rate of base colour; higher SH degrees learn 20 times more slowly.

@@ -76,6 +76,7 @@ use auto::CaptureStats;
 use splat4d::layers::Scene;
 use splat4d::motion::{Capabilities, Motion, Phase, Spec, build};
 use splat4d::scene::{LifeKind, Params};
+use std::ops::Range;
 use std::sync::Arc;
 
 /// The capture and the wishes of the user, as far as a program may know them.
@@ -142,42 +143,8 @@ impl Rate {
     }
 }
 
-/// What is left of a rate at the end of a stage that settles.
+/// What is left of the rates at the end of a stage that settles.
 const SETTLED: f64 = 0.1;
-
-/// The part of a stage over which all its rates fall linearly to [`SETTLED`], in shares of the stage.
-///
-/// A step sees one image, and moves parameters towards that image alone. At full rates a run therefore ends some tenths of a
-/// decibel short of what it has learned; small rates from the start would learn less.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Settling {
-    from: f64,
-    to: f64,
-}
-
-impl Settling {
-    /// Rates do not fall.
-    pub const NEVER: Self = Self { from: f64::INFINITY, to: f64::INFINITY };
-
-    /// Over the last part of the stage, a share of it.
-    pub fn last(share: f64) -> Self {
-        if share > 0.0 { Self { from: 1.0 - share, to: 1.0 } } else { Self::NEVER }
-    }
-
-    /// The factor of all rates after the share `progress` of the stage.
-    pub(crate) fn at(&self, progress: f64) -> f64 {
-        if progress <= self.from {
-            return 1.0;
-        }
-        1.0 - (1.0 - SETTLED) * ((progress - self.from) / (self.to - self.from)).min(1.0)
-    }
-
-    /// The same in a stage that is the part `start..end` of this one.
-    fn part(self, start: f64, end: f64) -> Self {
-        let place = |at: f64| (at - start) / (end - start).max(f64::MIN_POSITIVE);
-        Self { from: place(self.from), to: place(self.to) }
-    }
-}
 
 /// A group of this layer is one of every layer that has its columns.
 pub(crate) const EVERY: usize = usize::MAX;
@@ -251,8 +218,11 @@ pub struct Stage {
     pub batch: usize,
     /// Learnable groups and their rates.
     pub groups: Vec<Group>,
-    /// Where the rates of all groups fall.
-    pub settling: Settling,
+    /// The part of the stage, in shares of it, over which all rates fall linearly to a tenth; empty: they do not.
+    ///
+    /// A step sees one image, and moves parameters towards that image alone. At full rates a run therefore ends some tenths of a
+    /// decibel short of what it has learned; small rates from the start would learn less.
+    pub settling: Range<f64>,
     /// Losses over several times.
     pub probes: Vec<Box<dyn ProbeLoss<f32>>>,
     /// Losses on raw parameters.
@@ -294,7 +264,7 @@ impl Stage {
             sampler: Sampler::Uniform,
             batch: 1,
             groups: Vec::new(),
-            settling: Settling::NEVER,
+            settling: 1.0..1.0,
             probes: Vec::new(),
             params: Vec::new(),
             maintenance: Vec::new(),
@@ -318,6 +288,15 @@ impl Stage {
         self.maintenance.push(Box::new(operation));
     }
 
+    /// The factor of all rates after the share `progress` of the stage.
+    pub(crate) fn settled(&self, progress: f64) -> f64 {
+        let Range { start, end } = self.settling;
+        if progress <= start || end <= start {
+            return 1.0;
+        }
+        1.0 - (1.0 - SETTLED) * ((progress - start) / (end - start)).min(1.0)
+    }
+
     /// The steps `from..to` as a stage of its own: rates, densification, degrees of SH and images at half size are
     /// as they
     /// would have been then.
@@ -328,7 +307,8 @@ impl Stage {
         for group in &mut self.groups {
             group.rate = Rate { start: group.rate.at(start), end: group.rate.at(end) };
         }
-        self.settling = self.settling.part(start, end);
+        let place = |at: f64| (at - start) / (end - start).max(f64::MIN_POSITIVE);
+        self.settling = place(self.settling.start)..place(self.settling.end);
         for schedule in self.maintenance.iter_mut().filter_map(|u| u.densification()) {
             *schedule = schedule.part(from, to);
         }

@@ -1,7 +1,7 @@
 //! `still`: one stage, every group of static 3DGS. Also the base that other programs add to.
 
 use super::auto::CaptureStats;
-use super::{CommonSettings, Group, Method, Rate, Settling, Stage, TrainContext};
+use super::{CommonSettings, Group, Method, Rate, Stage, TrainContext};
 use crate::capture::Agreement;
 use crate::loss::motion;
 use crate::loss::neighbourhood::Neighbourhood;
@@ -110,7 +110,7 @@ pub fn stage(name: &str, plan: &TrainContext) -> Stage {
     Stage {
         batch: plan.batch_size,
         groups: groups(c, plan.extent),
-        settling: Settling::last(c.rates.settle),
+        settling: 1.0 - c.rates.settle..1.0,
         probes,
         params,
         maintenance: c.maintenance(),
@@ -129,13 +129,13 @@ mod tests {
     #[test]
     fn rates_fall_over_the_last_part_of_a_run_and_of_its_stages() {
         let of = |words: &[&str]| stage("still", &Recipe::of(words).unwrap().plan());
-        let near = |s: &Settling, at: &[(f64, f64)]| at.iter().all(|&(p, x)| (s.at(p) - x).abs() < 1e-12);
+        let near = |s: &Stage, at: &[(f64, f64)]| at.iter().all(|&(p, x)| (s.settled(p) - x).abs() < 1e-12);
         let whole = of(&["iterations=1000", "rates.settle=0.2"]);
-        assert!(near(&whole.settling, &[(0.0, 1.0), (0.8, 1.0), (0.9, 0.55), (1.0, 0.1)]));
-        assert!(near(&of(&["rates.settle=0"]).settling, &[(0.5, 1.0), (1.0, 1.0)]));
-        assert!(near(&whole.part(0, 500).settling, &[(0.0, 1.0), (1.0, 1.0)]), "before it begins");
+        assert!(near(&whole, &[(0.0, 1.0), (0.8, 1.0), (0.9, 0.55), (1.0, 0.1)]));
+        assert!(near(&of(&["rates.settle=0"]), &[(0.5, 1.0), (1.0, 1.0)]));
+        assert!(near(&whole.part(0, 500), &[(0.0, 1.0), (1.0, 1.0)]), "before it begins");
         let last = of(&["iterations=1000", "rates.settle=0.2"]).part(500, 1000);
-        assert!(near(&last.settling, &[(0.6, 1.0), (0.8, 0.55), (1.0, 0.1)]));
+        assert!(near(&last, &[(0.6, 1.0), (0.8, 0.55), (1.0, 0.1)]));
     }
 
     #[test]

@@ -122,7 +122,7 @@ pub(super) type Rates = Vec<Vec<Option<Vec<f64>>>>;
 /// The rates of a step.
 pub(super) fn rates_of(scene: &Scene<f32>, plan: &StepPlan<'_>, all: &mut Rates) {
     let (stage, progress) = (&*plan.stage, plan.info.progress);
-    let scale = plan.rate_scale * stage.settling.at(progress);
+    let scale = plan.rate_scale * stage.settled(progress);
     all.resize_with(scene.layers.len(), Vec::new);
     for (index, (layer, rates)) in scene.layers.iter().zip(all).enumerate() {
         rates.resize(layer.params.keys().count(), None);
@@ -171,7 +171,7 @@ fn learn_exposure(train_state: &mut TrainState, plan: &StepPlan<'_>) {
 /// The rate of a layer's positions, by which noise on them goes; none: they rest.
 pub(super) fn noise_rate(plan: &StepPlan<'_>, layer: usize) -> Option<f64> {
     let group = plan.stage.groups.iter().find(|g| g.is_of(layer) && g.column == "means")?;
-    Some(group.rate.at(plan.info.progress) * plan.stage.settling.at(plan.info.progress))
+    Some(group.rate.at(plan.info.progress) * plan.stage.settled(plan.info.progress))
 }
 
 /// The step's random numbers for that noise; a layer has a fork.

@@ -1,7 +1,7 @@
 //! Whether a camera stood still while it recorded: such a recording shows no depth.
 
-use super::{EXAMINED, Frame, Selection, Source};
 use crate::sync::grey::Grey;
+use crate::video::{EXAMINED, Frame, Selection, Source};
 use splat4d::Result;
 use splat4d::math::median_by;
 
