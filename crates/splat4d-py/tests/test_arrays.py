@@ -242,13 +242,18 @@ class Motions(InFolder):
         weights = np.random.default_rng(2).normal(size=(camera.height, camera.width, 3)).astype(np.float32)
         loss = lambda s: float((s.render(camera, 0.05).astype(np.float64) * weights).sum())
         grads = scene.render(camera, 0.05, requires_grad=True).backward(weights)
-        for name in ("layers.0.wave", "layers.0.velocity"):
+        # Both move a Gaussian by about 3e-5.
+        for name, h in (("layers.0.wave", 1e-4), ("layers.0.velocity", 6e-4)):
             array = scene.parameters()[name]
-            direction = np.random.default_rng(3).normal(size=array.shape).astype(np.float32)
-            h = 1e-3
-            sides = [loss(scene.with_parameters({name: array + s * h * direction})) for s in (1, -1)]
-            measured, told = (sides[0] - sides[1]) / (2 * h), float((grads[name] * direction).sum())
-            self.assertAlmostEqual(measured, told, delta=0.1 * max(abs(measured), 1), msg=name)
+            errors, largest = [], 0.0
+            for seed in range(3, 12):
+                direction = np.random.default_rng(seed).normal(size=3).astype(np.float32)
+                sides = [loss(scene.with_parameters({name: array + np.float32(s * h) * direction})) for s in (1, -1)]
+                measured, told = (sides[0] - sides[1]) / (2 * h), float((grads[name] * direction).sum())
+                errors.append(abs(measured - told))
+                largest = max(largest, abs(told))
+            # Where a pixel crosses the smallest alpha, the image jumps, and one difference measures the jump.
+            self.assertLess(np.median(errors), 0.1 * largest, f"{name}: {errors} of {largest}")
 
     def test_mistakes_in_a_motion_come_out_as_themselves(self):
         def broken(params, t):
