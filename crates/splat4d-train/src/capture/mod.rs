@@ -191,7 +191,7 @@ pub enum Split {
     Held,
     /// Kept from training: the data set's own validation set (D-NeRF).
     Validation,
-    /// Later than what is observed ([`Capture::observe`]): only scores predictions.
+    /// Later than what is observed (`Capture::observe`): only scores predictions.
     Future,
 }
 
@@ -240,7 +240,7 @@ pub struct Capture {
     pub train: Vec<usize>,
     /// Indices of the data set's own validation frames.
     pub validation: Vec<usize>,
-    /// Indices of the frames after the observed part, of every camera; see [`observe`](Self::observe).
+    /// Indices of the frames after the observed part, of every camera; see `observe`.
     pub future: Vec<usize>,
     /// Where the times are from.
     pub timing: Timing,

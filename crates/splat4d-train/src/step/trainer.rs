@@ -335,7 +335,7 @@ impl<'a> Trainer<'a> {
     }
 
     /// Waits for the steps that a device is still at, and leaves the learner with it. Returns and errors: as of
-    /// [`settle`](Self::settle).
+    /// `settle`.
     pub fn catch_up(&mut self) -> std::result::Result<Vec<Measured>, Fault> {
         self.engine.catch_up(&self.train_state).map_err(|fault| self.named(fault))
     }

@@ -109,7 +109,7 @@ impl Model for ControlSpec {
 
 /// The model with more than motion: node poses, the skin.
 ///
-/// Errors: as [`Model::build`].
+/// Errors: as `Model::build`.
 pub fn skinned<F: Real>(spec: &ControlSpec, p: &mut Params<F>) -> Result<Skinned<F>> {
     let skin = Skin::new(spec.skin, spec.seed, p)?;
     let trajectory: Box<dyn Trajectory<F>> = match spec.trajectory {

@@ -169,7 +169,7 @@ impl Model for HexplaneSpec {
 }
 
 impl Hexplane {
-    /// As its [`Model::build`].
+    /// As its `Model::build`.
     pub fn new<F: Real>(spec: HexplaneSpec, p: &mut Params<F>) -> Result<Self> {
         spec.check()?;
         let rng = Rng::new(spec.seed, "hexplane", 0);

@@ -185,7 +185,7 @@ impl Model for SsmSpec {
     }
 }
 
-/// Names of the network's learnable column groups: those of Λ and Δ, and all others. Errors: as [`Model::build`].
+/// Names of the network's learnable column groups: those of Λ and Δ, and all others. Errors: as `Model::build`.
 pub fn columns(spec: &SsmSpec) -> Result<(Vec<String>, Vec<String>)> {
     spec.check()?;
     Ok(Net::new(spec, &mut Params::<f32>::new(0, 1, &[]))?.columns())
