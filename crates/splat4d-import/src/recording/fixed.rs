@@ -2,8 +2,9 @@
 
 use crate::sync::grey::Grey;
 use crate::video::{EXAMINED, Frame, Selection, Source};
-use splat4d::Result;
+use crate::{Error, ErrorKind, Result};
 use splat4d::math::median_by;
+use splat4d_train::event::Progress;
 
 /// Shorter side of the examined images, pixels: codecs' noise is averaged out, and an edge is a few pixels wide.
 const SIDE: usize = 240;
@@ -19,13 +20,22 @@ const IN_PLACE: f32 = 0.25;
 const BACKGROUND: f64 = 0.6;
 
 /// Whether one fixed camera recorded the selected part: most of its textured pixels stay in place in all examined frames.
-/// False where that cannot be decided. Errors: those of reading.
-pub(crate) fn is_fixed(source: &dyn Source, selection: &Selection) -> Result<bool> {
+/// False where that cannot be decided. Errors: those of reading; `Interrupted`.
+pub(crate) fn is_fixed(
+    source: &dyn Source,
+    selection: &Selection,
+    progress: &mut Progress<'_>,
+    stop: &dyn Fn() -> bool,
+) -> Result<bool> {
     let selection = Selection { size: Some(SIDE), crop: None, ..selection.clone() };
     let (mut frame, mut images) = (Frame::default(), Vec::new());
     let mut reader = source.frames(&selection.spread(source.info()))?;
     while images.len() < EXAMINED && reader.next(&mut frame)? {
         images.push(Grey::of(&frame.picture));
+        progress.phase("checking that the camera moves", images.len(), EXAMINED);
+        if stop() {
+            return Err(Error::new(ErrorKind::Interrupted, "stopped").remedy("The same command goes on from there."));
+        }
     }
     Ok(stays(&images))
 }

@@ -176,7 +176,8 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
         Rig::Fixed => false,
         Rig::Moving => true,
     };
-    let still = request.rig == Rig::Auto && moving && fixed::is_fixed(&*cameras[0].source, &request.selection)?;
+    let still =
+        request.rig == Rig::Auto && moving && fixed::is_fixed(&*cameras[0].source, &request.selection, progress, stop)?;
     if cameras.len() == 1 && (!moving || still) {
         let why = if still { "the background of the images stays in place: " } else { "" };
         return Err(Error::input(format!("{why}one fixed camera gives no depth"))
