@@ -10,7 +10,7 @@ settings! {
     /// Colour of Gaussians and of cameras' images.
     pub struct AppearanceSettings {
         /// Highest degree of the spherical harmonics, 0 to 3.
-        sh_degree: usize = 1 => within(0, 3);
+        sh_degree: usize = 2 => within(0, 3);
         /// Iterations before each further SH degree is unlocked; 0: iterations/10.
         sh_degree_interval: usize = 0 => any().unit("iterations").when(On("appearance.sh_degree"));
         /// Learn a colour matrix and an offset per camera, if there are several cameras and each is named or has
@@ -29,10 +29,11 @@ settings! {
 settings! {
     /// Learning rates of parameters that all Gaussians have.
     pub struct RateSettings {
-        /// Rate of positions at the start, of the extent; 0: 0.002, and less in proportion if `densify.max_cap` is above
-        /// 30,000.
+        /// Rate of positions at the start, of the extent; 0: 0.001, and less in proportion if `densify.max_cap` is above
+        /// 60,000.
         position_init: f64 = 0.0 => any().unit("extents");
-        /// Rate of positions at the end, of the extent; 0: 0.00005, and less in the same way.
+        /// Rate of positions at the end, of the extent; 0: 0.0001, and less in proportion if `densify.max_cap` is above
+        /// 30,000.
         position_final: f64 = 0.0 => any().unit("extents");
         /// Share to which rates without a final value (colour, opacity, scale, rotation, lifespan) decay.
         decay: f64 = 1.0 => positive();
@@ -40,10 +41,10 @@ settings! {
         // on seven captures together with the fall at the end (studies/records/2026-11-27-rates.md).
         /// Share of the steps at the end over which all rates fall to a tenth; 0: they do not.
         settle: f64 = 0.15 => share();
-        /// Rate of base colour; higher SH degrees learn 20 times more slowly.
+        /// Rate of base colour; higher SH degrees learn 5 times more slowly.
         feature: f64 = 0.012 => positive();
         /// Rate of opacity logits.
-        opacity: f64 = 0.05 => positive();
+        opacity: f64 = 0.1 => positive();
         /// Rate of log scales.
         scaling: f64 = 0.03 => positive();
         /// Rate of quaternions.
@@ -52,8 +53,10 @@ settings! {
 }
 
 /// Rates of positions at the start and at the end for up to [`LEAST`] Gaussians, of the extent. Kerbl et al. 2023 use 1.6e-4
-/// and 1.6e-6 for runs of 30,000 steps; ours are several times shorter. Stated before and not measured against them.
-const POSITIONS: [f64; 2] = [2e-3, 5e-5];
+/// and 1.6e-6 for runs of 30,000 steps; ours are several times shorter (studies/records/2026-11-27-optimiser.md).
+const POSITIONS: [f64; 2] = [2e-3, 1e-4];
+/// Highest rate at the start: twice as much loses 0.2 dB with few Gaussians.
+const FASTEST: f64 = 1e-3;
 /// Lowest share of them, with many Gaussians: the rate of Kerbl et al. 2023, who have some millions.
 const FINEST: f64 = 0.08;
 
@@ -63,14 +66,13 @@ impl RateSettings {
         Rate { start: rate, end: rate * self.decay }
     }
 
-    /// Rates of positions at the start and at the end, of the extent. More Gaussians are smaller and lie closer, and the
-    /// steps of the few throw them about: a real room with 70,000 gains 0.4 dB with a third of the rates, an object with 90,000
-    /// neither gains nor loses (studies/records/2026-11-26-real-size.md).
+    /// Rates of positions at the start and at the end, of the extent. More Gaussians are smaller and lie closer, so that the steps
+    /// of few would scatter them (studies/records/2026-11-26-real-size.md).
     pub(super) fn positions(&self, cap: usize) -> [f64; 2] {
         let share = (LEAST as f64 / cap.max(1) as f64).clamp(FINEST, 1.0);
         let [start, end] = POSITIONS.map(|rate| rate * if cap == 0 { 1.0 } else { share });
         let stated = |rate: f64, by_count: f64| if rate > 0.0 { rate } else { by_count };
-        [stated(self.position_init, start), stated(self.position_final, end)]
+        [stated(self.position_init, start.min(FASTEST)), stated(self.position_final, end)]
     }
 }
 
@@ -84,7 +86,7 @@ settings! {
         /// Rate of lifespan centres, clips.
         center_lr: f64 = 1e-3 => any().unit("clips");
         /// Rate of log lifespan widths.
-        width_lr: f64 = 0.02;
+        width_lr: f64 = 0.04;
         /// Smallest lifespan width, frames.
         min_frames: f64 = 0.5 => any().unit("frames");
     }

@@ -13,8 +13,6 @@ use splat4d::scene::{LifeKind, Params};
 
 /// Scales in time count up to so many clips: a Gaussian is then as good as immortal (0.5 % fainter at the clip's ends).
 const LONGEST_CLIPS: f64 = 10.0;
-/// Colours beyond the base learn this much slower (Kerbl et al. 2023; Yang et al. 2024 for the blocks in time).
-const SH_REST_SLOWDOWN: f64 = 20.0;
 
 settings! {
     /// Settings of `native4d`.
@@ -89,7 +87,7 @@ impl Method for Native4dMethod {
         stage.groups.push(Group::new("log_time_scales", c.rates.falling(c.life.width_lr)));
         if self.native4d.harmonics > 0 {
             let block = 3 * (c.appearance.sh_degree + 1) * (c.appearance.sh_degree + 1);
-            let rate = c.rates.falling(c.rates.feature / SH_REST_SLOWDOWN);
+            let rate = c.rates.falling(c.rates.feature / still::SH_REST_SLOWDOWN);
             stage.groups.push(Group { part: Some((block, block * self.native4d.harmonics)), ..Group::new("sh", rate) });
         }
         if c.loss.opacity_life > 0.0 {

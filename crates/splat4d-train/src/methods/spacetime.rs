@@ -38,7 +38,7 @@ settings! {
         /// Rate of velocities at the start, extents per clip.
         velocity_lr_init: f64 = 0.01 => positive().unit("extents/clip").when(On("spacetime.order"));
         /// Rate of velocities at the end, extents per clip.
-        velocity_lr_final: f64 = 1.6e-5 => positive().unit("extents/clip").when(On("spacetime.order"));
+        velocity_lr_final: f64 = 5e-4 => positive().unit("extents/clip").when(On("spacetime.order"));
         /// Rate of quaternion rates, 1/clip.
         rotation_rate_lr: f64 = 1e-3 => any().unit("1/clip").when(On("spacetime.rotation_rate"));
         /// Features in addition to the base colour, which a small network turns into colour per pixel: none or full

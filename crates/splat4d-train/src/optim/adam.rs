@@ -9,16 +9,20 @@ use splat4d::scene::table::TableMut;
 use splat4d::scene::{BLOCK, Key, Table};
 use splat4d::simd::{Kernel, each};
 
-/// Decay of the first moment (Kingma and Ba 2015).
-const BETA1: f64 = 0.9;
-/// Decay of the second moment.
-const BETA2: f64 = 0.999;
+/// Decay of the first moment. Kingma and Ba use 0.9; a shorter memory follows the few images of a run faster, and Gaussians are born
+/// without one (studies/records/2026-11-27-optimiser.md).
+const BETA1: f64 = 0.8;
+/// Decay of the second moment. Kingma and Ba use 0.999, for longer runs: a Gaussian that is visible in a third of 3,000 steps
+/// would remember the gradients of its first position for good (studies/records/2026-11-27-optimiser.md).
+const BETA2: f64 = 0.99;
+/// Both decays for cameras (poses, focal lengths, time offsets), as Kingma and Ba state them.
+const CAMERA_BETAS: [f64; 2] = [0.9, 0.999];
 /// Added to the root of the second moment (Kerbl et al. 2023 use 1e-15: gradients of single Gaussians are tiny).
 const EPSILON: f64 = 1e-15;
 
 type Lane<F> = [F; BLOCK];
 
-/// c₁ and c₂ by step count, up to the count from which both are 1 for good (some 17,000 in f32: 130 kB).
+/// c₁ and c₂ by step count, up to the count from which both are 1 for good (some 1,700 in f32: 13 kB).
 pub(crate) fn corrections<F: Real>() -> Vec<[F; 2]> {
     let correction = |beta: f64, n: i32| F::of(1.0 / (1.0 - beta.powi(n)));
     // A row that has taken no step is not active; its entry is never used.
@@ -159,11 +163,12 @@ pub(crate) fn step_row<const N: usize>(table: &mut Table<f32>, row: usize, d: [f
     }
     let steps = table.get(row, 3 * N) + 1.0;
     table.set(row, 3 * N, steps);
-    let unbias = [BETA1, BETA2].map(|beta| 1.0 / (1.0 - beta.powi(steps as i32)));
+    let [beta1, beta2] = CAMERA_BETAS;
+    let unbias = CAMERA_BETAS.map(|beta| 1.0 / (1.0 - beta.powi(steps as i32)));
     for k in 0..N {
         let old = |col| f64::from(table.get(row, col));
-        let first = BETA1 * old(N + k) + (1.0 - BETA1) * d[k];
-        let second = BETA2 * old(2 * N + k) + (1.0 - BETA2) * d[k] * d[k];
+        let first = beta1 * old(N + k) + (1.0 - beta1) * d[k];
+        let second = beta2 * old(2 * N + k) + (1.0 - beta2) * d[k] * d[k];
         let value = old(k) - rates[k] * first * unbias[0] / ((second * unbias[1]).sqrt() + EPSILON);
         table.set(row, k, value as f32);
         table.set(row, N + k, first as f32);

@@ -183,9 +183,9 @@ mod tests {
             t.set(3, 1, g);
             t.set(4, 1, 9.0); // not active
             assert!(m.step(&mut p, &mut d, &rates, &[]).is_empty());
-            a = 0.9 * a + 0.1 * g;
-            b = 0.999 * b + 0.001 * g * g;
-            x -= 0.1 * (a / (1.0 - 0.9f64.powi(step))) / ((b / (1.0 - 0.999f64.powi(step))).sqrt() + 1e-15);
+            a = 0.8 * a + 0.2 * g;
+            b = 0.99 * b + 0.01 * g * g;
+            x -= 0.1 * (a / (1.0 - 0.8f64.powi(step))) / ((b / (1.0 - 0.99f64.powi(step))).sqrt() + 1e-15);
             assert!((p[GEOMETRY].get(3, 1) - x).abs() < 1e-12);
             d.clear(&p);
         }
@@ -211,11 +211,11 @@ mod tests {
         for row in (0..p.rows()).filter(|&r| active[r]) {
             *m.get_mut(row, 2 * width) += 1.0;
             let n = m.get(row, 2 * width) as i32;
-            let [c1, c2] = [0.9f64, 0.999].map(|beta| (1.0 / (1.0 - beta.powi(n))) as f32);
+            let [c1, c2] = [0.8f64, 0.99].map(|beta| (1.0 / (1.0 - beta.powi(n))) as f32);
             for c in (0..width).filter(|&c| rates[c] != 0.0) {
                 let g = d.get(row, c);
-                let a = 0.9 * m.get(row, c) + (1.0 - 0.9) * g;
-                let b = 0.999 * m.get(row, width + c) + (1.0 - 0.999) * g * g;
+                let a = 0.8 * m.get(row, c) + (1.0 - 0.8) * g;
+                let b = 0.99 * m.get(row, width + c) + (1.0 - 0.99) * g * g;
                 let x = p.get(row, c) - rates[c] as f32 * (a * c1) / ((b * c2).sqrt() + 1e-15);
                 m.set(row, c, a);
                 m.set(row, width + c, b);

@@ -8,8 +8,8 @@
 
 const TABLE_BLOCK: u32 = 16u;
 const ROW_THREADS: u32 = 256u;
-const BETA1: f32 = 0.9;
-const BETA2: f32 = 0.999;
+const BETA1: f32 = 0.8;
+const BETA2: f32 = 0.99;
 const EPSILON: f32 = 1e-15;
 const LARGEST: f32 = 3.4028234e38;
 

@@ -19,8 +19,8 @@ const WANTED: u32 = 4u;
 // Where steps stop because of a number that is none.
 const NOT_FINITE: u32 = 0xffffffffu;
 // Of adam.wgsl.
-const BETA1: f32 = 0.9;
-const BETA2: f32 = 0.999;
+const BETA1: f32 = 0.8;
+const BETA2: f32 = 0.99;
 const EPSILON: f32 = 1e-15;
 
 struct Rule {
