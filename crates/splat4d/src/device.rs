@@ -1,4 +1,4 @@
-//! The device that draws: the GPU where there is one that can, else the CPU, and a sentence that states why.
+//! The device that renders: the GPU where there is one that can, else the CPU, and a sentence that states why.
 
 mod resident;
 #[cfg(test)]
@@ -37,19 +37,19 @@ pub struct Opened {
     pub backend: Box<dyn Backend>,
     /// It in words: of a GPU its driver too.
     pub name: String,
-    /// The device in words; where it is not the one that was asked for, the reason too.
+    /// The device in words; where it is not the requested one, the reason too.
     pub why: String,
-    /// Whether there is no GPU to draw on although one was asked for.
+    /// Whether there is no GPU to render on although one was requested.
     pub fell_back: bool,
 }
 
-/// The renderer of the CPU, which can do everything. It is compiled here, once for all crates that draw through a
+/// The renderer of the CPU, which can do everything. It is compiled here, once for all crates that render through a
 /// [`Backend`].
 pub fn cpu(config: RenderConfig) -> Box<dyn Backend> {
     Box::new(Renderer::new(config))
 }
 
-/// The device that was asked for, if it has the abilities in `wanted`, or else the CPU.
+/// The requested device, if it has the abilities in `wanted`, or else the CPU.
 pub fn open(device: Device, config: RenderConfig, wanted: &Wanted, tables: Tables) -> Opened {
     if device == Device::Cpu {
         let why = format!("drawing on {CPU}");
@@ -66,7 +66,7 @@ fn or_cpu(config: RenderConfig, gpu: Result<(Box<dyn Backend>, String)>) -> Open
     }
 }
 
-/// The device that was asked for, with the CPU next to it: what the GPU cannot draw is drawn by the CPU, image by
+/// The requested device, with the CPU next to it: what the GPU cannot render is rendered by the CPU, image by
 /// image,
 /// and a GPU that fails is left for good. Each is reported once ([`Backend::notice`]), and neither is an error.
 pub fn open_to_train(device: Device, config: RenderConfig) -> Opened {
@@ -78,12 +78,12 @@ pub fn open_to_train(device: Device, config: RenderConfig) -> Opened {
     }
 }
 
-/// The CPU instead of the GPU that was asked for.
+/// The CPU instead of the requested GPU.
 pub fn on_cpu(config: RenderConfig, reason: &dyn std::fmt::Display) -> Opened {
     Opened { backend: cpu(config), name: CPU.into(), why: format!("drawing on {CPU}: {reason}"), fell_back: true }
 }
 
-/// Draws. A backend that fails on the way is left for the CPU, which draws instead; its error is returned.
+/// Renders. A backend that fails on the way is left for the CPU, which renders instead; its error is returned.
 pub fn draw(backend: &mut Box<dyn Backend>, shot: &Shot<'_>, out: &mut Image) -> Option<Error> {
     let error = backend.render(shot, out).err()?;
     *backend = cpu(*backend.config());
@@ -101,7 +101,7 @@ struct WithCpu {
     /// What it was refused for.
     refused: Vec<String>,
     notices: Vec<String>,
-    /// Where an image that is drawn again goes.
+    /// Where an image that is rendered again goes.
     again: Image,
     name: String,
 }
@@ -120,7 +120,7 @@ impl WithCpu {
         }
     }
 
-    /// The other device, if it is there and can draw a shot and take it back.
+    /// The other device, if it is there and can render a shot and take it back.
     fn able(&mut self, shot: &Shot<'_>) -> Option<&mut Box<dyn Backend>> {
         let other = self.other.as_mut()?;
         match other.can(&Wanted { backward: true, ..shot.wanted() }) {
@@ -233,7 +233,7 @@ const TEST_SIZE: [usize; 2] = [75, 45];
 /// roundings and a splat at the α cut-off, far below any mistake.
 const TRUSTED: [f64; 2] = [0.02, 0.05];
 
-/// Draws a little scene and takes it back, as the CPU does. Errors: something else comes out.
+/// Renders a little scene and takes it back, as the CPU does. Errors: something else comes out.
 #[cfg_attr(not(feature = "gpu"), allow(dead_code))]
 fn trusted(backend: &mut dyn Backend) -> Result<()> {
     let rng = Rng::new(1, "self-test", 0);
@@ -306,8 +306,8 @@ fn gpu(device: Device, config: RenderConfig, wanted: &Wanted, tables: Tables) ->
 #[cfg(feature = "gpu")]
 type SelfTest<'a> = &'a mut dyn FnMut(&mut dyn Backend) -> Result<()>;
 
-/// A renderer that has passed a test, and its name: with subgroups, or else without. Errors: it has passed neither; that of the
-/// first is reported.
+/// A renderer that has passed a test, and its name: with subgroups, or else without. Errors: it has passed neither;
+/// that of the first is reported.
 #[cfg(feature = "gpu")]
 fn to_train(
     open: &dyn Fn() -> Result<Gpu>,

@@ -1,5 +1,5 @@
-//! Plays a scene on the CPU: which Gaussians are alive at a time is looked up, not computed, and a playback file is read
-//! as time demands, within a budget of memory.
+//! Plays a scene on the CPU: which Gaussians are alive at a time is looked up, not computed, and a playback file is
+//! read as time demands, within a budget of memory.
 //!
 //! Like everything here it reads bytes, not paths: a file is whatever implements [`ReadAt`].
 
@@ -194,8 +194,8 @@ impl<'a> Player<'a> {
         Self { file: None, meta, held, head, budget: usize::MAX, shown, bytes_read: 0 }
     }
 
-    /// Plays a playback file of `length` bytes, of which only the index is read now. Pages stay in memory up to `budget`
-    /// bytes; those that one time needs stay in any case.
+    /// Plays a playback file of `length` bytes, of which only the index is read now. Pages stay in memory up to
+    /// `budget` bytes; those that one time needs stay in any case.
     ///
     /// Errors: those of [`Index::parse`] and of the source.
     pub fn open(mut source: Box<dyn ReadAt + Send>, length: u64, budget: usize) -> Result<Self> {
@@ -206,7 +206,7 @@ impl<'a> Player<'a> {
             if needed <= have as u64 {
                 break;
             }
-            // Beyond the end nothing is asked for: what is there states what is wrong with it.
+            // Beyond the end nothing is requested: what is there states what is wrong with it.
             let want = needed.min(length) as usize;
             if want <= have {
                 break;

@@ -25,7 +25,7 @@ pub(crate) const TILES: &str = include_str!("gpu/tiles.wgsl");
 pub(crate) const RANGES: &str = include_str!("gpu/ranges.wgsl");
 /// Blends to colour, alpha and depth. After `PROJECT`.
 pub(crate) const RASTERIZE: &str = include_str!("gpu/rasterize.wgsl");
-/// Planes → 8 bits a channel. After `PROJECT`.
+/// Planes → 8 bits per channel. After `PROJECT`.
 pub(crate) const BYTES: &str = include_str!("gpu/bytes.wgsl");
 /// What both ways back of the blend share. After `PROJECT`.
 pub(crate) const BLEND_BACK: &str = include_str!("gpu/blend_back.wgsl");
@@ -39,7 +39,7 @@ pub(crate) const RASTERIZE_BACK_VECTOR: &str = include_str!("gpu/rasterize_back_
 pub(crate) const RASTERIZE_BACK: &str = include_str!("gpu/rasterize_back.wgsl");
 /// An image compared with its truth: L1, D-SSIM and their gradient: `moments`, `gradient`.
 pub(crate) const LOSS: &str = include_str!("gpu/loss.wgsl");
-/// Learnable rows at time t, and their lives. Reads `params`, which the including shader binds.
+/// Learnable rows at time t, and their lifespans. Reads `params`, which the including shader binds.
 pub(crate) const LEARNT: &str = include_str!("gpu/learnt.wgsl");
 /// Writes a row's gradients. After `LEARNT`.
 pub(crate) const PUT: &str = include_str!("gpu/put.wgsl");

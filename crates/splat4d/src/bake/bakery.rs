@@ -56,7 +56,8 @@ impl Curve {
         self.straight as f64 + self.rate.pieces[PRICES - 1]
     }
 
-    /// Primitives and mean squared error of images (of channels from 0 to 1, the Gaussians' errors taken as independent).
+    /// Primitives and mean squared error of images (of channels from 0 to 1, the Gaussians' errors taken as
+    /// independent).
     pub fn at(&self, of: f64) -> [f64; 2] {
         let place = (of / price(0)).ln() / (price(1) / price(0)).ln();
         let place = place.clamp(0.0, (PRICES - 1) as f64);
@@ -149,7 +150,8 @@ impl<'a> Curved<'a> {
 }
 
 impl<'a> Bakery<'a> {
-    /// A scene that was not sampled yet. Errors: a scene with a pixel head; options out of range; a clip that is no clip.
+    /// A scene that was not sampled yet. Errors: a scene with a pixel head; options out of range; a clip that is no
+    /// clip.
     pub fn new(scene: &'a Scene<f32>, options: &'a Options) -> Result<Self> {
         scene.without_head("a playback file")?;
         // An endless tolerance is allowed: nothing is split then.
@@ -224,8 +226,8 @@ impl<'a> Bakery<'a> {
         Ok(Some(curve))
     }
 
-    /// Cuts the scene into segments. A price needs what [`measure`](Self::measure) found. `progress` hears how many Gaussians
-    /// of how many are done.
+    /// Cuts the scene into segments. A price needs what [`measure`](Self::measure) found. `progress` hears how many
+    /// Gaussians of how many are done.
     ///
     /// Errors: a model that would become too many primitives. Panics: a price before anything was measured.
     pub fn bake(&self, by: Cut, progress: &mut dyn FnMut(usize, usize)) -> Result<Baked> {
@@ -319,7 +321,8 @@ impl<'a> Bakery<'a> {
     fn refine(&mut self, layers: &[Cow<'_, Layer<f32>>]) -> Result<()> {
         loop {
             let finer = self.tree_of(2.0 * self.tree.rate())?;
-            // Every second sample of the finer tree is one of this tree's: a segment over two of its steps misses the middle.
+            // Every second sample of the finer tree is one of this tree's: a segment over two of its steps misses the
+            // middle.
             let gaussians: usize = layers.iter().filter(|l| self.is_split(l)).map(|l| l.params.len()).sum();
             if finer.frames() < 2 * self.tree.frames() - 1 || gaussians * finer.frames() > REFINED {
                 return Ok(());
@@ -383,7 +386,7 @@ impl<'a> Bakery<'a> {
                     own: curved.frame.shape(&learnt(&layer.params[GEOMETRY].read::<11>(row.id, 0))),
                     colors: (curved.colors == 0).then(|| curved.frame.colors(sample::own_colors(layer, row.id))),
                 };
-                // Colours that are not finite would show as black; what cannot be drawn is left out.
+                // Colours that are not finite would show as black; what cannot be rendered is left out.
                 if !subject.colors.is_none_or(|c| c.iter().all(|x| x.is_finite())) {
                     return Vec::new();
                 }

@@ -1,4 +1,4 @@
-//! One Gaussian becomes pieces: straight lines in the deepest nodes that hold its life, halved where they miss.
+//! One Gaussian becomes pieces: straight lines in the deepest nodes that hold its lifespan, halved where they miss.
 
 use super::life::Envelope;
 use super::sample::{GEOMETRY, Row, Samples};
@@ -29,7 +29,7 @@ pub(super) const COLORS: usize = 3 * MAX_COEFFS;
 pub(super) struct Piece {
     /// The node.
     pub span: Span,
-    /// The primitive drawn there.
+    /// The primitive rendered there.
     pub primitive: Primitive,
     /// Largest error over its frames, pixels.
     pub error: f64,
@@ -40,7 +40,7 @@ pub(super) struct Piece {
 pub(super) struct Fitter<'a> {
     pub tree: &'a Tree,
     pub sampling: &'a Lookout,
-    /// Errors of shape and life that need not be improved, pixels.
+    /// Errors of shape and lifespan that need not be improved, pixels.
     pub tolerance: f64,
     /// Largest error that is not split further, pixels.
     pub accepted: f64,
@@ -76,7 +76,7 @@ impl Fitter<'_> {
         out
     }
 
-    /// Goes down while one half holds all that is to be seen, then fits; a miss goes on in both halves.
+    /// Goes down while one half holds all that is to be seen, then fits; a miss continues in both halves.
     fn place(&self, subject: &Subject<'_>, span: Span, out: &mut Vec<Piece>) {
         match narrow(self.tree, subject.row.seen, span) {
             Place::Nowhere => return,
@@ -92,8 +92,8 @@ impl Fitter<'_> {
         }
     }
 
-    /// The best primitive of a node, and its error in pixels. None: not one look is finite, or the node is split whatever its
-    /// shape is.
+    /// The best primitive of a node, and its error in pixels. None: not one look is finite, or the node is split
+    /// whatever its shape is.
     fn fit(&self, subject: &Subject<'_>, span: Span) -> Option<(Primitive, f64)> {
         let looks = self.looks(subject, span);
         let single = span[1] - span[0] == 1;
@@ -148,8 +148,8 @@ impl Fitter<'_> {
         sound.then_some((primitive, error))
     }
 
-    /// The shape of the looks that a piece is held to. That of a single frame turns on to the next one's, so that what is
-    /// seen between them is whole, where it then misses its own by no more than is allowed, and both by less.
+    /// The shape of the looks that a piece is held to. That of a single frame turns on to the next one's, so that what
+    /// is seen between them is whole, where it then misses its own by no more than is allowed, and both by less.
     fn shape(
         &self,
         subject: &Subject<'_>,
@@ -192,7 +192,7 @@ impl Fitter<'_> {
         [subject.row.seen[0].max(self.tree.border(span[0])), subject.row.seen[1].min(self.tree.border(span[1]))]
     }
 
-    /// Envelope and opacity: the life as it was learnt, or, where that is not what is seen, a constant.
+    /// Envelope and opacity: the lifespan as it was learnt, or, where that is not what is seen, a constant.
     fn life(&self, subject: &Subject<'_>, span: Span, looks: &[FrameSample]) -> (Envelope, f64) {
         let [from, to] = [self.tree.border(span[0]), self.tree.border(span[1])];
         let still = Envelope::forever(0.5 * (from + to));
@@ -238,8 +238,8 @@ impl Fitter<'_> {
     }
 }
 
-/// An envelope about the strongest look that falls as the looks do: σ = exp(−½y²), y = (x − h)/s beyond h, is a line through
-/// √(−2 ln(α/α_max)).
+/// An envelope about the strongest look that falls as the looks do: σ = exp(−½y²), y = (x − h)/s beyond h, is a line
+/// through √(−2 ln(α/α_max)).
 fn tail(looks: &[FrameSample]) -> Option<(Envelope, f64)> {
     /// Looks at which next to nothing has fallen yet, or next to nothing is left, say little of the slope.
     const TELLING: std::ops::Range<f64> = 0.02..0.98;
@@ -381,11 +381,11 @@ pub(super) fn home(tree: &Tree, seen: [f64; 2]) -> Option<Span> {
 pub(super) fn seen(tree: &Tree, [from, to]: [f64; 2]) -> Option<[f64; 2]> {
     let clip = tree.clip();
     let seen = [from.max(clip[0]), to.min(clip[1])];
-    // NaN compares as never: such rows are not drawn by the renderer either.
+    // NaN compares as never: such rows are not rendered by the renderer either.
     (from <= to && seen[0] <= seen[1]).then_some(seen)
 }
 
-/// A Gaussian as faint as this is not drawn at any time.
+/// A Gaussian as faint as this is not rendered at any time.
 pub(super) fn is_visible(opacity: f64) -> bool {
     opacity >= ALPHA_MIN
 }

@@ -1,4 +1,4 @@
-//! Every kind of life as the file's one envelope.
+//! Every kind of lifespan as the file's one envelope.
 
 use crate::layers::Layer;
 use crate::scene::life::{CENTER, LOG_SOFTNESS, LOG_WIDTH};
@@ -37,7 +37,7 @@ impl Envelope {
     }
 }
 
-/// The lives of a layer's Gaussians.
+/// The lifespans of a layer's Gaussians.
 pub(super) struct Lives<'a> {
     table: std::borrow::Cow<'a, Table<f32>>,
     kind: LifeKind,

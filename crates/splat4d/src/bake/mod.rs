@@ -8,7 +8,8 @@
 //! [`Cut`] decides where to split: [`bake`] splits every segment that misses by more than a tolerance in pixels.
 //! [`Bakery`] knows the curve of segments and image error (`rate.rs`), so that a budget can be met.
 //!
-//! The model is sampled in runs of rows, each at all its frames, so that memory does not grow with frames times Gaussians.
+//! The model is sampled in runs of rows, each at all its frames, so that memory does not grow with frames times
+//! Gaussians.
 
 mod bakery;
 mod compare;
@@ -48,7 +49,7 @@ pub const MAX_REPEAT: usize = 10_000;
 /// Default of [`Options::renders`]: as many as pay off.
 pub(crate) const RENDERS: usize =
     if weights::STILL_RENDERS > weights::PATH_RENDERS { weights::STILL_RENDERS } else { weights::PATH_RENDERS };
-/// Default of [`Options::samples`]: 30,000 Gaussians at 27 seconds of 30 frames a second.
+/// Default of [`Options::samples`]: 30,000 Gaussians at 27 seconds of 30 frames per second.
 pub(crate) const SAMPLES: usize = 24_000_000;
 
 /// Options of baking.
@@ -95,7 +96,7 @@ impl Default for Options {
 /// A baked scene.
 #[derive(Clone, Debug)]
 pub struct Baked {
-    /// Primitives by the span in which they are drawn; spans rise, longer ones first.
+    /// Primitives by the span in which they are rendered; spans rise, longer ones first.
     pub nodes: Vec<Node>,
     /// First and last second, all rounds.
     pub clip: [f64; 2],

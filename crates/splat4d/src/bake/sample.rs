@@ -68,7 +68,7 @@ impl Framed {
 pub(super) struct Samples {
     /// The rows, ids rising.
     pub rows: Vec<Row>,
-    /// Numbers a look.
+    /// Numbers per look.
     width: usize,
     data: Vec<f32>,
 }

@@ -15,12 +15,12 @@ use crate::scene::{GEOMETRY, Key};
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Line {
     velocities: Option<Key>,
-    /// Origin of Δ for Gaussians that live for ever.
+    /// Origin of Δ for Gaussians that have infinite lifespans.
     origin: f64,
 }
 
 impl Line {
-    /// The layer's motion, where it is straight and its opacities are those of its lives.
+    /// The layer's motion, where it is straight and its opacities are those of its lifespans.
     pub(super) fn of(layer: &Layer<f32>) -> Option<Self> {
         let motion = layer.motion.polynomial().filter(|p| p.is_straight() && !layer.cross_fades())?;
         Some(Self { velocities: motion.velocities, origin: motion.origin })

@@ -66,7 +66,8 @@ pub(super) fn bounded(primitives: usize) -> Result<()> {
         .remedy("Raise --tolerance, or bake a shorter clip or fewer Gaussians."))
 }
 
-/// A layer of a playback file: pieces already, which stay as they are in their span. Their importance is not in the file.
+/// A layer of a playback file: pieces already, which stay as they are in their span. Their importance is not in the
+/// file.
 pub(super) fn page(layer: &Layer<f32>, sampling: &Lookout, tally: &mut Tally) -> Result<Option<Node>> {
     let mut all = primitives(layer);
     let before = all.len();
@@ -91,7 +92,7 @@ pub(super) fn page(layer: &Layer<f32>, sampling: &Lookout, tally: &mut Tally) ->
 pub(super) fn cut(mut node: Node, [first, last]: [f64; 2]) -> Option<Node> {
     let (from, to) = (node.from.max(first), node.to.min(last));
     if [from, to] != [node.from, node.to] {
-        // What lives for ever counts from the middle, so that nothing is far from where it was rounded.
+        // What has an infinite lifespan counts from the middle, so that nothing is far from where it was rounded.
         let middle = 0.5 * (from + to);
         for p in node.primitives.iter_mut().filter(|p| p.half_width == f64::INFINITY && p.turn == [0.0; 3]) {
             (0..3).for_each(|k| p.mean[k] += f64::from(p.velocity[k]) * (middle - p.center));
@@ -102,8 +103,8 @@ pub(super) fn cut(mut node: Node, [first, last]: [f64; 2]) -> Option<Node> {
     (from < to).then_some(node)
 }
 
-/// Nodes by their beginning; of those that begin together the longest, which holds the others, comes first. Those of one
-/// span are one.
+/// Nodes by their beginning; of those that begin together the longest, which holds the others, comes first. Those of
+/// one span are one.
 pub(super) fn in_order(mut nodes: Vec<Node>) -> Vec<Node> {
     nodes.sort_by(|a, b| a.from.total_cmp(&b.from).then(b.to.total_cmp(&a.to)));
     let mut out: Vec<Node> = Vec::with_capacity(nodes.len());

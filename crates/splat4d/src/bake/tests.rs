@@ -331,7 +331,7 @@ fn odd_scenes_bake_or_are_refused() {
         sick.params[LIFE].set(6, 0, f32::NAN);
         sick.params[LIFE].set(7, 1, f32::NAN);
         sick.params[SH].set(8, 2, f32::NAN);
-        // Not sick, but odd: a life without end, one without length, and a leap out of all numbers.
+        // Not sick, but odd: a lifespan without end, one without length, and a leap out of all numbers.
         sick.params[LIFE].set(9, 1, 300.0);
         sick.params[LIFE].set(10, 1, -300.0);
         let velocities = sick.params.find(VELOCITIES).unwrap();
@@ -365,7 +365,8 @@ fn a_file_is_as_good_and_can_be_baked_again() {
     let times: Vec<f64> = (0..57).step_by(5).map(|k| f64::from(k) / FPS).collect();
     let like = |file: &Scene<f32>| like_at(file, &times);
     let played = file(&first);
-    // A held-out view may be before the first training frame or after the last one, where a player shows the clip's ends.
+    // A held-out view may be before the first training frame or after the last one, where a player shows the clip's
+    // ends.
     let beyond = like_at(&played, &[scene.clip[0] - 0.5, scene.clip[1] + 0.5]);
     assert!(beyond.worst_psnr > 38.0, "{beyond:?}");
     assert!(like(&played).psnr > 40.0, "{:?} {:?}", like(&played), likeness(&scene, &first));

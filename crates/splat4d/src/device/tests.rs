@@ -213,8 +213,8 @@ fn a_driver_that_fails_the_self_test_is_tried_without_subgroups_and_left_then() 
     assert_eq!(opened.why, first, "what failed first is told");
 }
 
-/// Largest difference of a value from the oracle's, of the largest depth for depth: a splat at the α cut-off may be drawn by
-/// one backend only, which is 1/255 of what is left of the light there.
+/// Largest difference of a value from the oracle's, of the largest depth for depth: a splat at the α cut-off may be
+/// rendered by one backend only, which is 1/255 of what is left of the light there.
 const PIXEL: f64 = 5e-3;
 /// Largest root of the mean square of the differences: f32 against f64, and a few such splats.
 const RMS: f64 = 2e-4;
@@ -278,7 +278,7 @@ impl<F: Real> Scene<F> {
         }
     }
 
-    /// The image of a backend, if it can draw it.
+    /// The image of a backend, if it can render it.
     fn drawn(&self, backend: &mut dyn Backend<F>, camera: &Camera, sh_degree: usize, depth: bool) -> Option<Image<F>> {
         let sh = Color::Sh { table: &self.sh, rows: Rows::All, weights: None, base: true };
         // Harmonics in axes of their own, and in the world's.

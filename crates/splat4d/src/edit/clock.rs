@@ -40,10 +40,10 @@ pub(super) fn seen_in(layer: &Layer<f32>, [from, to]: [f64; 2]) -> usize {
 
 /// The layer on another clock: what it showed at s = rate·t + offset it shows at t.
 ///
-/// Errors: a filter around a model whose motion hangs on its lives.
+/// Errors: a filter around a model whose motion hangs on its lifespans.
 pub(super) fn retime(layer: &mut Layer<f32>, rate: f64, offset: f64) -> Result<()> {
     let outside = |s: f64| (s - offset) / rate;
-    // Before the lives change: models that read them take the same clock in their own tables.
+    // Before the lifespans change: models that read them take the same clock in their own tables.
     layer.motion = retimed(&layer.motion.clone(), rate, offset, layer)?;
     if layer.span != ALWAYS {
         let ends = layer.span.map(outside);
@@ -114,7 +114,7 @@ fn retimed(motion: &Arc<dyn Motion>, rate: f64, offset: f64, layer: &mut Layer<f
     if any.is::<Still>() { Ok(motion.clone()) } else { clocked(motion, rate, offset, layer) }
 }
 
-/// A clock around the model, which must not read the lives that are about to change.
+/// A clock around the model, which must not read the lifespans that are about to change.
 fn clocked(motion: &Arc<dyn Motion>, rate: f64, offset: f64, layer: &mut Layer<f32>) -> Result<Arc<dyn Motion>> {
     if reads_lives(motion.as_ref()) && layer.params[LIFE].width() > 0 {
         return Err(Error::new(ErrorKind::Unsupported, format!("layer `{}` cannot run on another clock", layer.name))

@@ -6,10 +6,10 @@ use crate::scene::Time;
 use crate::scene::time::DEFAULT_FPS;
 use crate::{Error, ErrorKind, Result};
 
-/// Bytes that editing, drawing and baking take at once, in those of the scene's tables: the scene before and after a step, and
-/// what a playback file is made of, 450 bytes a Gaussian where a table has 60 to 250.
+/// Bytes that editing, rendering and baking take at once, in those of the scene's tables: the scene before and after a
+/// step, and what a playback file is made of, 450 bytes per Gaussian where a table has 60 to 250.
 const WORKING: u64 = 8;
-/// Most frames of a clip: nine hours at 30 a second. Drawing, baking and sequences go through them.
+/// Most frames of a clip: nine hours at 30 a second. Rendering, baking and sequences go through them.
 const MOST_FRAMES: f64 = 1e6;
 /// Most changes around a model, each inside the next: readers of JSON take a hundred and some levels.
 const MOST_NESTED: usize = 40;
@@ -63,8 +63,8 @@ pub(super) fn check_room(size: Size, context: &dyn Context) -> Result<()> {
     Err(Error::new(ErrorKind::Memory, what).remedy("Leave the step out, or delete Gaussians before it"))
 }
 
-/// Refuses steps that surely outgrow memory before the first of them is taken: copies of everything double a scene until a step
-/// removes something. Errors: which step, counted from `before`.
+/// Refuses steps that surely outgrow memory before the first of them is taken: copies of everything double a scene
+/// until a step removes something. Errors: which step, counted from `before`.
 pub(super) fn check_growth(before: usize, steps: &[Step], scene: &Scene<f32>, context: &dyn Context) -> Result<()> {
     let mut size = Size::of_all(&scene.layers);
     for (i, step) in steps.iter().enumerate() {

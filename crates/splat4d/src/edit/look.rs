@@ -1,4 +1,4 @@
-//! Selections evaluated over time: every Gaussian is examined at some times of its own life.
+//! Selections evaluated over time: every Gaussian is examined at some times of its own lifespan.
 
 use super::select::Expr;
 use super::{Context, Mask};
@@ -11,7 +11,7 @@ use crate::scene::splats::{COV, SPLAT_OPACITY};
 use crate::scene::{Camera, Color, GEOMETRY, Rows, Space, Table, Time, features, labels};
 use crate::{Error, Result};
 
-/// Times at which a Gaussian is examined, at most, evenly over its life: a bit each.
+/// Times at which a Gaussian is examined, at most, evenly over its lifespan: a bit each.
 const LOOKS: usize = 8;
 /// Times of the clip at which neighbours are sought.
 const NEIGHBOUR_LOOKS: usize = 8;
@@ -53,7 +53,7 @@ type Query<'a> = (Time, &'a (Vec<u32>, Vec<u8>));
 type Bits = Vec<Vec<u8>>;
 
 impl Looks {
-    /// Looks spread over lives, on frames.
+    /// Looks spread over lifespans, on frames.
     fn over_lives(scene: &Scene<f32>, expr: &Expr) -> Self {
         let fps = if scene.fps > 0.0 && scene.fps.is_finite() { scene.fps } else { crate::scene::time::DEFAULT_FPS };
         let [start, end] = scene.clip;
@@ -68,7 +68,7 @@ impl Looks {
             let mut count = vec![1; seen.len()];
             for (row, [from, to]) in seen.iter().enumerate().filter(|(_, [from, to])| from <= to) {
                 let (first, last) = (frame(*from).ceil() as usize, frame(*to).floor() as usize);
-                // A life between two frames is examined at the nearer one.
+                // A lifespan between two frames is examined at the nearer one.
                 let (first, last) =
                     if first > last { [frame(0.5 * (from + to)).round() as usize; 2].into() } else { (first, last) };
                 let looks = LOOKS.min(last - first + 1);

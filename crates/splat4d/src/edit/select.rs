@@ -1,7 +1,7 @@
 //! Selections: what an edit is about, in words that hold for any scene.
 //!
-//! `box(-1,-1,0, 1,1,2) and not color(0,0.6,0, 0.2)`: predicates of places, looks and lives, never row numbers, so that a
-//! selection finds the same thing again after the scene was trained again. See docs/edit.md for the list.
+//! `box(-1,-1,0, 1,1,2) and not color(0,0.6,0, 0.2)`: predicates of places, looks and lifespans, never row numbers, so
+//! that a selection finds the same thing again after the scene was trained again. See docs/edit.md for the list.
 
 use crate::math::quat;
 use crate::math::se3::{mat_vec, sub, transpose};
@@ -35,7 +35,7 @@ pub enum Expr {
     Size(f64, f64),
     /// Seconds of the clip in which it can be seen.
     Life(f64, f64),
-    /// Scene units a second.
+    /// Scene units per second.
     Speed(f64, f64),
     /// Name of a layer.
     Layer(String),
@@ -53,7 +53,7 @@ pub enum Expr {
     Subject,
     /// What holds at that second.
     At(f64, Box<Expr>),
-    /// What holds at any time of a Gaussian's life.
+    /// What holds at any time of a Gaussian's lifespan.
     Ever(Box<Expr>),
     /// What holds at all of them.
     Always(Box<Expr>),

@@ -1,11 +1,11 @@
-//! Points that are asked for and followed: a pixel of an image, or a place in the world, through all times, with what a
+//! Points that are requested and followed: a pixel of an image, or a place in the world, through all times, with what a
 //! camera sees of it.
 //!
-//! A pixel belongs to the Gaussians that it shows: the eight heaviest α_i T_i at about the depth of the one at which half of
-//! the pixel's weight is reached (what a translucent edge lets through behind it has another motion), and its point is on
-//! the pixel's ray at that depth. A place belongs to the Gaussians nearest to it. They carry the point on by their mean
-//! displacement; where half of them have died, the nearest that live on take over, so that points are followed through
-//! models with short lifespans, at the price of the drift of an integration.
+//! A pixel belongs to the Gaussians that it shows: the eight heaviest α_i T_i at about the depth of the one at which
+//! half of the pixel's weight is reached (what a translucent edge lets through behind it has another motion), and its
+//! point is on the pixel's ray at that depth. A place belongs to the Gaussians nearest to it. They carry the point on
+//! by their mean displacement; where half of them have died, the nearest that live on take over, so that points are
+//! followed through models with short lifespans, at the price of the drift of an integration.
 
 use super::tracks::Member;
 use crate::layers::{Evaluation, Scene};
@@ -39,7 +39,7 @@ pub enum Place {
 /// A point to follow.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Query {
-    /// When it is where it is asked for, seconds.
+    /// When it is where it is requested, seconds.
     pub time: f64,
     /// Where.
     pub place: Place,
@@ -343,7 +343,8 @@ mod tests {
     use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
     use crate::scene::{GEOMETRY, LIFE, LifeKind, Params};
 
-    /// A wall of 24x24 discs at depth z, `wide` across, that moves; of every place a chain of Gaussians of `life` seconds.
+    /// A wall of 24x24 discs at depth z, `wide` across, that moves; of every place a chain of Gaussians of `life`
+    /// seconds.
     fn wall(z: f64, wide: f64, velocity: [f64; 3], life: Option<f64>) -> Layer<f32> {
         const SIDE: usize = 24;
         let births: Vec<f64> = life.map_or(vec![0.5], |l| (0..=(1.0 / l) as usize).map(|i| i as f64 * l).collect());

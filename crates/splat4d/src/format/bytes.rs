@@ -95,8 +95,8 @@ pub(super) fn dc_of_byte(byte: u8) -> f32 {
     (f32::from(byte) / 255.0 - 0.5) / SH_C0
 }
 
-/// Rows without NaN or infinity in geometry, colour and life: one such number would spoil a whole block of a quantised
-/// file. Says how many were left out.
+/// Rows without NaN or infinity in geometry, colour and lifespan: one such number would spoil a whole block of a
+/// quantised file. Says how many were left out.
 pub(super) fn sound_rows(params: &Params, warnings: &mut Warnings) -> Vec<usize> {
     let finite = |row: usize| {
         [GEOMETRY, SH, LIFE].into_iter().all(|key| {

@@ -1,7 +1,7 @@
 //! Gaussians of FreeTimeGS (Wang et al. 2025) as FreeTimeGsVanilla stores them, in checkpoints and `.ftgs.ply`.
 //!
-//! On a clock from 0 (first frame) to 1 (last frame): μ(t) = μ + v (t − c), opacity · exp(−½((t − c)/e^d)²), e^d at least
-//! 0.02. All else is 3DGS with spherical harmonics. Files do not state seconds: 30 frames a second are assumed.
+//! On a clock from 0 (first frame) to 1 (last frame): μ(t) = μ + v (t − c), opacity · exp(−½((t − c)/e^d)²), e^d at
+//! least 0.02. All else is 3DGS with spherical harmonics. Files do not state seconds: 30 frames per second are assumed.
 //! Source: OpsiClear-4DGS/FreeTimeGsVanilla, README, "FTGS PLY layout, version 1".
 
 use super::dialect::Y_DOWN;

@@ -3,8 +3,9 @@
 //! Metadata `splat4d` holds JSON: version, clip, fps, up, background, head, `labels` (names) where Gaussians have some,
 //! `offset` (world coordinates of the scene's origin) where it is not zero, and a list of layers with name, rows, SH
 //! coefficients, life and motion, `frame` where the layer's axes are not the world's, and
-//! `cross_fade` (seconds at the span's beginning and end) where it fades. Every column group of every table is one row-major array: `layers.0.means` `[N,3]`,
-//! `layers.0.quats` `[N,4]` wxyz, `layers.0.sh` `[N,K,3]`, `layers.0.velocities` `[N,3·order]` … Seconds and scene units.
+//! `cross_fade` (seconds at the span's beginning and end) where it fades. Every column group of every table is one
+//! row-major array: `layers.0.means` `[N,3]`, `layers.0.quats` `[N,4]` wxyz, `layers.0.sh` `[N,K,3]`,
+//! `layers.0.velocities` `[N,3·order]` … Seconds and scene units.
 
 use super::arrays::MASKS;
 use super::safetensors::{Dtype, SafeTensors, Tensor, checksum, header, sealed};
@@ -105,7 +106,8 @@ pub fn spec_to_json(spec: &Spec) -> Value {
     }
 }
 
-/// A motion model's spec from JSON. Errors: a model that this version does not know, or a field that is missing or wrong.
+/// A motion model's spec from JSON. Errors: a model that this version does not know, or a field that is missing or
+/// wrong.
 pub fn spec_from_json(v: &Value) -> Result<Spec> {
     let model = text(v, "model")?;
     if v["custom"].as_bool() == Some(true) {
@@ -133,8 +135,8 @@ pub fn arrays(scene: &Scene<f32>) -> Vec<super::arrays::Array> {
     scene.layers.iter().enumerate().flat_map(|(i, l)| params_to_arrays(&format!("layers.{i}."), &l.params)).collect()
 }
 
-/// The masks of a scene's layers, ready to be written (also into a checkpoint): `layers.i.masks`, u32 [keys, ⌈rows/32⌉],
-/// row i is bit i % 32 of word i / 32. Their times are in the metadata.
+/// The masks of a scene's layers, ready to be written (also into a checkpoint): `layers.i.masks`, u32 [keys,
+/// ⌈rows/32⌉], row i is bit i % 32 of word i / 32. Their times are in the metadata.
 pub fn masks(scene: &Scene<f32>) -> Vec<Tensor<'_>> {
     fn of((i, layer): (usize, &Layer<f32>)) -> Option<Tensor<'_>> {
         let m = layer.masks.as_deref()?;
@@ -173,8 +175,8 @@ fn check(scene: &Scene<f32>) -> Result<()> {
     Ok(())
 }
 
-/// Writes a scene whose layers do not fit into memory together: the bytes of [`write()`]. `scene` has no layers; `layer` is
-/// asked for each of the `count` twice.
+/// Writes a scene whose layers do not fit into memory together: the bytes of [`write()`]. `scene` has no layers;
+/// `layer` is requested each of the `count` twice.
 ///
 /// Errors: those of `layer`, the sink's. Panics: `scene` has layers; `layer` answers twice differently, or with masks.
 pub fn write_by_layer(

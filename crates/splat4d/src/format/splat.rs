@@ -1,4 +1,4 @@
-//! `.splat`: 32 bytes a Gaussian and nothing else, not even a magic number.
+//! `.splat`: 32 bytes per Gaussian and nothing else, not even a magic number.
 //!
 //! position 3×f32, **linear** scale 3×f32, colour rgb u8 (½ + C0·f_dc, no view dependence), opacity u8, quaternion wxyz
 //! 4×u8 with (b − 128)/128. World axes as in .ply: y down. Source: antimatter15/splat (MIT).
@@ -24,7 +24,7 @@ pub const DIALECT: Dialect = Dialect {
     world: false,
 };
 
-/// Bytes a Gaussian.
+/// Bytes per Gaussian.
 pub(crate) const ROW: usize = 32;
 /// A linear scale of zero or below is read as this: no logarithm, and nothing to see either.
 const SMALLEST_SCALE: f32 = 1e-30;

@@ -1,11 +1,12 @@
-//! Just enough of zip for `.sog`, `.npz` and `.usdz`: stored and deflated files, named in the central directory, are read;
-//! stored ones are written.
+//! Just enough of zip for `.sog`, `.npz` and `.usdz`: stored and deflated files, named in the central directory, are
+//! read; stored ones are written.
 //!
-//! [`Archive::open`] reads the directory alone and refuses files whose bytes overlap; a file is inflated when it is asked for,
-//! up to the length that its format needs. An archive of 200 kB whose files share one body would otherwise become 200 GB.
+//! [`Archive::open`] reads the directory alone and refuses files whose bytes overlap; a file is inflated when it is
+//! requested, up to the length that its format needs. An archive of 200 kB whose files share one body would otherwise
+//! become 200 GB.
 //!
-//! Source: PKWARE's APPNOTE 6.3.10, sections 4.3 and 4.4. Own code, because a general crate brings ciphers and ten other
-//! compressions, and this is a page.
+//! Source: PKWARE's APPNOTE 6.3.10, sections 4.3 and 4.4. Own code, because a general crate brings ciphers and ten
+//! other compressions, and this is a page.
 
 use super::bytes::Cursor;
 use crate::{Error, ErrorKind, Result};

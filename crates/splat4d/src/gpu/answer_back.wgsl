@@ -1,9 +1,10 @@
-// From the gradients of a layer's splats to those of its rows. Twin of Motion::backward for `still`, `spacetime` and a frame of
-// `tracked`, of the life's VJP in layers/envelope.rs; learnt.wgsl and put.wgsl are put in front of this file.
+// From the gradients of a layer's splats to those of its rows. Twin of Motion::backward for `still`, `spacetime` and a
+// frame of `tracked`, of the lifespan's VJP in layers/envelope.rs; learnt.wgsl and put.wgsl are put in front of this
+// file.
 //
-// Bindings, group 0: 0 ask; 1 counts ([3]: stopped); 2 params; 3 back as colors_back.wgsl left it (mean, opacity; covariance);
-// out: 4 d_params, laid out as params: overwritten by the step's first view, added to by the others. Four storage buffers.
-// A thread owns one row.
+// Bindings, group 0: 0 ask; 1 counts ([3]: stopped); 2 params; 3 back as colors_back.wgsl left it (mean, opacity;
+// covariance); out: 4 d_params, laid out as params: overwritten by the step's first view, added to by the others. Four
+// storage buffers. A thread owns one row.
 
 @group(0) @binding(0) var<uniform> ask: Ask;
 @group(0) @binding(1) var<storage, read> counts: array<u32>;

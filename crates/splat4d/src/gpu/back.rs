@@ -28,7 +28,7 @@ const CHUNK: usize = 1024;
 /// What came back, splat by splat; memory is reused from call to call.
 #[derive(Debug, Default)]
 pub(super) struct Returned {
-    /// 0: not drawn.
+    /// 0: not rendered.
     pub radii: Vec<f32>,
     /// Of which the CPU's half of the backward pass looks at the radius alone.
     projected: Vec<Projected<f32>>,
@@ -75,7 +75,7 @@ pub(super) enum End {
 }
 
 impl GpuRenderer {
-    /// Compiles the kernels of the backward pass, and draws so that its records have room. Errors: the driver
+    /// Compiles the kernels of the backward pass, and renders so that its records have room. Errors: the driver
     /// refuses one.
     pub fn for_training(&mut self) -> Result<()> {
         // Lists may grow by a share more than they need; behind the records are a few sums.
@@ -221,7 +221,7 @@ impl GpuRenderer {
         }
     }
 
-    /// Takes one band back; `again`: it must be listed and drawn again; `last`: with what came of the splats.
+    /// Takes one band back; `again`: it must be listed and rendered again; `last`: with what came of the splats.
     fn return_band(
         &self,
         (band, pairs): (Band, usize),
@@ -241,7 +241,7 @@ impl GpuRenderer {
         self.come_back(recorder, (band, pairs), across, end, layout)
     }
 
-    /// The backward pass of a band whose lists, planes and gradient are at hand after what `recorder` holds, and the
+    /// The backward pass of a band whose lists, planes and gradient are available after what `recorder` holds, and the
     /// reading of
     /// what comes of it. `pairs`: so many at most.
     pub(super) fn come_back(

@@ -139,23 +139,23 @@ pub(super) struct Buffers {
     pub pair_values: [Grown; 2],
     /// Splat and quadrants of a pair, by its number.
     pub owners: Grown,
-    /// Three numbers a tile.
+    /// Three numbers per tile.
     pub ranges: Grown,
     /// Five planes.
     pub planes: Grown,
-    /// A pixel in 8 bits a channel.
+    /// A pixel in 8 bits per channel.
     pub bytes: Grown,
     /// Gradient to the planes.
     pub d_planes: Grown,
     /// Nine planes of the loss.
     pub maps: Grown,
-    /// Sixteen numbers a tile of the loss.
+    /// Sixteen numbers per tile of the loss.
     pub partials: Grown,
-    /// Twelve sums a pair, then three a tile.
+    /// Twelve sums a pair, then three per tile.
     pub records: Grown,
     /// Twelve a splat.
     pub sums: Grown,
-    /// Twenty numbers a splat for the CPU.
+    /// Twenty numbers per splat for the CPU.
     pub back: Grown,
     /// Six a workgroup.
     pub cameras: Grown,

@@ -1,11 +1,11 @@
-// From the gradient to a splat's colour to those of its SH coefficients and, through the direction, of its mean; and what
-// densification wants to know of it. Twin of the VJP in render/shade.rs and of Stats::observe in splat4d-train's learner.rs;
-// render/project.wgsl, render/shade.wgsl and learnt.wgsl are put in front of this file.
+// From the gradient to a splat's colour to those of its SH coefficients and, through the direction, of its mean; and
+// what densification wants to know of it. Twin of the VJP in render/shade.rs and of Stats::observe in splat4d-train's
+// learner.rs; render/project.wgsl, render/shade.wgsl and learnt.wgsl are put in front of this file.
 //
-// Bindings, group 0: 0 view; 1 ask; 2 counts ([3]: stopped); 3 geometry as answer.wgsl wrote it, 4 params: here the SH table; in and
-// out: 5 back as splats_back.wgsl wrote it, whose means are added to; 6 d_sh, as the SH table; 7 stats, three columns a row: sum
-// of |dL/dmean2d|, number of views that drew it, largest radius; 8 weights of the blocks of SH, of which the gradients take the
-// place. Seven storage buffers.
+// Bindings, group 0: 0 view; 1 ask; 2 counts ([3]: stopped); 3 geometry as answer.wgsl wrote it, 4 params: here the SH
+// table; in and out: 5 back as splats_back.wgsl wrote it, whose means are added to; 6 d_sh, as the SH table; 7 stats,
+// three columns per row: sum of |dL/dmean2d|, number of views that rendered it, largest radius; 8 weights of the blocks
+// of SH, of which the gradients take the place. Seven storage buffers.
 // A thread owns one row.
 
 const GEOMETRY_WIDTH: u32 = 10u;
@@ -52,7 +52,7 @@ fn sh_basis_gradient(d: vec3<f32>) -> array<vec3<f32>, 16> {
 @compute @workgroup_size(ROW_THREADS)
 fn colors_back(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = id.x;
-    // Where steps have stopped there are no gradients: the view is drawn again.
+    // Where steps have stopped there are no gradients: the view is rendered again.
     if (row >= ask.rows || counts[3] != 0u) {
         return;
     }

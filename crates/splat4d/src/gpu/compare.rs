@@ -1,4 +1,4 @@
-//! An image that never leaves the GPU: drawn, compared with its truth and taken back in one submission.
+//! An image that never leaves the GPU: rendered, compared with its truth and taken back in one submission.
 
 use super::back::{Came, End};
 use super::buffers::UNIFORM_STRIDE;
@@ -50,7 +50,7 @@ fn window() -> [f32; 12] {
 }
 
 impl Loss {
-    /// `dssim`: λ. `response`: number of the camera's row, where it does not show what is drawn.
+    /// `dssim`: λ. `response`: number of the camera's row, where it does not show what is rendered.
     pub(super) fn new(dssim: f64, held: &Held, response: Option<usize>) -> Self {
         let total = held.weight * CHANNELS as f64;
         Self {
@@ -111,7 +111,7 @@ impl GpuRenderer {
         Ok(Some(comparison))
     }
 
-    /// Renders, compares and runs the backward pass. `None`: it must be drawn in bands.
+    /// Renders, compares and runs the backward pass. `None`: it must be rendered in bands.
     fn compare_held(
         &mut self,
         shot: &Shot<'_, f32>,
@@ -173,7 +173,8 @@ impl GpuRenderer {
         b.d_planes.ensure(gpu, (4 * PLANES * w * h) as u64)
     }
 
-    /// One submission: rendering, comparison, backward pass. What came means nothing if there are more pairs than there is room for.
+    /// One submission: rendering, comparison, backward pass. What came means nothing if there are more pairs than there
+    /// is room for.
     fn there_and_back(
         &mut self,
         held: &Held,

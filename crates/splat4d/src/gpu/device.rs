@@ -1,6 +1,6 @@
-//! Choice and opening of the GPU: nothing beyond WebGPU's default limits is asked for, so that what runs here runs in
-//! a browser too; but for the size of buffers, which natively may be as large as the driver has them, and subgroups, where it has
-//! them.
+//! Choice and opening of the GPU: nothing beyond WebGPU's default limits is requested, so that what runs here runs in
+//! a browser too; but for the size of buffers, which natively may be as large as the driver has them, and subgroups,
+//! where it has them.
 
 use super::tuning::Tuning;
 use crate::{Error, ErrorKind, Result};
@@ -21,7 +21,7 @@ pub enum Adapters {
 /// Threads of the smallest and the largest subgroup that kernels can work with (rasterize_back_subgroup.wgsl).
 pub(super) const SUBGROUPS: [u32; 2] = [8, 64];
 
-/// The first error that the driver reported since it was last asked for.
+/// The first error that the driver reported since it was last requested.
 type Trouble = Arc<Mutex<Option<(ErrorKind, String)>>>;
 
 /// An open GPU.

@@ -45,8 +45,8 @@ pub(super) mod count {
     pub(crate) const ALL: usize = 5;
 }
 
-/// The two buffers of arguments, and what is in each: triples of u32, first for a thread a thing, then for a workgroup a
-/// block of things.
+/// The two buffers of arguments, and what is in each: triples of u32, first for a thread a thing, then for a workgroup
+/// a block of things.
 pub(super) mod arguments {
     pub(crate) const VISIBLE: usize = 0;
     pub(crate) const PAIRS: usize = 1;
@@ -55,7 +55,7 @@ pub(super) mod arguments {
     pub(crate) const BYTES: u64 = 24;
 }
 
-/// Rows of tiles that are drawn at once.
+/// Rows of tiles that are rendered at once.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Band {
     /// First row of tiles.
@@ -258,8 +258,8 @@ impl Frame<'_> {
         })
     }
 
-    /// Lists and blends one band; `bytes`: so many pixels of it in 8 bits too. Returns in which of the two buffers the sorted
-    /// pairs lie.
+    /// Lists and blends one band; `bytes`: so many pixels of it in 8 bits too. Returns in which of the two buffers the
+    /// sorted pairs lie.
     pub(super) fn band(
         &self,
         recorder: &mut Recorder<'_>,

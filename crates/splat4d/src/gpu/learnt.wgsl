@@ -1,8 +1,8 @@
-// Learnable rows of a layer that stays on the GPU, and what they are at time t. Twin of motion/still.rs (activate and its VJP),
-// motion/spacetime.rs, scene/life.rs, and of motion/tracked.rs on a frame.
+// Learnable rows of a layer that stays on the GPU, and what they are at time t. Twin of motion/still.rs (activate and
+// its VJP), motion/spacetime.rs, scene/life.rs, and of motion/tracked.rs on a frame.
 //
-// No bindings and no entry point, but for `params`, which whoever includes this binds: all tables of a layer but the SH, one
-// after the other, [row / 16][column][16].
+// No bindings and no entry point, but for `params`, which whoever includes this binds: all tables of a layer but the
+// SH, one after the other, [row / 16][column][16].
 
 const TABLE_BLOCK: u32 = 16u;
 // Threads of a workgroup of the kernels over rows (gpu/tuning.rs).
@@ -11,11 +11,12 @@ const ROW_THREADS: u32 = 256u;
 const QUAT: u32 = 3u;
 const LOG_SCALE: u32 = 7u;
 const OPACITY: u32 = 10u;
-// Bits of ask.flags: quaternions have rates; the life's centre learns from opacity alone; this is the step's first view.
+// Bits of ask.flags: quaternions have rates; the lifespan's centre learns from opacity alone; this is the step's first
+// view.
 const ASK_ROTATION: u32 = 1u;
 const ASK_DETACH: u32 = 2u;
 const ASK_FIRST: u32 = 4u;
-// Kinds of life.
+// Kinds of lifespan.
 const LIFE_INFINITE: u32 = 0u;
 const LIFE_HALF: u32 = 1u;
 const LIFE_ONE: u32 = 2u;
@@ -33,7 +34,7 @@ struct Ask {
     velocities_at: u32,
     rates_at: u32,
     t: f32,
-    delta: f32,         // of rows that live for ever
+    delta: f32,         // of rows that have infinite lifespans
     alpha_min: f32,     // least opacity of a row that is alive
     widest: f32,        // widths from the centre at which no row is
     first_splat: u32,

@@ -74,11 +74,11 @@ pub struct GpuStats {
     pub visible: usize,
     /// Pairs of 16² tile and splat.
     pub pairs: usize,
-    /// Bands in which the image was drawn.
+    /// Bands in which the image was rendered.
     pub bands: usize,
 }
 
-/// Draws splats on a GPU. All memory is reused from call to call.
+/// Renders splats on a GPU. All memory is reused from call to call.
 #[derive(Debug)]
 pub struct GpuRenderer {
     /// Options; `simd` means nothing here.
@@ -104,11 +104,12 @@ pub struct GpuRenderer {
     drawn: Vec<(Band, usize)>,
     returned: Returned,
     pictures: Pictures,
-    /// How a camera shows what is drawn, where no tables stay.
+    /// How a camera shows what is rendered, where no tables stay.
     response: Grown,
     resident: Option<Box<KeptTables>>,
     flights: Flights,
-    /// Steps that may be under way, rows of tiles of a band in them, and rows of a page of their tables, where tests say so.
+    /// Steps that may be under way, rows of tiles of a band in them, and rows of a page of their tables, where tests
+    /// say so.
     ahead: usize,
     band_rows: usize,
     page_rows: Option<usize>,
@@ -175,7 +176,7 @@ impl GpuRenderer {
         lacks.iter().find(|(wanted, _)| *wanted).map_or(Ok(()), |(_, what)| Err(refusal("the GPU", what)))
     }
 
-    /// Draws all bands of an image that has pixels.
+    /// Renders all bands of an image that has pixels.
     fn draw_bands(&mut self, shot: &Shot<'_, f32>, out: &mut Out<'_>) -> Result<()> {
         let start = Instant::now();
         let (n, w, h) = (self.stats.splats, shot.camera.width, shot.camera.height);
@@ -241,7 +242,7 @@ impl GpuRenderer {
         Ok(())
     }
 
-    /// Buffers with a row a splat; whether any is new.
+    /// Buffers with a row per splat; whether any is new.
     fn make_room_for_splats(&mut self, n: usize) -> Result<bool> {
         let (gpu, b) = (&self.gpu, &mut self.buffers);
         let n = n as u64;
@@ -431,7 +432,7 @@ impl Backend<f32> for GpuRenderer {
         self.take_back(shot, grads, d_sh, d)
     }
 
-    /// Errors in addition: a gradient that is not finite. `None` in addition: the image must be drawn in bands, or
+    /// Errors in addition: a gradient that is not finite. `None` in addition: the image must be rendered in bands, or
     /// none of its pixels
     /// counts.
     fn compare(
@@ -462,7 +463,7 @@ impl Backend<f32> for GpuRenderer {
     }
 }
 
-/// What a submission does in addition to drawing a band.
+/// What a submission does in addition to rendering a band.
 #[derive(Clone, Copy, Debug, Default)]
 struct Way {
     /// Of the backward pass, flags and place of the sums in `Blend`.
@@ -483,7 +484,7 @@ enum Out<'a> {
     Bytes(&'a mut [[u8; 4]]),
 }
 
-/// Copies the planes of a band into the image, from pixel row `first` on; the depth only where it is drawn.
+/// Copies the planes of a band into the image, from pixel row `first` on; the depth only where it is rendered.
 fn read_planes(bytes: &[u8], first: usize, rows: usize, out: &mut Image<f32>) {
     let width = out.alpha.width;
     let Image { color, alpha, depth, .. } = out;

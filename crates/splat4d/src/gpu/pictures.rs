@@ -112,7 +112,7 @@ impl Pictures {
         }
     }
 
-    /// Keeps half of what is kept now, for want of memory.
+    /// Keeps half of what is kept now, for lack of memory.
     pub(super) fn shrink(&mut self) {
         self.budget = self.bytes / 2;
         self.forget();

@@ -1,16 +1,16 @@
 // Blends each tile's splats front to back to colour, alpha and depth. Twin of render/rasterize.rs (forward), where the
 // equations and their sources stand. render/project.wgsl is put in front of this file.
 //
-// Bindings, group 0: 0 view; 1 blend; 2 ranges (three u32 a tile; the third is written: one past the last pair that some
-// pixel used), 3 values (pairs, sorted by tile, then nearest first), 4 owners (of a pair: splat and quadrants);
+// Bindings, group 0: 0 view; 1 blend; 2 ranges (three u32 per tile; the third is written: one past the last pair that
+// some pixel used), 3 values (pairs, sorted by tile, then nearest first), 4 owners (of a pair: splat and quadrants);
 // 5 shapes, 6 colors; out: 7 planes: red, green, blue over the background, alpha, depth (sum of z alpha T), each
 // [rows of the planes][width]. Six storage buffers, 12 KiB of workgroup memory.
-// A workgroup owns a tile of 16 x 16 pixels, 64 neighbouring threads a quadrant of it, a thread a pixel; splats are
+// A workgroup owns a tile of 16 x 16 pixels, 64 neighbouring threads a quadrant of it, a thread per pixel; splats are
 // read in batches by all threads together.
 
 const TILE: u32 = 16u;
 const THREADS: u32 = 256u;
-// Splats that are read at a time, at most one a thread (gpu/tuning.rs).
+// Splats that are read at a time, at most one per thread (gpu/tuning.rs).
 const BATCH: u32 = 256u;
 // Pixels across and down a quadrant, and the split of an owner (tiles.wgsl).
 const QUADRANT: u32 = 8u;

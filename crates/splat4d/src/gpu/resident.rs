@@ -1,9 +1,10 @@
 //! Tables that stay on the GPU: rows become splats, splats an image, and its loss steps of Adam, without a number of
 //! them
-//! passing through the CPU. Densification, files and whatever else looks at a scene fetch the tables, and hand them back.
+//! passing through the CPU. Densification, files and whatever else looks at a scene fetch the tables, and hand them
+//! back.
 //!
-//! Tables of more rows than a binding holds are in pages of whole blocks, each with buffers and dispatches of its own; every row
-//! has a thread to itself, so that pages change no bit of the tables.
+//! Tables of more rows than a binding holds are in pages of whole blocks, each with buffers and dispatches of its own;
+//! every row has a thread to itself, so that pages change no bit of the tables.
 
 mod cameras;
 mod film;
@@ -146,7 +147,7 @@ pub(super) struct Tables {
     layers: usize,
     /// Page after page of layer after layer.
     pages: Vec<ResidentBuffers>,
-    /// Geometry and SH of the pages, as they are drawn.
+    /// Geometry and SH of the pages, as they are rendered.
     upload: Upload,
     kernels: ResidentKernels,
     uniforms: Grown,
@@ -232,7 +233,7 @@ impl Tables {
 /// The words of a step behind those of record.wgsl.
 #[derive(Debug)]
 struct Status {
-    /// One a table: one more than the last row whose number is not finite.
+    /// One per table: one more than the last row whose number is not finite.
     bad: usize,
     /// Rows alive, by layer.
     alive: usize,
@@ -360,7 +361,8 @@ impl ResidentPass<'_> {
         self.tables.ask(page)
     }
 
-    /// The sums of the view, the gradients of splats to those of rows, and, after the step's last view, Adam and the record.
+    /// The sums of the view, the gradients of splats to those of rows, and, after the step's last view, Adam and the
+    /// record.
     fn learn(&self, gpu: &Gpu, b: &Buffers, upload: &Upload, recorder: &mut Recorder<'_>) -> Result<()> {
         let Tables { pages, kernels: k, status, corrections, cameras, .. } = self.tables;
         let words = status.all();

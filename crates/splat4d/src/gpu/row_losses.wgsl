@@ -1,9 +1,10 @@
-// Losses on the geometry of the rows that are alive, each a mean over them: opacity, its entropy, scale. Twin of MeanOpacity,
-// OpacityEntropy and MeanScale in splat4d-train's loss/scene.rs; learnt.wgsl and numbers.wgsl are put in front of this file.
+// Losses on the geometry of the rows that are alive, each a mean over them: opacity, its entropy, scale. Twin of
+// MeanOpacity, OpacityEntropy and MeanScale in splat4d-train's loss/scene.rs; learnt.wgsl and numbers.wgsl are put in
+// front of this file.
 //
-// Bindings, group 0: 0 ask; 1 rule; 2 counts ([3]: stopped); 3 params; 4 alive, as answer.wgsl left it; in and out: 5 d_params, which
-// is added to; 6 status, cleared to 0 before: rows alive at rule.count_at, and from rule.sums_at on the loss of each workgroup's
-// rows, as bits. Five storage buffers.
+// Bindings, group 0: 0 ask; 1 rule; 2 counts ([3]: stopped); 3 params; 4 alive, as answer.wgsl left it; in and out: 5
+// d_params, which is added to; 6 status, cleared to 0 before: rows alive at rule.count_at, and from rule.sums_at on the
+// loss of each workgroup's rows, as bits. Five storage buffers.
 // A thread owns one row; the rows of a workgroup are added in a fixed order.
 
 // Probabilities are kept this far from 0 and 1 (loss/image/entropy.rs).
@@ -29,7 +30,7 @@ struct RowRule {
 var<workgroup> marks: array<u32, 256>;
 var<workgroup> sums: array<f32, 256>;
 
-// None where steps have stopped: the view is drawn again, and what other views gave must stay as it is.
+// None where steps have stopped: the view is rendered again, and what other views gave must stay as it is.
 fn lives(row: u32) -> bool {
     return counts[3] == 0u && row < ask.rows && alive[min(row, ask.rows - 1u)] != 0u;
 }

@@ -3,10 +3,10 @@
 // too many.
 //
 // Three dispatches: block_sums (a workgroup a block of 2,048), total (one workgroup), offsets (as block_sums).
-// Bindings, group 0: 0 scan_pass; 1 counts: numbers of things, [count_index] is read and [total_index] written; of steps on
-// tables that stay, [3] stops them all (frame.rs, `count`): 1 + the view that had more things than there is room for, [4];
-// 2 scan_in, 3 scan_out: one a thing; 4 scan_sums: one a block; 5 arguments of indirect dispatches: two triples are
-// written from arguments_at on, one thread a thing and 2,048 things a workgroup. Five storage buffers.
+// Bindings, group 0: 0 scan_pass; 1 counts: numbers of things, [count_index] is read and [total_index] written; of
+// steps on tables that stay, [3] stops them all (frame.rs, `count`): 1 + the view that had more things than there is
+// room for, [4]; 2 scan_in, 3 scan_out: one a thing; 4 scan_sums: one per block; 5 arguments of indirect dispatches:
+// two triples are written from arguments_at on, one thread a thing and 2,048 things a workgroup. Five storage buffers.
 // A thread owns eight neighbouring numbers; in `total`, a run of neighbouring blocks.
 
 const SCAN_THREADS: u32 = 256u;

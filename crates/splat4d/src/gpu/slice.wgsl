@@ -1,12 +1,12 @@
-// One Gaussian of space and time and what its slice at t is made of. Twin of motion/native4d/slice.rs, where the equations
-// stand; learnt.wgsl and numbers.wgsl are put in front of this file.
+// One Gaussian of space and time and what its slice at t is made of. Twin of motion/native4d/slice.rs, where the
+// equations stand; learnt.wgsl and numbers.wgsl are put in front of this file.
 //
-// No bindings and no entry point. A row's own columns: time of the mean, log scale in time, right quaternion. Matrices are
-// held by rows: m[i] is row i.
+// No bindings and no entry point. A row's own columns: time of the mean, log scale in time, right quaternion. Matrices
+// are held by rows: m[i] is row i.
 
 const LOG_TIME_SCALE: u32 = 1u;
 const RIGHT: u32 = 2u;
-// The life's exponent stops at half of this.
+// The lifespan's exponent stops at half of this.
 const FAINTEST: f32 = 60.0;
 
 struct Slice {

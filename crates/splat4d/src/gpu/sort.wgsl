@@ -26,8 +26,8 @@ const SORT_BLOCK: u32 = 2048u; // SORT_THREADS x SORT_ROUNDS
 const SORT_ROW: u32 = 16u;
 // Up to this many blocks one thread walks along a digit's counts: fewer steps than a workgroup's sums take.
 const SORT_FEW: u32 = 32u;
-// 32-bit words that hold a byte for each thread. Bits by digit and thread would need fewer steps, but 8 KiB of workgroup
-// memory, which software devices take a second to compile.
+// 32-bit words that hold a byte for each thread. Bits by digit and thread would need fewer steps, but 8 KiB of
+// workgroup memory, which software devices take a second to compile.
 const SORT_WORDS: u32 = 64u;
 
 struct SortPass {
@@ -81,7 +81,7 @@ fn histogram(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_
     }
 }
 
-// Exclusive sums over the workgroup's 256 numbers, one a thread; uses sort_sums and sort_rows. Rows of 16 keep it at
+// Exclusive sums over the workgroup's 256 numbers, one per thread; uses sort_sums and sort_rows. Rows of 16 keep it at
 // two barriers: software devices pay for each, and on others the few more additions cost nothing.
 fn sort_exclusive(thread: u32, value: u32) -> u32 {
     sort_sums[thread] = value;
@@ -105,8 +105,8 @@ fn sort_exclusive(thread: u32, value: u32) -> u32 {
     return before;
 }
 
-// Turns a digit's counts by block into exclusive sums, and writes their total. A workgroup owns a digit; where there are
-// few blocks, the first workgroup does all of it, a thread a digit.
+// Turns a digit's counts by block into exclusive sums, and writes their total. A workgroup owns a digit; where there
+// are few blocks, the first workgroup does all of it, a thread a digit.
 @compute @workgroup_size(256)
 fn scan(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) thread: u32) {
     let blocks = sort_blocks();

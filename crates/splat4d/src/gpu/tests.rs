@@ -129,7 +129,7 @@ fn skewed(width: usize, height: usize) -> Camera {
     camera
 }
 
-/// Everything that the GPU draws.
+/// Everything that the GPU renders.
 fn shot<'a>(splats: &'a Splats<'a, f32>, camera: &'a Camera) -> Shot<'a> {
     Shot { depth: true, ..Shot::new(splats, camera, BACKGROUND) }
 }

@@ -1,12 +1,12 @@
-// What holds the poses of a tracked frame: along the edges of a graph rigidity, rotation and isometry, a floor, and a background that
-// stays. Twin of splat4d-train's loss/rigid.rs and loss/tracked.rs, where the equations stand; learnt.wgsl is put in front of this
-// file.
+// What holds the poses of a tracked frame: along the edges of a graph rigidity, rotation and isometry, a floor, and a
+// background that stays. Twin of splat4d-train's loss/rigid.rs and loss/tracked.rs, where the equations stand;
+// learnt.wgsl is put in front of this file.
 //
-// Bindings, group 0: 0 ask; 1 rule; 2 params; 3 before, two vec4 a point: position, quaternion of the frame before; 4 edges, four
-// words each: where it leads to, length and weight as bits; 5 links: from 0 on the first edge to each point and one past the last,
-// from rule.back_at on the edges to points, from rule.rows_at on the rows of points and of the background; in and out: 6 turns, a
-// vec4 a point; 7 d_params, which is added to; 8 status: from rule.sums_at on the loss of each workgroup, as bits; 9 counts ([3]:
-// stopped). Eight storage buffers.
+// Bindings, group 0: 0 ask; 1 rule; 2 params; 3 before, two vec4 a point: position, quaternion of the frame before; 4
+// edges, four words each: where it leads to, length and weight as bits; 5 links: from 0 on the first edge to each point
+// and one past the last, from rule.back_at on the edges to points, from rule.rows_at on the rows of points and of the
+// background; in and out: 6 turns, a vec4 a point; 7 d_params, which is added to; 8 status: from rule.sums_at on the
+// loss of each workgroup, as bits; 9 counts ([3]: stopped). Eight storage buffers.
 // A thread owns one point, or one row of the background, and adds what its edges pull at both their ends.
 
 // Keeps the root's derivative finite (loss/rigid.rs).
@@ -166,7 +166,7 @@ fn hold(
     @builtin(local_invocation_index) thread: u32,
 ) {
     var sum = 0.0;
-    // Where steps have stopped the view is drawn again, and what other views gave must stay as it is.
+    // Where steps have stopped the view is rendered again, and what other views gave must stay as it is.
     if (counts[3] == 0u) {
         if (id.x < rule.points) {
             sum = hold_point(id.x);

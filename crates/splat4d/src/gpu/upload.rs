@@ -88,7 +88,7 @@ impl PartBuffers {
 /// The tables of all parts.
 #[derive(Debug, Default)]
 pub(super) struct Upload {
-    /// One a part of the largest scene so far.
+    /// One per part of the largest scene so far.
     pub parts: Vec<PartBuffers>,
     /// Dispatches of the last scene.
     pub draws: Vec<Draw>,
@@ -125,8 +125,8 @@ impl Upload {
         Ok(())
     }
 
-    /// Makes room for layers of so many rows, columns and blocks of SH, which kernels fill, and lists the dispatches. What
-    /// buffers held may be lost. Errors: no memory, or a table that is larger than a binding.
+    /// Makes room for layers of so many rows, columns and blocks of SH, which kernels fill, and lists the dispatches.
+    /// What buffers held may be lost. Errors: no memory, or a table that is larger than a binding.
     pub(super) fn keep(&mut self, gpu: &Gpu, layers: &[(usize, usize, usize)]) -> Result<()> {
         self.draws.clear();
         self.parts.resize_with(layers.len(), PartBuffers::new);

@@ -1,5 +1,6 @@
 //! A dynamic scene with the same Gaussians in the same order at every time: what programs need that interpolate between
-//! frames, blur by motion or encode differences. A Gaussian stays where it was first or last seen while it does not live.
+//! frames, blur by motion or encode differences. A Gaussian stays where it was first or last seen while it does not
+//! live.
 
 use super::{Layer, Scene, freeze_rows};
 use crate::Result;
@@ -18,7 +19,7 @@ pub struct Constant<'a> {
     places: Vec<Vec<u32>>,
     /// Every kept row as it is when it is first alive, its opacity hidden.
     first: Params<f32>,
-    /// The rows at the last time that was asked for.
+    /// The rows at the last time that was queried for.
     now: Params<f32>,
 }
 
@@ -66,7 +67,7 @@ impl<'a> Constant<'a> {
         &self.times
     }
 
-    /// Frame `i`, whose opacities are `HIDDEN` where a Gaussian does not live. Frames are asked for one after the
+    /// Frame `i`, whose opacities are `HIDDEN` where a Gaussian does not live. Frames are requested one after the
     /// other; frame 0 begins again. Rotations keep the sign and the order of axes that are nearest to the frame before.
     pub fn frame(&mut self, i: usize) -> &Params<f32> {
         if i == 0 {

@@ -1,5 +1,5 @@
-//! Conversion of `native4d` layers to `spacetime` and back. A Gaussian of space and time is a slice that moves at a constant
-//! velocity, and a life: exactly a `spacetime` one of order 1 with a `GaussHalf` life.
+//! Conversion of `native4d` layers to `spacetime` and back. A Gaussian of space and time is a slice that moves at a
+//! constant velocity, and a lifespan: exactly a `spacetime` one of order 1 with a `GaussHalf` life.
 
 use super::Layer;
 use crate::math::{Real, quat, sym3};
@@ -66,9 +66,9 @@ pub fn to_spacetime<F: Real>(layer: &Layer<F>) -> Result<Layer<F>> {
 }
 
 /// A `spacetime` layer as a `native4d` one with the given spec (its harmonics start at zero): the same image at every
-/// time, where the lives are within the spec's bounds.
+/// time, where the lifespans are within the spec's bounds.
 ///
-/// Errors: the layer moves otherwise, along curves, turns, or its life is no Gaussian; a spec out of its ranges.
+/// Errors: the layer moves otherwise, along curves, turns, or its lifespan is no Gaussian; a spec out of its ranges.
 pub fn to_native4d<F: Real>(layer: &Layer<F>, spec: Native4dSpec) -> Result<Layer<F>> {
     let own_spec = match layer.motion.spec() {
         Spec::Spacetime(SpacetimeSpec { features: Some(_), .. }) => {

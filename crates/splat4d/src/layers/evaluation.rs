@@ -1,8 +1,8 @@
 //! [`Evaluation`]: the scene at these times, forth and back.
 //!
-//! A motion model wants all questions of a step at once (`prepare`), then answers them one by one (`at`); in the
+//! A motion model wants all queries of a step at once (`prepare`), then answers them one by one (`at`); in the
 //! backward pass it
-//! takes a gradient a question (`backward`) and hears when that was the last one (`finish`). That order is written here,
+//! takes a gradient a query (`backward`) and hears when that was the last one (`finish`). That order is written here,
 //! once, for training, playback, freezing, flow and baking.
 
 #[cfg(test)]
@@ -14,7 +14,7 @@ use crate::motion::{At, Cache};
 use crate::scene::table::par_split;
 use crate::scene::{Grads, Rows, Space, SplatGrads, Splats, Table, Time};
 
-/// Questions to the layers of a scene, their answers, and the gradients to these. No two questions have the same layer,
+/// Queries to the layers of a scene, their results, and the gradients to these. No two queries have the same layer,
 /// space and time. All memory is used again after [`begin`](Self::begin).
 #[derive(Debug, Default)]
 pub struct Evaluation<F: Real = f32> {
@@ -28,9 +28,9 @@ pub struct Evaluation<F: Real = f32> {
 struct Query<F: Real> {
     layer: usize,
     tape: LayerTape<F>,
-    /// Whether the rows alive at that time are among those asked for.
+    /// Whether the rows alive at that time are among those requested.
     alive: bool,
-    /// Whether the gradients below belong to the answer; what they hold otherwise is of an earlier one.
+    /// Whether the gradients below belong to the result; what they hold otherwise is of an earlier one.
     begun: bool,
     d_out: Table<F>,
     d_color: Option<Table<F>>,
@@ -47,12 +47,12 @@ impl<F: Real> Evaluation<F> {
         out
     }
 
-    /// Forgets all questions.
+    /// Forgets all queries.
     pub fn begin(&mut self) {
         self.spare.append(&mut self.questions);
     }
 
-    /// Asks for rows of a layer at a time, next to those that were asked for already. Returns the question's number.
+    /// Requests rows of a layer at a time, next to those that were requested already. Returns the query's number.
     pub fn request(&mut self, layer: usize, of: Space, rows: Rows<'_>, t: Time) -> usize {
         match self.find(layer, of, t) {
             Some(i) => {
@@ -63,9 +63,9 @@ impl<F: Real> Evaluation<F> {
         }
     }
 
-    /// Asks for the Gaussians of a layer that are alive at t, next to those that were asked for already. `of` is
+    /// Requests the Gaussians of a layer that are alive at t, next to those that were requested already. `of` is
     /// that layer.
-    /// Returns the question's number.
+    /// Returns the query's number.
     pub fn ask_active(&mut self, layer: usize, of: &Layer<F>, t: Time) -> usize {
         let i = match self.find(layer, Space::Gaussians, t) {
             Some(i) if self.questions[i].alive => i,
@@ -81,7 +81,7 @@ impl<F: Real> Evaluation<F> {
         i
     }
 
-    /// Asks for the rows of question i at another time. Returns the number of that question.
+    /// Requests the rows of query i at another time. Returns the number of that query.
     pub fn ask_again(&mut self, i: usize, t: Time) -> usize {
         let Query { layer, tape, .. } = &self.questions[i];
         let (layer, of) = (*layer, tape.space());
@@ -102,7 +102,7 @@ impl<F: Real> Evaluation<F> {
         self.questions.len() - 1
     }
 
-    /// Adds rows to a question.
+    /// Adds rows to a query.
     fn widen(&mut self, i: usize, rows: Rows<'_>) {
         let tape = &mut self.questions[i].tape;
         match (tape.rows(), rows) {
@@ -115,7 +115,7 @@ impl<F: Real> Evaluation<F> {
         }
     }
 
-    /// Answers all questions: `prepare` once a layer, `at` once a question. Gradients begin again.
+    /// Answers all queries: `prepare` once per layer, `at` once per query. Gradients begin again.
     pub fn evaluate(&mut self, layers: &[Layer<F>]) {
         self.caches.resize_with(layers.len(), Default::default);
         for (index, (layer, (cache, d_cache))) in layers.iter().zip(&mut self.caches).enumerate() {
@@ -128,32 +128,32 @@ impl<F: Real> Evaluation<F> {
         }
     }
 
-    /// How many distinct questions were asked.
+    /// How many distinct queries were queried.
     pub fn len(&self) -> usize {
         self.questions.len()
     }
 
-    /// Whether nothing was asked.
+    /// Whether nothing was queried.
     pub fn is_empty(&self) -> bool {
         self.questions.is_empty()
     }
 
-    /// The number of the question for a layer, a space and a time.
+    /// The number of the query for a layer, a space and a time.
     pub fn find(&self, layer: usize, of: Space, t: Time) -> Option<usize> {
         self.questions.iter().position(|q| q.layer == layer && q.tape.space() == of && same(q.tape.time(), t))
     }
 
-    /// Question i and its answer.
+    /// Query i and its result.
     pub fn tape(&self, i: usize) -> &LayerTape<F> {
         &self.questions[i].tape
     }
 
-    /// All questions and answers, in the order in which they were first asked.
+    /// All queries and results, in the order in which they were first asked.
     pub fn tapes(&self) -> impl ExactSizeIterator<Item = &LayerTape<F>> {
         self.questions.iter().map(|q| &q.tape)
     }
 
-    /// The splats of a time at which all layers of `scene` were asked.
+    /// The splats of a time at which all layers of `scene` were queried.
     pub fn splats<'a>(&'a self, scene: &'a Scene<F>, t: Time) -> Splats<'a, F> {
         let part = |(index, layer): (usize, &'a Layer<F>)| {
             let i = self.find(index, Space::Gaussians, t).expect("every layer was asked at the time of these splats");
@@ -162,22 +162,22 @@ impl<F: Real> Evaluation<F> {
         Splats { parts: scene.layers.iter().enumerate().map(part).collect(), head: scene.head_weights() }
     }
 
-    /// Marks the rows asked for as active in `d`, the gradients of the layers.
+    /// Marks the rows requested as active in `d`, the gradients of the layers.
     pub fn activate(&self, d: &mut [Grads<F>]) {
         for q in &self.questions {
             d[q.layer].activate(q.tape.space(), q.tape.rows());
         }
     }
 
-    /// The gradient to answer i, [splats, 10], to be added to.
+    /// The gradient to result i, [splats, 10], to be added to.
     pub fn d_out(&mut self, i: usize) -> &mut Table<F> {
         let q = &mut self.questions[i];
         q.begin_gradient();
         &mut q.d_out
     }
 
-    /// Adds to the gradient of answer i: that of [`Part::out`](crate::scene::Part::out), of direct colours, and of weights
-    /// of colours. Tables may come back exchanged for others, whose numbers mean nothing.
+    /// Adds to the gradient of result i: that of [`Part::out`](crate::scene::Part::out), of direct colours, and of
+    /// weights of colours. Tables may come back exchanged for others, whose numbers mean nothing.
     pub fn add_gradient(
         &mut self,
         i: usize,
@@ -199,7 +199,8 @@ impl<F: Real> Evaluation<F> {
         }
     }
 
-    /// The VJP of [`answer`](Self::evaluate): `backward` once a question, `finish` once a layer. Adds to `d`, one a layer.
+    /// The VJP of [`answer`](Self::evaluate): `backward` once per query, `finish` once per layer. Adds to `d`, one per
+    /// layer.
     pub fn backward(&mut self, layers: &[Layer<F>], d: &mut [Grads<F>]) {
         assert_eq!(d.len(), layers.len(), "a gradient a layer is needed");
         for q in &mut self.questions {
@@ -214,7 +215,7 @@ impl<F: Real> Evaluation<F> {
         }
     }
 
-    /// dL/dt of a time at which Gaussians were asked for, all layers together, after [`backward`](Self::backward).
+    /// dL/dt of a time at which Gaussians were requested, all layers together, after [`backward`](Self::backward).
     pub fn d_time(&self, t: Time) -> f64 {
         let at_t = |q: &&Query<F>| q.tape.space() == Space::Gaussians && same(q.tape.time(), t);
         self.questions.iter().filter(at_t).map(|q| q.d_time).sum()
@@ -231,8 +232,8 @@ impl<F: Real> Query<F> {
     }
 }
 
-/// Shows the answers to many questions for the Gaussians of one layer, of which one is held at a time, however many there are. The motion
-/// model hears of all of them first, so that one that scans through time does so once.
+/// Shows the answers to many queries for the Gaussians of one layer, of which one is held at a time, however many there
+/// are. The motion model hears of all of them first, so that one that scans through time does so once.
 pub(crate) fn sweep<F: Real>(layer: &Layer<F>, asked: &[(Rows<'_>, Time)], mut show: impl FnMut(usize, &LayerTape<F>)) {
     let (p, of) = (&layer.params, Space::Gaussians);
     let (mut cache, mut tape) = (Cache::default(), LayerTape::default());

@@ -137,7 +137,7 @@ fn coefficients(scene: &Scene<f32>) -> usize {
 struct Shapes<'a> {
     layer: &'a Layer<f32>,
     tape: &'a LayerTape<f32>,
-    /// Quaternion rates, and the centre of those who live for ever.
+    /// Quaternion rates, and the centre of those who have infinite lifespans.
     turning: Option<(Key, f64)>,
 }
 

@@ -1,4 +1,4 @@
-//! Every built-in motion model and life, through the layer, against f64 finite differences.
+//! Every built-in motion model and lifespan, through the layer, against f64 finite differences.
 
 use super::*;
 use crate::motion::{SpacetimeSpec, Spec, build_as};
@@ -229,7 +229,7 @@ fn a_layer_is_seen_in_its_span_only() {
     assert_eq!(scene.splats(&instant).len(), 8);
 }
 
-/// A layer whose Gaussians move, turn and have their own lives, in a frame of its own.
+/// A layer whose Gaussians move, turn and have their own lifespans, in a frame of its own.
 fn turning() -> Scene<f32> {
     let mut params = Params::<f32>::new(40, 4, LifeKind::GaussHalf.columns());
     let spec = SpacetimeSpec { order: 1, rotation: true, detach: false, origin: 0.5, features: None };

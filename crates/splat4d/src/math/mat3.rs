@@ -6,7 +6,7 @@ use super::{Real, quat};
 
 /// Share of the matrix's size that is added along the identity, so that of several equally near rotations (points on a
 /// line or in one place leave some free) the one that turns least is taken. Rounding of f64 is some thousand times
-/// smaller, and the answer elsewhere moves by no more than this.
+/// smaller, and the result elsewhere moves by no more than this.
 const LEAST_TURN: f64 = 1e-12;
 /// Sweeps of the Jacobi iteration, at most; it converges quadratically, four or five are usual for 4x4.
 const SWEEPS: usize = 12;
@@ -150,7 +150,7 @@ mod tests {
             let error =
                 r.as_flattened().iter().zip(identity.as_flattened()).fold(0.0, |m: f64, (a, b)| m.max((a - b).abs()));
             assert!(error < 1e-3, "{error}");
-            // In a plane the answer is one, without a reflection.
+            // In a plane the result is one, without a reflection.
             let w = random("plane", i)[0];
             let r = procrustes(std::array::from_fn(|k| std::array::from_fn(|l| v[k] * v[l] + w[k] * w[l])));
             let error =

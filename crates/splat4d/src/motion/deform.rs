@@ -2,15 +2,15 @@
 //!
 //! With x̂ = (sg(x) − c)/r and t̂ = (t − from)/(to − from) clamped to [0, 1], a network gives every Gaussian
 //! (δx 3, δq 4, δs 3), or with `rigid` a screw (w 3, v 3) in place of δx:
-//! x_t = x + r·δx or c + r·exp([w; v])((x − c)/r), q_t = q/|q| + δq, s_t = max(exp(log_scales) + r·δs, 1e-6) — scales are
-//! changed after the activation — each head times its constant of `GAINS`. Opacity and SH stay.
-//! `sg` stops the gradient: the network's input is detached from the mean, so that dL/dx = dL/dx_t (with a screw: turned
-//! by it). The network sees γ(x̂) and γ(t̂), t̂'s perhaps through a small network of its own, or hash grids over
-//! (x, y, z) and (x, y, t), (y, z, t), (x, z, t). What depends on t̂ alone enters as a shift of biases, which is the same
-//! as standing in every row.
-//! At the start the last map is zero: the answer is then the canonical cloud bit for bit, as in `still`.
-//! Source: Yang et al. 2024 (Deformable 3D Gaussians) §3; heads that start at zero as in SC-GS (Huang et al. 2024); hash
-//! grids after Müller et al. 2022 and Grid4D (Xu et al. 2024).
+//! x_t = x + r·δx or c + r·exp([w; v])((x − c)/r), q_t = q/|q| + δq, s_t = max(exp(log_scales) + r·δs, 1e-6) — scales
+//! are changed after the activation — each head times its constant of `GAINS`. Opacity and SH stay.
+//! `sg` stops the gradient: the network's input is detached from the mean, so that dL/dx = dL/dx_t (with a screw:
+//! turned by it). The network sees γ(x̂) and γ(t̂), t̂'s perhaps through a small network of its own, or hash grids over
+//! (x, y, z) and (x, y, t), (y, z, t), (x, z, t). What depends on t̂ alone enters as a shift of biases, which is the
+//! same as standing in every row.
+//! At the start the last map is zero: the result is then the canonical cloud bit for bit, as in `still`.
+//! Source: Yang et al. 2024 (Deformable 3D Gaussians) §3; heads that start at zero as in SC-GS (Huang et al. 2024);
+//! hash grids after Müller et al. 2022 and Grid4D (Xu et al. 2024).
 
 mod rows;
 #[cfg(test)]
@@ -128,12 +128,12 @@ pub struct Deform {
     trunk: Mlp,
 }
 
-/// State that one answer keeps for its backward.
+/// State that one result keeps for its backward.
 #[derive(Debug)]
 struct Own<F> {
-    /// Whether the network was asked.
+    /// Whether the network was queried.
     asked: bool,
-    /// Whether its answer is used: false where the last map is zero.
+    /// Whether its result is used: false where the last map is zero.
     moves: bool,
     /// [rows, inputs] of the trunk.
     x: Vec<F>,
@@ -267,7 +267,7 @@ impl Deform {
         Bounds { center: [b[0], b[1], b[2]], radius: b[3], rigid: self.spec.rigid }
     }
 
-    /// Asks the network for every row of the question.
+    /// Asks the network for every row of the query.
     fn request<F: Real>(&self, q: &At<'_, F>, own: &mut Own<F>) {
         let (n, bounds, t) = (q.len(), self.bounds(q.p), F::of(self.unit_time(q.t).0));
         let geometry = &q.p[GEOMETRY];
@@ -381,7 +381,8 @@ impl<F: Real> Motion<F> for Deform {
         Spec::DeformMlp(self.spec.clone())
     }
 
-    /// Bytes of the trunk's inputs and outputs, each with its gradient; of the hidden layers what [`LayerOutputs`] keeps.
+    /// Bytes of the trunk's inputs and outputs, each with its gradient; of the hidden layers what [`LayerOutputs`]
+    /// keeps.
     fn scratch_bytes(&self, _p: &Params<F>, rows: usize) -> u64 {
         let shape = self.trunk.shape();
         let number = size_of::<F>();

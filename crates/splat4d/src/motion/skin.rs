@@ -1,19 +1,19 @@
 //! Skinning: Gaussians follow sparse control nodes, whatever drives the nodes (Huang et al. 2024, "SC-GS").
 //!
 //! Node k has a rest position p_k, a log radius, a weight logit w_k and hyper coordinates h_k; Gaussian i its canonical
-//! position x_i and hyper coordinates h_i. A [`Trajectory`] gives every node a shift T_k(t) and a rotation R_k(t) about its
-//! own position. With weights a_ik (see `weights`) a Gaussian goes to
+//! position x_i and hyper coordinates h_i. A [`Trajectory`] gives every node a shift T_k(t) and a rotation R_k(t) about
+//! its own position. With weights a_ik (see `weights`) a Gaussian goes to
 //!
 //! > x_i(t) = Σ_k a_ik [R_k (x_i − p_k) + p_k + T_k] (linear blend skinning),
 //! > q_i(t) = normalize(Σ_k a_ik s_k u_k) ⊗ q_i,
 //!
-//! where u_k is the unit quaternion of R_k and s_k = ±1 aligns it to the nearest node's. Scales stay. With a motion mask
-//! m_i = sigmoid(`motion_mask`) a Gaussian goes the share m_i of the way: x_i + m_i (x_i(t) − x_i), and likewise for the
-//! quaternion, from the identity.
+//! where u_k is the unit quaternion of R_k and s_k = ±1 aligns it to the nearest node's. Scales stay. With a motion
+//! mask m_i = sigmoid(`motion_mask`) a Gaussian goes the share m_i of the way: x_i + m_i (x_i(t) − x_i), and likewise
+//! for the quaternion, from the identity.
 //!
-//! Nothing is detached (the reference stops the gradient at x and p inside the blend): finite differences hold for every
-//! table. What is not learnt is which nodes are looked at: every Gaussian has a list of the nearest ones, refreshed by
-//! `Skinned::bind` now and then; among them the weights choose again at every step, continuously.
+//! Nothing is detached (the reference stops the gradient at x and p inside the blend): finite differences hold for
+//! every table. What is not learnt is which nodes are looked at: every Gaussian has a list of the nearest ones,
+//! refreshed by `Skinned::bind` now and then; among them the weights choose again at every step, continuously.
 
 mod blend;
 mod offset;
@@ -65,7 +65,7 @@ pub(crate) const POSE_COLUMNS: [(&str, usize); 2] = [("shift", 3), ("turn", 4)];
 
 /// The trajectories of control nodes.
 pub trait Trajectory<F: Real>: Send + Sync {
-    /// Once a step with all its times: scans, networks.
+    /// Once per step with all its times: scans, networks.
     fn prepare(&self, _p: &Params<F>, _times: &[Time], _cache: &mut Slot) {}
 
     /// Node poses at t, one of the prepared times: fills `out` [nodes, 7] with the displacement 3 (scene units) and the
@@ -83,7 +83,7 @@ pub trait Trajectory<F: Real>: Send + Sync {
         d: &mut Grads<F>,
     ) -> f64;
 
-    /// Once a step: the VJP of `prepare`.
+    /// Once per step: the VJP of `prepare`.
     fn finish(&self, _p: &Params<F>, _times: &[Time], _cache: &mut Slot, _d_cache: &mut Slot, _d: &mut Grads<F>) {}
 
     /// Bytes that a step keeps of `prepare` for [`finish`](Self::finish).
@@ -150,10 +150,11 @@ pub struct Skin {
 }
 
 impl Skin {
-    /// Makes or claims the tables in `p`: nodes at farthest points of the Gaussians, as wide as they are apart, all bound.
+    /// Makes or claims the tables in `p`: nodes at farthest points of the Gaussians, as wide as they are apart, all
+    /// bound.
     ///
-    /// Where the layer has fewer Gaussians than `spec.nodes`, there are as many nodes as Gaussians. Errors: numbers of the
-    /// spec out of range, loaded arrays of the wrong shape.
+    /// Where the layer has fewer Gaussians than `spec.nodes`, there are as many nodes as Gaussians. Errors: numbers of
+    /// the spec out of range, loaded arrays of the wrong shape.
     pub(crate) fn new<F: Real>(spec: SkinSpec, seed: u64, p: &mut Params<F>) -> Result<Self> {
         spec.check()?;
         let rows = p.len();
@@ -235,7 +236,7 @@ fn start_nodes<F: Real>(t: &mut Table<F>, centers: &[[F; 3]], rng: Rng) {
     }
 }
 
-/// Motion made of a skin and of what drives its nodes. Questions of [`Space::Nodes`] are answered by isotropic splats:
+/// Motion made of a skin and of what drives its nodes. Queries of [`Space::Nodes`] are answered by isotropic splats:
 /// the node's position, its radius, sigmoid(logit) as opacity.
 pub struct Skinned<F: Real> {
     /// Which Gaussian follows which nodes.
@@ -282,7 +283,7 @@ impl<F: Real> Skinned<F> {
     /// The same motion with nodes displaced at all times, for editing: `offsets` [nodes, 7] are shifts to be added and
     /// rotations to be done after the nodes' own, as [`arap`](super::arap) gives them. Files cannot hold it.
     ///
-    /// Panics: not as many offsets as nodes, when it is asked.
+    /// Panics: not as many offsets as nodes, when it is queried.
     pub fn with_offsets(&self, offsets: Table<F>) -> Self {
         let trajectory = Arc::new(offset::Offset { of: self.trajectory.clone(), by: offsets });
         Self { skin: self.skin, trajectory, spec: Spec::Custom(format!("{} with displaced nodes", self.spec.name())) }

@@ -1,15 +1,17 @@
 //! `ssm`: control nodes driven by a diagonal state-space model (our design on S4D, Gu et al. 2022).
 //!
-//! The clip is cut into M ticks. Every node is a sequence: a clock γ(t) and an impulse at the ends, a learnt embedding, and
-//! what its surroundings look like. A stack of residual blocks (`nn::sequence`) scans the sequence, one scan serving every
-//! time of a step, and a head that starts at zero gives a shift ρ and a rotation vector θ a tick. Between ticks both
-//! are interpolated (Catmull-Rom); the node goes to p + ρ and turns by exp(θ) about itself. Gaussians follow by skinning
-//! (`motion::skin`).
+//! The clip is cut into M ticks. Every node is a sequence: a clock γ(t) and an impulse at the ends, a learnt embedding,
+//! and what its surroundings look like. A stack of residual blocks (`nn::sequence`) scans the sequence, one scan
+//! serving every time of a step, and a head that starts at zero gives a shift ρ and a rotation vector θ a tick. Between
+//! ticks both are interpolated (Catmull-Rom); the node goes to p + ρ and turns by exp(θ) about itself. Gaussians follow
+//! by skinning (`motion::skin`).
 //!
-//! - `mode`: scans in both directions to reconstruct; the past alone to forecast, with ticks past the clip as asked for.
+//! - `mode`: scans in both directions to reconstruct; the past alone to forecast, with ticks past the clip as
+//!   requested.
 //! - `output`: poses, or their rates, which are composed from tick to tick (drifts, but carries on).
-//! - `equivariance`: none; `frames`: all that the network sees and states is in local frames of the nodes (`nn::frames`),
-//!   so that a turned scene is a turned scene; `vector`: vector neurons (`nn::vector`), which mirror exactly, too.
+//! - `equivariance`: none; `frames`: all that the network sees and states is in local frames of the nodes
+//!   (`nn::frames`), so that a turned scene is a turned scene; `vector`: vector neurons (`nn::vector`), which mirror
+//!   exactly, too.
 //!
 //! A node's context (positions, frames, neighbours) is taken when nodes are placed or edited and held
 //! fixed: no gradient goes through it to the nodes' positions.
@@ -243,7 +245,7 @@ impl Field {
         }
     }
 
-    /// Numbers a tick and node.
+    /// Numbers per tick and node.
     fn tick_width(&self) -> usize {
         if self.spec.output == Output::Twist { 7 } else { 6 }
     }

@@ -1,9 +1,9 @@
 //! `tracked`: positions and rotations of the same Gaussians at every frame; all else is shared by all frames.
 //!
-//! Frame 0 is the layer's geometry itself; frame k has a page of 7 numbers a Gaussian (28 bytes), `means@k` and `quats@k`.
-//! Between frames, u = (t − t_k)/(t_{k+1} − t_k): μ = (1 − u) μ_k + u μ_{k+1}, and q = (1 − u) q̂_k ± u q̂_{k+1} with the
-//! sign that makes the two quaternions neighbours. Before the first frame and after the last one nothing moves. On a
-//! frame itself, where the slopes of both sides differ, dL/dt is 0 and only that frame is read.
+//! Frame 0 is the layer's geometry itself; frame k has a page of 7 numbers per Gaussian (28 bytes), `means@k` and
+//! `quats@k`. Between frames, u = (t − t_k)/(t_{k+1} − t_k): μ = (1 − u) μ_k + u μ_{k+1}, and q = (1 − u) q̂_k ± u
+//! q̂_{k+1} with the sign that makes the two quaternions neighbours. Before the first frame and after the last one
+//! nothing moves. On a frame itself, where the slopes of both sides differ, dL/dt is 0 and only that frame is read.
 //! Source: Luiten et al. 2024 (Dynamic 3D Gaussians) §3; what is between frames is ours.
 
 #[cfg(test)]
@@ -33,15 +33,16 @@ pub const FOREGROUND: &str = "foreground_logits";
 pub const LEAST_CAMERAS: usize = 3;
 /// Most frames of a file that is believed: some nine hours at 30 a second.
 const MAX_FRAMES: usize = 1 << 20;
-/// Numbers of pages that are made and not loaded, at most: a gigabyte. A file whose specification asks for more has lost
-/// its arrays.
+/// Numbers of pages that are made and not loaded, at most: a gigabyte. A file whose specification requests more has
+/// lost its arrays.
 const MAX_MADE: usize = 1 << 28;
 
 /// The model as plain data.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TrackedSpec {
-    /// Seconds of every frame that has been tracked, strictly increasing. Frame 0 is the geometry, the others have pages.
+    /// Seconds of every frame that has been tracked, strictly increasing. Frame 0 is the geometry, the others have
+    /// pages.
     pub times: Vec<f64>,
     /// Whether Gaussians have a [`FOREGROUND`] logit: what masks say of them. No image depends on it.
     pub foreground: bool,
@@ -134,9 +135,9 @@ impl Tracked {
         Ok(())
     }
 
-    /// The model with one frame more at second t, where every Gaussian goes on as it went: x + (x − x') and
-    /// normalize(q̂ ± (q̂ − q̂')), scaled by the durations, no further than `cap` scene units. The first step after frame
-    /// 0 knows no velocity and stays.
+    /// The model with one frame more at second t, where every Gaussian continues as it went: x + (x − x') and
+    /// normalize(q̂ ± (q̂ − q̂')), scaled by the durations, no further than `cap` scene units. The first step after
+    /// frame 0 knows no velocity and stays.
     ///
     /// Source: Luiten et al. 2024 §3.3 (forward propagation); aligned signs, durations and the cap are ours: the
     /// overshoot of what bounces is bounded by it. Panics: t is not after the last frame.
@@ -263,7 +264,7 @@ impl<F: Real> Motion<F> for Tracked {
     }
 }
 
-/// One question's parameters, read sixteen rows at a time.
+/// One query's parameters, read sixteen rows at a time.
 struct Reader<'a, F> {
     geometry: &'a Table<F>,
     from: &'a Table<F>,

@@ -1,10 +1,11 @@
-//! [`HashGrid`]: features on grids of several resolutions, blended between the corners of a cell; fine grids share their
-//! entries by a hash.
+//! [`HashGrid`]: features on grids of several resolutions, blended between the corners of a cell; fine grids share
+//! their entries by a hash.
 //!
 //! Level l has R_l = ⌊base·g^l⌋ cells a side with g = (finest/base)^{1/(levels−1)}. A point u in \[0,1\]^d is at
-//! u·(R_l − 1) + ½, so that corners of no two levels coincide at 0. A level with (R_l + 1)^d ≤ 2^log2_size corners has an
-//! entry for each, any other looks its corners up at (⊕ c_k π_k) mod 2^log2_size.
-//! A level's gradient is scattered by one task in the order of the rows: the bits do not depend on the number of threads.
+//! u·(R_l − 1) + ½, so that corners of no two levels coincide at 0. A level with (R_l + 1)^d ≤ 2^log2_size corners has
+//! an entry for each, any other looks its corners up at (⊕ c_k π_k) mod 2^log2_size.
+//! A level's gradient is scattered by one task in the order of the rows: the bits do not depend on the number of
+//! threads.
 //! Source: Müller et al. 2022 (Instant-NGP) §3 and its conventions in tiny-cuda-nn.
 
 use crate::math::{Real, Rng};
@@ -22,7 +23,7 @@ const INITIAL: f64 = 1e-4;
 pub(crate) const MAX_DIMS: usize = 4;
 /// Most features of an entry.
 const MAX_FEATURES: usize = 8;
-/// Most levels, features an entry, cells a side and, as a power of two, entries a level.
+/// Most levels, features an entry, cells a side and, as a power of two, entries per level.
 const LIMITS: [usize; 4] = [24, MAX_FEATURES, 1 << 16, 22];
 /// Most numbers of a grid: 64 MB in f32.
 const MAX_NUMBERS: usize = 1 << 24;
@@ -97,8 +98,8 @@ pub struct HashGrid {
 }
 
 impl HashGrid {
-    /// Makes or claims the tables `{name}.{level}` ([entries, features] in one column, `Space::Fixed`) of a grid over the
-    /// numbers `axes` of points of `stride` numbers.
+    /// Makes or claims the tables `{name}.{level}` ([entries, features] in one column, `Space::Fixed`) of a grid over
+    /// the numbers `axes` of points of `stride` numbers.
     ///
     /// Errors: sizes that are not possible; loaded arrays of the wrong shape. Panics: an axis beyond the point.
     pub fn new<F: Real>(
@@ -148,7 +149,8 @@ impl HashGrid {
         }
     }
 
-    /// The VJP of [`forward`](Self::forward): adds to the entries' gradients in `d`, and to d_points [n, stride] if wanted.
+    /// The VJP of [`forward`](Self::forward): adds to the entries' gradients in `d`, and to d_points [n, stride] if
+    /// wanted.
     pub fn backward<F: Real>(
         &self,
         p: &Params<F>,

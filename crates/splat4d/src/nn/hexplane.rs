@@ -8,11 +8,12 @@
 //! gradient. (The released code sends t in [0, 1] to a grid over [-1, 1] and so never reads half of it; here the whole
 //! grid is time, and half as many time steps are as fine.)
 //!
-//! A plane is one `Space::Fixed` column of H·W·C numbers, `[second axis][first axis][channel]`, so that the channels of a
-//! grid point lie together: a lookup is four short runs of memory. All points of a question have one t, hence a time
+//! A plane is one `Space::Fixed` column of H·W·C numbers, `[second axis][first axis][channel]`, so that the channels of
+//! a grid point lie together: a lookup is four short runs of memory. All points of a query have one t, hence a time
 //! plane is first blended to the [`Lines`] of that t: 2 runs from the first-level cache instead of 4 from memory.
 //!
-//! Gradients of grid points are scattered by one task a plane, over rows in order: the same bits for any number of threads.
+//! Gradients of grid points are scattered by one task a plane, over rows in order: the same bits for any number of
+//! threads.
 
 use crate::math::{Real, Rng};
 use crate::scene::{Grads, Key, Params};
@@ -38,13 +39,14 @@ const MAX_CHANNELS: usize = 128;
 const MAX_LEVELS: usize = 8;
 /// Most grid points along an axis.
 const MAX_RESOLUTION: usize = 4096;
-/// Most numbers in all planes, 1 GiB of f32: a file must not ask for more.
+/// Most numbers in all planes, 1 GiB of f32: a file must not request more.
 const MAX_NUMBERS: usize = 1 << 28;
 /// Planes start between these: about 1, so that a product of six is neither lost nor overwhelming.
 const START: [f64; 2] = [0.5, 1.5];
 /// Random grid points along an axis that the first level's planes start from, the second's from twice as many.
 const START_POINTS: usize = 3;
-/// Rows that a task of the backward looks up before they are scattered; 128 rows of 12 planes of 32 channels are 200 kB.
+/// Rows that a task of the backward looks up before they are scattered; 128 rows of 12 planes of 32 channels are 200
+/// kB.
 const PART_ROWS: usize = 128;
 /// Parts whose gradients wait to be scattered at a time: 3 MB, within the last-level cache.
 const PARTS: usize = 16;
@@ -209,8 +211,8 @@ impl Planes {
         });
     }
 
-    /// VJP of [`forward`](Self::forward) and [`lines`](Self::lines): adds to `d` and to `d_x`; returns dL/dt. `waiting` is
-    /// scratch, whatever is in it.
+    /// VJP of [`forward`](Self::forward) and [`lines`](Self::lines): adds to `d` and to `d_x`; returns dL/dt. `waiting`
+    /// is scratch, whatever is in it.
     pub fn backward<F: Real>(
         &self,
         p: &Params<F>,
@@ -267,9 +269,9 @@ impl Planes {
     }
 }
 
-/// Fills a plane with bilinear blends of `points` by `points` random numbers a channel. Independent grid points, as the
-/// released code has them, give neighbours unrelated features, and networks train for long before they can separate a
-/// motion of a region from noise: mutant at 200x200 reached 25.9 dB after 600 steps, and 30.1 dB from smooth planes.
+/// Fills a plane with bilinear blends of `points` by `points` random numbers per channel. Independent grid points, as
+/// the released code has them, give neighbours unrelated features, and networks train for long before they can separate
+/// a motion of a region from noise: mutant at 200x200 reached 25.9 dB after 600 steps, and 30.1 dB from smooth planes.
 fn smooth<F: Real>(data: &mut [F], size: [usize; 2], channels: usize, points: usize, stream: Rng) {
     let counts = size.map(|n| points.min(n));
     // The random point before a grid point, and how far that is on the way to the next.

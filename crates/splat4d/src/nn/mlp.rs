@@ -3,8 +3,8 @@
 //!
 //! a₀ = x, aᵢ₊₁ = max(0, aᵢ Wᵢᵀ + bᵢ), out = a_D W_Dᵀ + b_D; where `skip` = s the input of layer s + 1 is [a_{s+1}, x].
 //! Backward: dWᵢ = dYᵢᵀ aᵢ, dbᵢ = Σ_rows dYᵢ, daᵢ = dYᵢ Wᵢ, masked where aᵢ is not positive.
-//! Weight gradients are summed over a fixed number of runs of chunks and then in the order of the runs, so that the bits
-//! do not depend on the number of threads.
+//! Weight gradients are summed over a fixed number of runs of chunks and then in the order of the runs, so that the
+//! bits do not depend on the number of threads.
 //! Source: Yang et al. 2024 (Deformable 3D Gaussians) §3; weights start as He et al. 2015 §2.2.
 
 use super::matmul::{Matrix, product};
@@ -195,8 +195,8 @@ impl Mlp {
         self.forward_shifted(p, x, &[], out, kept);
     }
 
-    /// As [`forward_keeping`](Self::forward_keeping), where `shifts[i]`, unless absent or empty, is added to the bias of
-    /// map i: what all rows share (a time's features) need not stand in every row.
+    /// As [`forward_keeping`](Self::forward_keeping), where `shifts[i]`, unless absent or empty, is added to the bias
+    /// of map i: what all rows share (a time's features) need not stand in every row.
     pub(crate) fn forward_shifted<F: Real>(
         &self,
         p: &Params<F>,
@@ -208,7 +208,7 @@ impl Mlp {
         let n = self.rows(x, out);
         let biases = self.biases(p, shifts);
         let (rows, hidden) = (self.chunk_rows(), self.hidden());
-        // `forward` asks for nothing to be kept by a count that no pass can have.
+        // `forward` requests nothing to be kept by a count that no pass can have.
         let wanted = if kept.chunks == usize::MAX { 0 } else { n.div_ceil(rows) };
         let per_chunk = rows * hidden;
         kept.chunks = wanted.min(LayerOutputs::<F>::BYTES / size_of::<F>() / per_chunk.max(1));
@@ -346,7 +346,7 @@ impl Mlp {
         (CHUNK_NUMBERS / self.shape.width.max(1)).clamp(CHUNK_ROWS[0], CHUNK_ROWS[1])
     }
 
-    /// Numbers a row that the hidden layers give, with the input where it is next to them.
+    /// Numbers per row that the hidden layers give, with the input where it is next to them.
     fn hidden(&self) -> usize {
         self.maps[1..].iter().map(|m| m.inputs).sum()
     }

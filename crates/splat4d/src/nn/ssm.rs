@@ -2,8 +2,8 @@
 //!
 //! h'(τ) = Λh + Bu, y = Re(Ch) + Du with Λ = −exp(a) + iω, held constant over a tick (zero-order hold):
 //! hₙ = Āhₙ₋₁ + B̄uₙ, z = ΔΛ·gap, Ā = e^z, B̄ = Δ·gap·φ(z)·B, φ(z) = (e^z − 1)/z. Real parts of Λ are negative by
-//! construction, hence |Ā| < 1. The backward is the reverse scan λₙ = conj(C)gₙ + conj(Āₙ₊₁)λₙ₊₁; states are not kept but
-//! made again, [`CHUNK`] ticks at a time, from marks that the forward scan leaves.
+//! construction, hence |Ā| < 1. The backward is the reverse scan λₙ = conj(C)gₙ + conj(Āₙ₊₁)λₙ₊₁; states are not kept
+//! but made again, [`CHUNK`] ticks at a time, from marks that the forward scan leaves.
 //!
 //! Source: Gu et al. 2022 (S4D). Gradients of complex numbers are ∂L/∂Re + i·∂L/∂Im throughout.
 
@@ -108,11 +108,12 @@ pub(crate) enum Direction {
     Backward,
 }
 
-/// Discretised parameters of a layer, for all ticks: Ā and B̄ \[gaps,H,N\], C \[H,N\], D \[H\]; also the gradient to it.
+/// Discretised parameters of a layer, for all ticks: Ā and B̄ \[gaps,H,N\], C \[H,N\], D \[H\]; also the gradient to
+/// it.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Discrete<F> {
     shape: Shape,
-    /// 1 where ticks are evenly spaced, else one a tick.
+    /// 1 where ticks are evenly spaced, else one per tick.
     gaps: usize,
     decay: Vec<Complex<F>>,
     drive: Vec<Complex<F>>,
@@ -181,8 +182,8 @@ fn against(a: Complex<f64>, b: Complex<f64>) -> Complex<f64> {
 }
 
 impl<F: Real> Discrete<F> {
-    /// Of a layer's weights. `gaps`: time since the tick before, in ticks: one number for evenly spaced ones, else one a
-    /// tick (the first as the others; a scan backwards takes the gap to the tick after).
+    /// Of a layer's weights. `gaps`: time since the tick before, in ticks: one number for evenly spaced ones, else one
+    /// a tick (the first as the others; a scan backwards takes the gap to the tick after).
     pub(crate) fn new(shape: Shape, w: &[F], gaps: &[f64]) -> Self {
         let mut out = Self::zeros(shape, gaps.len());
         let mut w = w.to_vec();
@@ -294,8 +295,8 @@ impl<F: Real> Discrete<F> {
         out
     }
 
-    /// The scan. Shapes: u, y \[rows, ticks\]; `state` \[rows,N\] is what stood before the first tick and becomes what stands
-    /// after the last; `marks` gets the states at the start of every chunk, \[rows, chunks, N\].
+    /// The scan. Shapes: u, y \[rows, ticks\]; `state` \[rows,N\] is what stood before the first tick and becomes what
+    /// stands after the last; `marks` gets the states at the start of every chunk, \[rows, chunks, N\].
     pub(crate) fn scan(
         &self,
         way: Direction,
@@ -316,8 +317,8 @@ impl<F: Real> Discrete<F> {
         }
     }
 
-    /// The VJP of [`scan`](Self::scan): adds to `d_u` and to the gradient `d`; `d_state` \[rows,N\] is the gradient to what
-    /// stood after the last tick and becomes that to what stood before the first.
+    /// The VJP of [`scan`](Self::scan): adds to `d_u` and to the gradient `d`; `d_state` \[rows,N\] is the gradient to
+    /// what stood after the last tick and becomes that to what stood before the first.
     #[expect(
         clippy::too_many_arguments,
         reason = "a scan's backward has all that its forward has, and their gradients"

@@ -28,7 +28,7 @@ fn primitive(rng: &Rng, center: f64, half_width: f64) -> Primitive {
     }
 }
 
-/// A root that lives for ever and a node a second.
+/// A root that has an infinite lifespan and a node a second.
 fn take() -> Vec<u8> {
     let rng = Rng::new(3, "play", 0);
     let mut nodes = vec![Node { from: 0.0, to: CLIP + 0.1, primitives: Vec::new() }];

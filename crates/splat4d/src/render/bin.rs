@@ -20,7 +20,7 @@ pub(super) const MASK_SIDE: usize = 8;
 /// Set in a footprint's first column: it is a rectangle larger than a mask.
 const LARGE: u16 = 1 << 15;
 
-/// Pairs of bin and splat that are held at once. An image with more is drawn in runs of bins, each of at most this
+/// Pairs of bin and splat that are held at once. An image with more is rendered in runs of bins, each of at most this
 /// many pairs (or a single bin, whose pairs are at most the splats). A pair holds about 130 bytes in f32 with
 /// gradients, so this is about 2 GiB; ordinary scenes of a million splats have a fifth of it.
 pub(crate) const PAIR_BUDGET: usize = 1 << 24;
@@ -146,7 +146,7 @@ impl Footprint {
     }
 }
 
-/// Sorted lists of splats, one a bin; every buffer is kept from step to step.
+/// Sorted lists of splats, one per bin; every buffer is kept from step to step.
 #[derive(Debug, Default)]
 pub struct Bins {
     /// Bins across.

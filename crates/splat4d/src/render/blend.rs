@@ -1,7 +1,7 @@
 //! Blending one bin of 32² pixels, and the backward pass.
 //!
-//! Its 16 tiles of 8² pixels stay in cache while a batch of splats passes: for each tile the batch's bit map states which
-//! splats can touch it, and for each of these its rows of pixels go through one loop over eight lanes.
+//! Its 16 tiles of 8² pixels stay in cache while a batch of splats passes: for each tile the batch's bit map states
+//! which splats can touch it, and for each of these its rows of pixels go through one loop over eight lanes.
 //!
 //! α = min(α_max, o·g), g = exp(−½ dᵀ conic d); α < α_min is skipped; a pixel stops before T(1−α) would fall below
 //! T_min. Source: Kerbl et al. 2023; gradients are 0 where α is at its maximum, as in gsplat.
@@ -40,7 +40,7 @@ pub(super) type Plane<F> = [F; TILE * TILE];
 #[repr(C, align(64))]
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Tile<F> {
-    /// Transmittance; negated once a pixel has stopped.
+    /// Transmittance; negated once per pixel has stopped.
     pub t: Plane<F>,
     /// Σ channel·α·T.
     pub color: [Plane<F>; CHANNELS],
@@ -347,7 +347,7 @@ const VXY: usize = 4;
 const VYY: usize = 5;
 /// … the channels' gradients …
 const LIGHT: usize = 6;
-/// … and, where asked for, the absolute gradients to the centre.
+/// … and, where requested, the absolute gradients to the centre.
 const ABS: usize = LIGHT + CHANNELS;
 /// Numbers in a record.
 const NUMBERS: usize = ABS + 2;
@@ -393,7 +393,7 @@ impl<F: Real> Pair<F> {
         [-(a * vx + b * vy), -(b * vx + c * vy)]
     }
 
-    /// Σ of |gradient to the centre|, 0 where it was not asked for.
+    /// Σ of |gradient to the centre|, 0 where it was not requested.
     #[inline(always)]
     pub(crate) fn center_abs(&self) -> [F; 2] {
         // The records' conic is in powers of 2.
@@ -446,7 +446,7 @@ impl<F: Real> Kernel for Backward<'_, F> {
 #[repr(C, align(64))]
 #[derive(Clone, Copy)]
 struct Back<F> {
-    /// Transmittance in front of the splat in hand; negated once a pixel has stopped.
+    /// Transmittance in front of the splat in hand; negated once per pixel has stopped.
     t: Plane<F>,
     /// Σ_ch g_ch·(light that is still to come): one number serves all channels and alpha.
     rest: Plane<F>,

@@ -13,7 +13,7 @@ pub struct Target<'a, F = f32> {
     pub picture: usize,
     /// λ: the share of 1 − SSIM.
     pub dssim: f64,
-    /// How the camera shows what is drawn: a matrix without the identity, row by row, then an offset a channel.
+    /// How the camera shows what is rendered: a matrix without the identity, row by row, then an offset per channel.
     pub response: Option<[F; 12]>,
 }
 

@@ -1,16 +1,17 @@
 //! The importance of each splat to an image, in three scores that one walk as forward's sums over the pixels.
 //!
-//! *Contribution*: Σ over pixels of α_i T_i, T_i = Π_{j<i} (1 − α_j): the gradient of a channel's sum to that channel, which
-//! the backward pass would compute together with eleven other numbers. *Removal*: the change that it makes to be
+//! *Contribution*: Σ over pixels of α_i T_i, T_i = Π_{j<i} (1 − α_j): the gradient of a channel's sum to that channel,
+//! which the backward pass would compute together with eleven other numbers. *Removal*: the change that it makes to be
 //! without the
-//! splat, Σ over pixels and channels of (α_i T_i (b_i − c_i))², b_i the colour of all that is behind: exact for one splat
-//! alone (pixels that had stopped stay stopped). A splat before others of its colour contributes much and changes little.
+//! splat, Σ over pixels and channels of (α_i T_i (b_i − c_i))², b_i the colour of all that is behind: exact for one
+//! splat alone (pixels that had stopped stay stopped). A splat before others of its colour contributes much and changes
+//! little.
 //!
 //! *Sensitivity*: how strongly the image answers to a splat. A pixel's channels depend on its shape through ln α alone,
-//! with the slope v_c = αT(c − b), and ln α = ln o − ½ dᵀ Q d, d = μ − p, Q the conic. Its gradient to (μ, Q) is a polynomial
-//! s(d) of second degree, so that Σ over pixels and channels of the products of gradients is known from the moments
-//! Σ_p (Σ_c v_c²) dx^i dy^j of degree 2 to 4: twelve sums a splat, exact. Slow and clear: it is meant for scores, not for
-//! steps.
+//! with the slope v_c = αT(c − b), and ln α = ln o − ½ dᵀ Q d, d = μ − p, Q the conic. Its gradient to (μ, Q) is a
+//! polynomial s(d) of second degree, so that Σ over pixels and channels of the products of gradients is known from the
+//! moments Σ_p (Σ_c v_c²) dx^i dy^j of degree 2 to 4: twelve sums a splat, exact. Slow and clear: it is meant for
+//! scores, not for steps.
 
 use super::Renderer;
 use super::bin::{BIN, id};
@@ -37,15 +38,15 @@ const POWERS: [[usize; 2]; 12] =
 /// The moments, and Σ of (Σ_c v_c²)/α².
 const MOMENTS: usize = POWERS.len() + 1;
 
-/// The answer of an image to changes of one splat.
+/// The result of an image to changes of one splat.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Sensitivity {
-    /// Upper triangle, row by row, of the 6x6 block Σ over pixels and channels of ∇I ∇Iᵀ with respect to the mean (3, world) and
-    /// the standard deviations along the covariance's axes (3, longest first), scene units⁻². Colour does not count as
-    /// depending on the direction. Source: PUP 3D-GS (Hanson et al. 2025), its spatial Fisher block.
+    /// Upper triangle, row by row, of the 6x6 block Σ over pixels and channels of ∇I ∇Iᵀ with respect to the mean (3,
+    /// world) and the standard deviations along the covariance's axes (3, longest first), scene units⁻². Colour does
+    /// not count as depending on the direction. Source: PUP 3D-GS (Hanson et al. 2025), its spatial Fisher block.
     pub fisher: [f64; 21],
-    /// Σ over pixels and channels of (dI/dg)², g the splat's bare bell e^(−½ dᵀ Q d). Source: Speedy-Splat (Hanson et al.
-    /// 2025), its efficient pruning score.
+    /// Σ over pixels and channels of (dI/dg)², g the splat's bare bell e^(−½ dᵀ Q d). Source: Speedy-Splat (Hanson et
+    /// al. 2025), its efficient pruning score.
     pub squared: f64,
 }
 
@@ -81,7 +82,7 @@ impl Importance {
         self.renderer.sensitivities(shot, out);
     }
 
-    /// Splats as a camera sees them, before any is blended, one a splat.
+    /// Splats as a camera sees them, before any is blended, one per splat.
     pub(crate) fn project(&mut self, splats: &Splats<'_>, camera: &Camera) -> &[Projected] {
         self.renderer.list(splats, camera);
         self.renderer.projected()
@@ -96,8 +97,8 @@ impl Importance {
 impl<F: Real> Renderer<F> {
     /// Σ over pixels of α_i Π_{j<i} (1 − α_j) of every splat: how much of the image it is. No colour is examined.
     ///
-    /// `out` is overwritten, one a splat; exactly 0 where no pixel shows it. Draws no image; no backward may follow.
-    /// Costs
+    /// `out` is overwritten, one per splat; exactly 0 where no pixel shows it. Renders no image; no backward may
+    /// follow. Costs
     /// less than a render's blend. Source: the significance of LightGaussian (Fan et al. 2024) and the spatial score of
     /// 4DGS-1K (Yuan et al. 2025).
     pub(crate) fn contributions(&mut self, splats: &Splats<'_, F>, camera: &Camera, out: &mut Vec<F>) {
@@ -105,18 +106,18 @@ impl<F: Real> Renderer<F> {
         self.last_contributions(out);
     }
 
-    /// `Renderer::contributions` of what was drawn last. A backward may still follow.
+    /// `Renderer::contributions` of what was rendered last. A backward may still follow.
     pub(crate) fn last_contributions(&mut self, out: &mut Vec<F>) {
         self.score_all::<Contribution>(None, out);
     }
 
-    /// Σ over pixels and channels of the squared change that a splat's removal would make to the image, one a splat,
+    /// Σ over pixels and channels of the squared change that a splat's removal would make to the image, one per splat,
     /// exact
     /// for each alone.
     ///
     /// Neither head nor further channels are examined: it is the base colours' image that changes. `out` is
     /// overwritten,
-    /// one a splat. Draws by itself; no backward may follow.
+    /// one per splat. Renders by itself; no backward may follow.
     pub(crate) fn removals(&mut self, shot: &Shot<'_, F>, out: &mut Vec<F>) {
         self.list_and_blend(shot);
         self.score_all::<Removal>(Some(shot.background), out);
@@ -126,7 +127,7 @@ impl<F: Real> Renderer<F> {
     /// of and
     /// behind the same others. Neither head nor further channels are examined: the image is that of the base colours.
     ///
-    /// `out` is overwritten, one a splat; zeros where no pixel shows it. Draws by itself; no backward may follow.
+    /// `out` is overwritten, one per splat; zeros where no pixel shows it. Renders by itself; no backward may follow.
     pub fn sensitivities(&mut self, shot: &Shot<'_, F>, out: &mut Vec<Sensitivity>) {
         let view = self.list_and_blend(shot);
         let splats = shot.splats;
@@ -208,8 +209,9 @@ impl<F: Real> Renderer<F> {
 }
 
 impl<F: Real> Raster<F> {
-    /// Sums a score over the pixels of every splat that was prepared, after [`Raster::blend`] of the same pass where the score
-    /// looks at colours. `add` adds a pair of bin and splat to the splat's row of `out`, in the order of its bins.
+    /// Sums a score over the pixels of every splat that was prepared, after [`Raster::blend`] of the same pass where
+    /// the score looks at colours. `add` adds a pair of bin and splat to the splat's row of `out`, in the order of its
+    /// bins.
     fn score<S: Score<F, NUMBERS>, const NUMBERS: usize, A: Send>(
         &mut self,
         pass: &Pass<'_, F>,
@@ -275,7 +277,7 @@ struct Pixel<F> {
     own: [F; CHANNELS],
     /// α/(1 − α) times what the pixel shows of all that is behind: α T b. As `own`; 0 where the pixel has stopped.
     hidden: [F; CHANNELS],
-    /// Whether α follows the splat here: it does not where nothing is drawn or α is at its maximum.
+    /// Whether α follows the splat here: it does not where nothing is rendered or α is at its maximum.
     felt: bool,
     /// The splat's centre less the pixel's, pixels.
     offset: [F; 2],
@@ -340,8 +342,8 @@ impl<F: Real> Score<F, MOMENTS> for Moments {
     }
 }
 
-/// The score of one bin: a walk as forward's that, for a score of colours, knows at every pixel the light of all that lies
-/// behind each splat.
+/// The score of one bin: a walk as forward's that, for a score of colours, knows at every pixel the light of all that
+/// lies behind each splat.
 struct Walk<'a, F, S, const NUMBERS: usize> {
     records: &'a [Record<F>],
     /// As the blend left them.

@@ -26,7 +26,7 @@ struct Blob {
     id: usize,
 }
 
-/// Draws a shot exactly as [`super::Renderer`] should, O(splats · pixels), in f64 whatever the input.
+/// Renders a shot exactly as [`super::Renderer`] should, O(splats · pixels), in f64 whatever the input.
 ///
 /// Shapes as in [`super::Renderer::render`]. Panics: `extra` has not one row a splat.
 pub fn render<F: Real>(shot: &Shot<'_, F>, config: &RenderConfig) -> Image<f64> {

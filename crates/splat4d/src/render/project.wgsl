@@ -24,7 +24,7 @@ struct View {
     near: f32,                      // Gaussians with z <= near are culled, scene units
     low_pass: f32,                  // added to the screen covariance, px^2
     camera: vec3<f32>,              // the camera's centre in the world
-    alpha_min: f32,                 // alpha below this is not drawn; above 0
+    alpha_min: f32,                 // alpha below this is not rendered; above 0
     sh_degree: u32,
     count: u32,                     // Gaussians
     time: f32,

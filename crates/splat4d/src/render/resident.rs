@@ -11,22 +11,24 @@ pub const KEPT: usize = 5;
 /// How the rows of a layer move.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Moves {
-    /// As [`Spacetime`](crate::motion::SpacetimeSpec) can, by its velocities and rotation rates; order 0 without rotation: not at all.
+    /// As [`Spacetime`](crate::motion::SpacetimeSpec) can, by its velocities and rotation rates; order 0 without
+    /// rotation: not at all.
     Along {
         /// Order of the polynomial.
         order: usize,
         /// Whether quaternions have a rate.
         rotation: bool,
-        /// Whether the life's centre learns from opacity alone.
+        /// Whether the lifespan's centre learns from opacity alone.
         detach: bool,
-        /// Origin of time for Gaussians that live for ever, seconds.
+        /// Origin of time for Gaussians that have infinite lifespans, seconds.
         origin: f64,
     },
     /// Not at all: positions and quaternions are those of a tracked frame, in a table of their own.
     Posed,
-    /// As slices of Gaussians of space and time ([`motion::native4d`](crate::motion::native4d)), whose further columns are a table.
+    /// As slices of Gaussians of space and time ([`motion::native4d`](crate::motion::native4d)), whose further columns
+    /// are a table.
     Sliced {
-        /// κ, scene units a second.
+        /// κ, scene units per second.
         speed: f64,
         /// Least c, scene units².
         floor: f64,
@@ -68,14 +70,15 @@ pub struct ResidentLayer<'a> {
     pub life: LifeKind,
     /// See [`KEPT`].
     pub tables: [ResidentTable<'a>; KEPT],
-    /// Sum of |dL/dmean2d|, number of views that drew it, largest radius: three columns.
+    /// Sum of |dL/dmean2d|, number of views that rendered it, largest radius: three columns.
     pub stats: &'a [f32],
     /// What the poses of a [`Moves::Posed`] layer are held by.
     pub ties: Option<&'a ResidentTies>,
 }
 
-/// The ties of a tracked frame's poses: rigidity, rotation and isometry along the edges of a graph, a floor below its points, and a
-/// background that stays where the geometry's own poses are. Weights are those of a point's or an edge's share in the loss.
+/// The ties of a tracked frame's poses: rigidity, rotation and isometry along the edges of a graph, a floor below its
+/// points, and a background that stays where the geometry's own poses are. Weights are those of a point's or an edge's
+/// share in the loss.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ResidentTies {
     /// Rows of the graph's points.
@@ -139,7 +142,7 @@ pub struct ResidentNoise {
 pub struct ResidentCameras<'a> {
     /// Cameras.
     pub count: usize,
-    /// A table of twelve columns a camera: its matrix without the identity, row by row, then an offset a channel.
+    /// A table of twelve columns per camera: its matrix without the identity, row by row, then an offset per channel.
     pub table: ResidentTable<'a>,
     /// Those whose mean is held at the identity.
     pub held: &'a [usize],
@@ -212,11 +215,11 @@ pub struct ResidentNumbers {
 
 /// Keeps a scene's tables and takes steps on them: evaluate, draw, compare, back, Adam.
 ///
-/// Steps are begun and done later: several may be under way, whose results come in their order. What they come to does not depend on
-/// when it is read.
+/// Steps are begun and done later: several may be under way, whose results come in their order. What they come to does
+/// not depend on when it is read.
 pub trait Resident {
-    /// Takes over all layers, in place of whatever was kept; steps under way are forgotten. `corrections`: Adam's 1/(1 − β₁ⁿ) and
-    /// 1/(1 − β₂ⁿ) by step count n, the last for all that follow.
+    /// Takes over all layers, in place of whatever was kept; steps under way are forgotten. `corrections`: Adam's 1/(1
+    /// − β₁ⁿ) and 1/(1 − β₂ⁿ) by step count n, the last for all that follow.
     ///
     /// Errors: they are too large for the device, or it failed.
     fn keep(
@@ -244,6 +247,7 @@ pub trait Resident {
     /// The numbers of a layer, with no step under way. Errors: the device failed. Panics: as of `step`.
     fn fetch(&mut self, layer: usize) -> Result<ResidentNumbers>;
 
-    /// The cameras' colour matrices and their moments, in the same way; nothing where none are kept. Errors: as of `fetch`.
+    /// The cameras' colour matrices and their moments, in the same way; nothing where none are kept. Errors: as of
+    /// `fetch`.
     fn fetch_cameras(&mut self) -> Result<[Vec<f32>; 2]>;
 }

@@ -1,6 +1,6 @@
 //! The feature head: a tiny network that turns nine blended channels of a pixel into its colour.
 //!
-//! Here are its weights and their shapes; what it computes, and how that is drawn, stands in `render/head.rs`.
+//! Here are its weights and their shapes; what it computes, and how that is rendered, stands in `render/head.rs`.
 //! Source: Li et al. 2024 (Spacetime Gaussians) §4.1 and its released code.
 
 use super::{Key, Params};
@@ -32,8 +32,8 @@ pub struct HeadKeys {
 }
 
 impl HeadKeys {
-    /// Makes the weights, or claims the loaded ones: W₁ uniform within ±√(6/[`INPUTS`]) (He et al. 2015), W₂ zero, so that
-    /// the head starts as the identity. Errors: loaded arrays of the wrong shape.
+    /// Makes the weights, or claims the loaded ones: W₁ uniform within ±√(6/[`INPUTS`]) (He et al. 2015), W₂ zero, so
+    /// that the head starts as the identity. Errors: loaded arrays of the wrong shape.
     pub(crate) fn new<F: Real>(seed: u64, p: &mut Params<F>) -> Result<Self> {
         let bound = (6.0 / INPUTS as f64).sqrt();
         let rng = Rng::new(seed, HEAD_IN, 0);

@@ -1,5 +1,5 @@
-//! The life of a Gaussian: an envelope in time that any layer may carry, so that birth, death and the active set work for
-//! every motion model.
+//! The lifespan of a Gaussian: an envelope in time that any layer may carry, so that birth, death and the active set
+//! work for every motion model.
 
 use super::Time;
 use crate::math::Real;
@@ -17,11 +17,11 @@ pub enum LifeKind {
     Interval,
 }
 
-/// Column of the centre in the life table.
+/// Column of the centre in the lifespan table.
 pub const CENTER: usize = 0;
-/// Column of the logarithm of the width in the life table.
+/// Column of the logarithm of the width in the lifespan table.
 pub const LOG_WIDTH: usize = 1;
-/// Column of the logarithm of the softness in the life table (interval only).
+/// Column of the logarithm of the softness in the lifespan table (interval only).
 pub(crate) const LOG_SOFTNESS: usize = 2;
 
 /// σ and its derivatives to (t, centre, log width, log softness).
@@ -38,7 +38,7 @@ pub struct LifeValue<F> {
 }
 
 impl LifeKind {
-    /// The life table's columns.
+    /// The lifespan table's columns.
     pub fn columns(self) -> &'static [(&'static str, usize)] {
         match self {
             Self::Infinite => &[],
@@ -62,7 +62,7 @@ impl LifeKind {
         [Self::Infinite, Self::GaussHalf, Self::GaussOne, Self::Interval].into_iter().find(|k| k.name() == name)
     }
 
-    /// σ at time t and its derivatives; `row` holds the life columns (unused ones are not read).
+    /// σ at time t and its derivatives; `row` holds the lifespan columns (unused ones are not read).
     #[inline(always)]
     pub fn eval<F: Real>(self, row: [F; 3], t: Time) -> LifeValue<F> {
         let zero = F::ZERO;
@@ -93,8 +93,8 @@ impl LifeKind {
         }
     }
 
-    /// ∂²σ/∂t² at time t, for a `row` as [`LifeKind::eval`] takes it: how far from constant or fading evenly the life
-    /// is. Where an interval's flat top meets its tail it jumps; there it is the top's, 0.
+    /// ∂²σ/∂t² at time t, for a `row` as [`LifeKind::eval`] takes it: how far from constant or fading evenly the
+    /// lifespan is. Where an interval's flat top meets its tail it jumps; there it is the top's, 0.
     pub fn d2_time<F: Real>(self, row: [F; 3], t: Time) -> F {
         let (delta, sigma) = (F::of(t.0) - row[CENTER], self.eval(row, t).sigma);
         // σ = exp(−h·x²), x in units of 1/inverse: σ'' = (4h²x² − 2h)·σ·inverse².
@@ -116,7 +116,8 @@ impl LifeKind {
         (h2 * h2 * x * x - h2) * sigma * inverse * inverse
     }
 
-    /// The seconds before and after the centre at which σ·opacity falls to `alpha_min`; negative where it never reaches it.
+    /// The seconds before and after the centre at which σ·opacity falls to `alpha_min`; negative where it never reaches
+    /// it.
     pub fn reach(self, row: [f64; 3], opacity: f64, alpha_min: f64) -> f64 {
         let level = (opacity / alpha_min).ln();
         if level < 0.0 {

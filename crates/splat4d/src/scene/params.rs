@@ -77,7 +77,7 @@ pub struct Key(pub u32);
 pub const GEOMETRY: Key = Key(0);
 /// `sh` 3·K, coefficient-major: coefficient k of channel c is column 3k + c.
 pub const SH: Key = Key(1);
-/// The life envelope's columns, none for a layer whose Gaussians live for ever.
+/// The lifespan envelope's columns, none for a layer whose Gaussians have infinite lifespans.
 pub const LIFE: Key = Key(2);
 
 /// Columns of [`GEOMETRY`].
@@ -110,7 +110,7 @@ pub struct LoadedArray {
     pub name: String,
     /// Rows.
     pub rows: usize,
-    /// Numbers a row.
+    /// Numbers per row.
     pub width: usize,
     /// Row-major.
     pub data: Vec<f32>,
@@ -130,12 +130,14 @@ pub struct Params<F = f32> {
 }
 
 impl<F: Real> Params<F> {
-    /// `rows` Gaussians with `sh_coefficients` (K) spherical-harmonic coefficients and the given life columns, all zero.
+    /// `rows` Gaussians with `sh_coefficients` (K) spherical-harmonic coefficients and the given life columns, all
+    /// zero.
     pub fn new(rows: usize, sh_coefficients: usize, life: &[(&'static str, usize)]) -> Self {
         Self::build(Vec::new(), rows, sh_coefficients, life).expect("without loaded arrays nothing can mismatch")
     }
 
-    /// As [`new`](Self::new), filled from loaded arrays where the names match; the rest waits for [`entry`](Self::entry).
+    /// As [`new`](Self::new), filled from loaded arrays where the names match; the rest waits for
+    /// [`entry`](Self::entry).
     pub fn build(
         loaded: Vec<LoadedArray>,
         rows: usize,
@@ -183,8 +185,8 @@ impl<F: Real> Params<F> {
         Ok(key)
     }
 
-    /// A `Fixed` table of one column of `numbers` rows, which lie one after the other: a weight, a grid. The table and its
-    /// column group share the name.
+    /// A `Fixed` table of one column of `numbers` rows, which lie one after the other: a weight, a grid. The table and
+    /// its column group share the name.
     ///
     /// Errors: the loaded array has another shape.
     pub fn array(&mut self, name: &str, numbers: usize, init: impl FnOnce(&mut [F])) -> Result<Key> {
@@ -337,8 +339,8 @@ impl<F> std::ops::IndexMut<Key> for Params<F> {
 
 /// Gradients to a [`Params`]. Only touched tables and active rows are ever cleared or stepped.
 ///
-/// Pages of frames that nothing reaches cost nothing: their tables have no rows until something is added to them, so that
-/// memory does not grow with the frames that were tracked before.
+/// Pages of frames that nothing reaches cost nothing: their tables have no rows until something is added to them, so
+/// that memory does not grow with the frames that were tracked before.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Grads<F = f32> {
     tables: Vec<Table<F>>,

@@ -41,7 +41,8 @@ pub struct Part<'a, F = f32> {
     pub out: &'a Table<F>,
     /// Colour.
     pub color: Color<'a, F>,
-    /// Rotation (rows) that takes directions of the world to the axes of the spherical harmonics; none: they are the same.
+    /// Rotation (rows) that takes directions of the world to the axes of the spherical harmonics; none: they are the
+    /// same.
     pub layer_from_world: Option<[[F; 3]; 3]>,
 }
 
@@ -55,7 +56,7 @@ impl<'a, F: Real> Part<'a, F> {
 /// A scene at one time: a part a layer. Splats are numbered through all parts in order.
 #[derive(Clone, Debug, Default)]
 pub struct Splats<'a, F = f32> {
-    /// One a layer.
+    /// One per layer.
     pub parts: Vec<Part<'a, F>>,
     /// Network from blended channels to colour; none: they are the colour. To it, parts without features have zeros.
     pub head: Option<HeadWeights<'a, F>>,

@@ -15,7 +15,7 @@ pub const BLOCK: usize = 16;
 pub struct Column {
     /// The array's name in a scene file.
     pub name: Cow<'static, str>,
-    /// Numbers a row.
+    /// Numbers per row.
     pub width: usize,
 }
 
@@ -51,7 +51,7 @@ impl<F: Real> Table<F> {
         self.rows
     }
 
-    /// Numbers a row.
+    /// Numbers per row.
     pub fn width(&self) -> usize {
         self.width
     }
@@ -250,7 +250,7 @@ pub struct TableMut<'a, F = f32> {
     pub first: usize,
     /// Rows in the view.
     pub rows: usize,
-    /// Numbers a row.
+    /// Numbers per row.
     pub width: usize,
     /// `[row/16][column][16]`
     pub data: &'a mut [F],

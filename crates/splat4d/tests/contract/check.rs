@@ -1,5 +1,5 @@
-//! What every motion model must keep, checked on a model made from its [`Spec`] with random parameters in f64: gradients
-//! to every table and to t against central differences, compact rows, random access, files, row edits.
+//! What every motion model must keep, checked on a model made from its [`Spec`] with random parameters in f64:
+//! gradients to every table and to t against central differences, compact rows, random access, files, row edits.
 
 use splat4d::format::scene::{read, spec_from_json, spec_to_json, write};
 use splat4d::layers::{Head, Layer, Scene};
@@ -18,7 +18,7 @@ const H: f64 = 1e-6;
 const TOLERANCE: (f64, f64) = (2e-5, 1e-7);
 /// Numbers of every table that are moved, at most.
 const PROBED: usize = 40;
-/// The times that are asked: within the clip of one second, on a frame, at its ends and outside.
+/// The times that are queried: within the clip of one second, on a frame, at its ends and outside.
 const TIMES: [f64; 5] = [0.31, 0.7333, 0.0, 1.0, 1.2];
 
 /// A model in f64 with its parameters.
@@ -84,7 +84,7 @@ impl Subject {
         (cache, tape)
     }
 
-    /// The splats of a question.
+    /// The splats of a query.
     pub(crate) fn splats(&self, of: Space, rows: Rows<'_>, t: f64) -> Table<f64> {
         self.request(of, rows, t).1.out
     }
@@ -100,7 +100,7 @@ impl Subject {
         out
     }
 
-    /// Σ weights · answers over all questions of a step.
+    /// Σ weights · answers over all queries of a step.
     fn value(&self, spaces: &[Space], rows: &[u32], times: &[f64], w: &Weights) -> f64 {
         let q = self.questions(spaces, rows, times);
         let mut cache = Cache::default();
@@ -120,7 +120,7 @@ impl Subject {
         sum
     }
 
-    /// The gradient of [`value`](Self::value), and to every question's time.
+    /// The gradient of [`value`](Self::value), and to every query's time.
     fn gradient(&self, spaces: &[Space], rows: &[u32], times: &[f64], w: &Weights) -> (Grads<f64>, Vec<f64>) {
         let q = self.questions(spaces, rows, times);
         let (mut cache, mut d_cache) = (Cache::default(), Cache::default());
@@ -195,7 +195,7 @@ impl Subject {
         }
     }
 
-    /// A question about some rows answers as the question about all.
+    /// A query about some rows answers as the query about all.
     pub(crate) fn compact(&self) {
         let rows: Vec<u32> = (0..self.p.len() as u32).filter(|r| r % 4 == 1 || r % 7 == 0).collect();
         for t in TIMES {
@@ -212,7 +212,7 @@ impl Subject {
         }
     }
 
-    /// Any time has an answer, alone as together with others.
+    /// Any time has a result, alone as together with others.
     pub(crate) fn random_access(&self) {
         for t in [-1e4, -0.3, 0.0, 0.5, 1.0, 1.7, 1e4] {
             let out = self.splats(Space::Gaussians, Rows::All, t);
@@ -331,7 +331,7 @@ pub(crate) fn files(spec: &Spec, rows: usize, life: LifeKind) {
     assert!(*spec == Spec::Still || refused.is_err(), "unknown fields are refused");
 }
 
-/// An answer at the start is the canonical cloud: what `build` makes does not move anything.
+/// A result at the start is the canonical cloud: what `build` makes does not move anything.
 pub(crate) fn starts_still(spec: &Spec, rows: usize) {
     let s = subject(spec, rows, LifeKind::Infinite, 0.0, 9);
     let mut still = Params::<f64>::new(rows, 4, &[]);
@@ -384,7 +384,7 @@ pub(crate) fn filtered(spec: &Spec, rows: usize, life: LifeKind, spaces: &[Space
     let plain = subject(spec, rows, life, 0.1, 1);
     let around = |fusion: Fusion| {
         let mut p = plain.p.clone();
-        // The clip begins so early that every question has a past.
+        // The clip begins so early that every query has a past.
         let own = FilteredSpec::around(spec.clone(), 0.05, -1.0);
         let own = FilteredSpec { fusion, stop_gradient: false, ..own };
         let motion = Arc::new(Filtered::around(plain.motion.clone(), own, &mut p).expect("settings are sound"));

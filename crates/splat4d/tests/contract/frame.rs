@@ -11,7 +11,7 @@ use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::splats::COV;
 use splat4d::scene::{Camera, Grads, LifeKind, Rows, SH, Space, SplatGrads, Table, Time};
 
-/// Largest difference between a framed answer and the answer framed by hand, and of their images, in f64.
+/// Largest difference between a framed result and the result framed by hand, and of their images, in f64.
 const SAME: f64 = 1e-6;
 /// Largest difference between a frozen moment's image and the scene's: f32, and shapes out of a decomposition.
 const FROZEN: f32 = 2e-3;
@@ -21,7 +21,7 @@ const ALIKE: f64 = 45.0;
 const AS_WELL: f64 = 3.0;
 /// Half the step of the central differences.
 const H: f64 = 1e-6;
-/// The times that are asked.
+/// The times that are queried.
 const TIMES: [f64; 3] = [0.31, 0.7333, 1.2];
 
 /// A frame that does all that a similarity can.
@@ -114,7 +114,7 @@ fn pictures(own: Layer<f64>, placed: Layer<f64>) {
     assert!(seen > 200, "the test must look at something: {seen}");
 }
 
-/// Along a random direction of all learnable numbers the framed answers change as the gradient states.
+/// Along a random direction of all learnable numbers the framed results change as the gradient states.
 fn gradient(mut layer: Layer<f64>, frozen: &[&str]) {
     let rng = Rng::new(81, "frame", 0);
     let weights = |like: &Table<f64>| {

@@ -96,7 +96,7 @@ fn hexplane() {
 
 #[test]
 fn tracked() {
-    // One frame only; a frame on a moment that is asked, gaps, a late start and an early end.
+    // One frame only; a frame on a moment that is queried, gaps, a late start and an early end.
     for times in [vec![0.2], vec![0.0, 0.25, 0.5, 1.0], vec![0.3, 0.9, 1.1]] {
         let spec = Spec::Tracked(TrackedSpec { times, foreground: false });
         model(&spec, ROWS, LifeKind::Infinite, &[Space::Gaussians], &[]);

@@ -31,7 +31,7 @@ struct Mesh {
 }
 
 impl Mesh {
-    /// Adds an attribute of `width` f32 a Gaussian.
+    /// Adds an attribute of `width` f32 per Gaussian.
     fn floats<const N: usize>(&mut self, name: &str, values: impl Iterator<Item = [f32; N]>) {
         let begin = self.bytes.len();
         values.for_each(|v| v.iter().for_each(|x| self.bytes.extend(x.to_le_bytes())));
@@ -120,8 +120,8 @@ pub(super) fn plain(params: &Params) -> Result<(File<'static>, Warnings)> {
     Ok((mesh.file(json!({"kernel": ELLIPSE, "colorSpace": SRGB}), &[]), warnings))
 }
 
-/// Gaussians as an .spz of version 2. The draft gives its numbers the axes of the file, and maps them to attributes that
-/// have accessors without bytes. Errors: there are none.
+/// Gaussians as an .spz of version 2. The draft gives its numbers the axes of the file, and maps them to attributes
+/// that have accessors without bytes. Errors: there are none.
 pub(super) fn compressed(params: &Params) -> Result<(File<'static>, Warnings)> {
     let mut bytes = Vec::new();
     // Version 2 names no axes: those of .ply draw no remark.

@@ -1,6 +1,6 @@
-//! Files of clips that are not finished: sections are appended, and a new index behind them; then the header names the new
-//! index. A reader of the old header continues with the old index, of which nothing was touched. What is finished is written
-//! again as any other file, its index in front.
+//! Files of clips that are not finished: sections are appended, and a new index behind them; then the header names the
+//! new index. A reader of the old header continues with the old index, of which nothing was touched. What is finished
+//! is written again as any other file, its index in front.
 
 use super::index::broken;
 use super::write::GENERATOR;
@@ -47,8 +47,9 @@ impl<F: Read + Write + Seek> Growing<F> {
         &mut self.file
     }
 
-    /// Adds the pages of a whole playback file, their palettes, masks and labels, and states `meta`, of which `gaussians` is counted.
-    /// `sync` is called before the header names what was added: until then the file is what it was.
+    /// Adds the pages of a whole playback file, their palettes, masks and labels, and states `meta`, of which
+    /// `gaussians` is counted. `sync` is called before the header names what was added: until then the file is what it
+    /// was.
     ///
     /// Errors: `part` is no whole file; metadata out of range; the file's. After an error the file is what it was.
     pub fn append(
@@ -108,9 +109,9 @@ impl<F: Read + Write + Seek> Growing<F> {
     }
 }
 
-/// Writes a file that grew as a finished one: an index in front, then sections in the order in which a player wants them,
-/// whatever the order in which they were added. `gaussians` of `meta` is counted; `poster` as in [`write()`](super::write()).
-/// Returns the file's length, bytes.
+/// Writes a file that grew as a finished one: an index in front, then sections in the order in which a player wants
+/// them, whatever the order in which they were added. `gaussians` of `meta` is counted; `poster` as in
+/// [`write()`](super::write()). Returns the file's length, bytes.
 ///
 /// Errors: `source` does not grow, or is damaged or cut short; metadata out of range; either file's.
 pub fn finish(source: &mut (impl Read + Seek), meta: Meta, poster: Option<&[u8]>, out: &mut dyn Write) -> Result<u64> {
@@ -147,10 +148,10 @@ pub fn finish(source: &mut (impl Read + Seek), meta: Meta, poster: Option<&[u8]>
     Ok(index.file_len)
 }
 
-/// What the first image needs: the first tier of its pages, what colours them, the rest of them; then time goes on.
+/// What the first image needs: the first tier of its pages, what colours them, the rest of them; then time continues.
 /// Palettes
-/// come before the first page that names them, masks behind their page, labels behind everything. Equal ones stand by their bytes, so that who added
-/// what when does not show.
+/// come before the first page that names them, masks behind their page, labels behind everything. Equal ones stand by
+/// their bytes, so that who added what when does not show.
 fn order(index: &Index) -> Vec<usize> {
     let start = index.meta.clip[0];
     let holds = |e: &Entry| e.span[0] <= start && start < e.span[1];

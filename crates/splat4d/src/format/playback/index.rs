@@ -116,7 +116,7 @@ pub struct Entry {
     pub degree: u16,
     /// Page: Gaussians. Palette: entries. Masks, labels, features: Gaussians of their page.
     pub count: u32,
-    /// Page: it is drawn for from ≤ t < to, seconds. Masks: first and last key time.
+    /// Page: it is rendered for from ≤ t < to, seconds. Masks: first and last key time.
     pub span: [f64; 2],
     /// Page: place of its palette in the table of sections; none: base colour only.
     pub palette: Option<u32>,
@@ -148,8 +148,9 @@ struct Header {
 }
 
 impl Index {
-    /// Bytes from the start that [`parse`](Self::parse) wants: 64 as long as `prefix` is shorter, then the exact number. Of a
-    /// file that grows that is nearly all of it: a reader with random access uses its [`place`](Self::place).
+    /// Bytes from the start that [`parse`](Self::parse) wants: 64 as long as `prefix` is shorter, then the exact
+    /// number. Of a file that grows that is nearly all of it: a reader with random access uses its
+    /// [`place`](Self::place).
     ///
     /// Errors: not a playback file, a newer major version, a damaged header.
     pub fn needed(prefix: &[u8]) -> Result<usize> {
@@ -176,8 +177,8 @@ impl Index {
         Ok(header.index_at..header.index_at + header.index_bytes as u64)
     }
 
-    /// Understands the start of a file, of which `prefix` holds at least [`needed`](Self::needed) bytes. `file_len`, where
-    /// it is known, is how long the file really is: a shorter one is cut short, which is no error here.
+    /// Understands the start of a file, of which `prefix` holds at least [`needed`](Self::needed) bytes. `file_len`,
+    /// where it is known, is how long the file really is: a shorter one is cut short, which is no error here.
     ///
     /// Errors: not a playback file, a newer major version, damage, a required section of an unknown kind.
     pub fn parse(prefix: &[u8], file_len: Option<u64>) -> Result<Self> {
@@ -217,8 +218,8 @@ impl Index {
         Ok(index)
     }
 
-    /// The pages (with their places in the table) that are drawn at second t, most important tier first. Clamps t to the
-    /// clip.
+    /// The pages (with their places in the table) that are rendered at second t, most important tier first. Clamps t to
+    /// the clip.
     pub fn pages_at(&self, t: f64) -> Vec<(usize, &Entry)> {
         let t = t.max(self.meta.clip[0]).min(self.meta.clip[1]);
         let mut pages: Vec<_> = self.pages().filter(|(_, e)| e.span[0] <= t && t < e.span[1]).collect();
@@ -319,8 +320,8 @@ impl Index {
         [&self.header(HEADER_BYTES as u64, &index)[..], &index].concat()
     }
 
-    /// The start of a file that grows, and its index, which is to be behind everything else, `at`; sections stay where they
-    /// are. Panics: as [`bytes`](Self::bytes).
+    /// The start of a file that grows, and its index, which is to be behind everything else, `at`; sections stay where
+    /// they are. Panics: as [`bytes`](Self::bytes).
     pub(super) fn growing(&mut self, at: u64, generator: &str) -> ([u8; HEADER_BYTES], Vec<u8>) {
         let index = self.table(&self.json(generator));
         (self.version, self.file_len) = (GROWING, at + index.len() as u64);
@@ -366,7 +367,8 @@ impl Index {
     }
 }
 
-/// Writes both checksums of a file's start, whose index is behind its header. Panics: fewer bytes than header and index have.
+/// Writes both checksums of a file's start, whose index is behind its header. Panics: fewer bytes than header and index
+/// have.
 #[cfg(test)]
 pub(super) fn seal(file: &mut [u8]) {
     let index_bytes = read_u32(file, 12).expect("a header") as usize;

@@ -92,7 +92,7 @@ pub struct NamedCamera {
     pub cx: f64,
     /// Principal point, pixels.
     pub cy: f64,
-    /// Nothing as near as this or nearer is drawn, scene units; readers that do not know it draw a little more.
+    /// Nothing as near as this or nearer is rendered, scene units; readers that do not know it draw a little more.
     #[serde(default = "nothing_nearer")]
     pub near: f64,
 }
@@ -127,7 +127,7 @@ pub struct PathKey {
     pub up: [f64; 3],
     /// Vertical field of view, degrees.
     pub fov_y: f64,
-    /// Second of the scene; none: time goes on by itself.
+    /// Second of the scene; none: time continues by itself.
     #[serde(default)]
     pub time: Option<f64>,
 }
@@ -168,7 +168,7 @@ impl NamedCamera {
 }
 
 impl Meta {
-    /// Refuses what no reader could draw. Errors: the first field that is out of range, by name.
+    /// Refuses what no reader could render. Errors: the first field that is out of range, by name.
     pub(super) fn check(&self) -> Result<()> {
         let wrong = |what: &str| Err(Error::input(format!("the playback file's {what}")));
         let finite = |values: &[f64]| values.iter().all(|x| x.is_finite());

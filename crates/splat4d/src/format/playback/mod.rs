@@ -83,19 +83,19 @@ const ALPHA_MIN: f64 = crate::layers::ALPHA_MIN;
 pub struct Primitive {
     /// Mean at `center`, scene units.
     pub mean: [f64; 3],
-    /// Middle of its life, and the time to which mean and rotation belong, seconds.
+    /// Middle of its lifespan, and the time to which mean and rotation belong, seconds.
     pub center: f64,
-    /// Seconds before and after the centre for which it is fully there; infinite: it lives for ever.
+    /// Seconds before and after the centre for which it is fully there; infinite: it has an infinite lifespan.
     pub half_width: f64,
-    /// Standard deviation of the Gaussian tails of its life, seconds.
+    /// Standard deviation of the Gaussian tails of its lifespan, seconds.
     pub softness: f64,
     /// Rotation wxyz at `center`; need not be normalised.
     pub quat: [f32; 4],
     /// Standard deviations along its axes, scene units.
     pub scales: [f32; 3],
-    /// Opacity in the middle of its life, 0 to 1.
+    /// Opacity in the middle of its lifespan, 0 to 1.
     pub opacity: f32,
-    /// Scene units a second.
+    /// Scene units per second.
     pub velocity: [f32; 3],
     /// Angular velocity about the world's axes, radians a second.
     pub turn: [f32; 3],
@@ -111,7 +111,7 @@ pub struct Primitive {
     pub features: Vec<f32>,
 }
 
-/// Gaussians that are drawn for from ≤ t < to.
+/// Gaussians that are rendered for from ≤ t < to.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Node {
     /// First second.

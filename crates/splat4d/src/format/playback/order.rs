@@ -1,5 +1,5 @@
-//! The order of the Gaussians of a page: blocks of 256 that are alike, so that a block is culled whole and its ranges are
-//! narrow.
+//! The order of the Gaussians of a page: blocks of 256 that are alike, so that a block is culled whole and its ranges
+//! are narrow.
 //!
 //! A k-d tree over place, life and size halves the page at whole blocks, each time across what differs most; within a
 //! block Gaussians are in Morton order, which deflate likes.
@@ -15,7 +15,7 @@ const FEATURES: usize = 6;
 const TIME_WEIGHT: f64 = 4.0;
 /// A factor e in size counts as much as this many standard deviations of all places.
 const SIZE_WEIGHT: f64 = 0.35;
-/// Standard deviations of its tails at which a life counts as over: o·σ is 1/255 at 3.3 of an opaque Gaussian.
+/// Standard deviations of its tails at which a lifespan counts as over: o·σ is 1/255 at 3.3 of an opaque Gaussian.
 const TAILS: f64 = 3.0;
 /// Cells along the longest side of a block's box, within which Morton order is distinguished.
 const CELLS: f64 = (1u32 << 10) as f64;

@@ -36,7 +36,7 @@ struct Gaussian {
 const CODE_8: f32 = 255.0;
 const CODE_16: f32 = 65535.0;
 const CODE_10_MIDDLE: f32 = 511.0;
-// Half-width codes: 0 is zero, 255 lives for ever, between them 253 steps.
+// Half-width codes: 0 is zero, 255 has an infinite lifespan, between them 253 steps.
 const FOREVER: u32 = 255u;
 const HALF_WIDTH_STEPS: f32 = 253.0;
 // A dying Gaussian's reach has this many softnesses on either side.

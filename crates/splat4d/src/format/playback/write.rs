@@ -81,17 +81,17 @@ impl ErrorStat {
 /// Errors of quantisation.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Errors {
-    /// Means in the middle of lives, per axis, scene units.
+    /// Means in the middle of lifespans, per axis, scene units.
     pub mean: ErrorStat,
     /// Scales, difference of logarithms; those below 1/1000 of the Gaussian's largest are taken for 1/1000, as written.
     pub scale: ErrorStat,
-    /// Rotations in the middle of lives, radians.
+    /// Rotations in the middle of lifespans, radians.
     pub rotation: ErrorStat,
-    /// Opacity in the middle of lives.
+    /// Opacity in the middle of lifespans.
     pub opacity: ErrorStat,
-    /// Half-widths and softness of lives, seconds.
+    /// Half-widths and softness of lifespans, seconds.
     pub life: ErrorStat,
-    /// Velocities, scene units a second and axis.
+    /// Velocities, scene units per second and axis.
     pub velocity: ErrorStat,
     /// Angular velocities, radians a second and axis.
     pub turn: ErrorStat,
@@ -136,7 +136,7 @@ pub(super) struct Sections {
     pub file: Index,
     bodies: Vec<Vec<u8>>,
     level: u32,
-    /// Labels and features by the section of their page: written behind everything that is drawn.
+    /// Labels and features by the section of their page: written behind everything that is rendered.
     labels: Vec<(u32, Vec<u8>)>,
     features: Vec<(u32, Vec<u8>)>,
     /// A poster that is written last.
@@ -192,7 +192,7 @@ impl Sections {
         Ok(())
     }
 
-    /// Labels of the page that was added last, one a Gaussian.
+    /// Labels of the page that was added last, one per Gaussian.
     pub(super) fn labels(&mut self, of: impl Iterator<Item = Option<u8>>) {
         let page = self.last_page();
         self.labels.extend(labels::bytes(of).map(|bytes| (page, bytes)));
@@ -264,7 +264,7 @@ pub fn write(draft: &Draft, config: &WriteConfig, out: &mut dyn Write) -> Result
         .try_for_each(|(i, n)| check(n, &draft.meta).map_err(|e| e.at(format!("node {i}"))))?;
     let (palette, entries) = palette(draft, config);
     // First what the first image needs: the important Gaussians of the clip's start in their base colours, what
-    // colours them, the rest of them; then time goes on.
+    // colours them, the rest of them; then time continues.
     let start = draft.meta.clip[0];
     let mut pieces = pieces(draft, config);
     let holds = |p: &Piece| draft.nodes[p.node].from <= start && start < draft.nodes[p.node].to;

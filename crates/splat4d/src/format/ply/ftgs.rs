@@ -1,8 +1,8 @@
 //! `.ftgs.ply` of FreeTimeGsVanilla, version 1: 3DGS with a time, a duration and a velocity each
 //! ([`freetime`](crate::format::freetime)).
 //!
-//! To the properties of a plain file come time, log_duration (clips) and velocity_0..2 (units per clip), all f32; comments
-//! state `ftgs_version`, `n_frames`, `use_velocity`. Our files say clip and frame rate in a further comment.
+//! To the properties of a plain file come time, log_duration (clips) and velocity_0..2 (units per clip), all f32;
+//! comments state `ftgs_version`, `n_frames`, `use_velocity`. Our files say clip and frame rate in a further comment.
 //! Source: OpsiClear-4DGS/FreeTimeGsVanilla, README and player.
 
 use super::header::{Element, Header};
@@ -33,7 +33,7 @@ pub(crate) const FTGS: Dialect = Dialect {
 
 /// Properties in addition to those of a plain file.
 const EXTRA: [&str; 5] = ["time", "log_duration", "velocity_0", "velocity_1", "velocity_2"];
-/// Curvature (units) and rotation (radians) over a life from which it counts as lost.
+/// Curvature (units) and rotation (radians) over a lifespan from which it counts as lost.
 const VISIBLE: f64 = 1e-4;
 /// Least opacity that players of the format render.
 const FLOOR: &str = "opacity_floor 0.0001";

@@ -66,7 +66,7 @@ fn the_written_layout_is_the_plain_one() {
     let header = std::str::from_utf8(&bytes[..end]).unwrap();
     let names: Vec<&str> = header.lines().filter_map(|l| l.strip_prefix("property float ")).collect();
     let row: Vec<f32> = bytes[end..].chunks(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect();
-    // 62 numbers a row at degree 3, as every viewer expects.
+    // 62 numbers per row at degree 3, as every viewer expects.
     assert_eq!((names.len(), row.len()), (62, 62));
     let value = |name: &str| row[names.iter().position(|n| *n == name).unwrap()];
     assert_eq!(names[..7], ["x", "y", "z", "nx", "ny", "nz", "f_dc_0"]);
@@ -253,7 +253,7 @@ fn infinities_that_mean_something_are_no_damage() {
     assert!(back[GEOMETRY].get(1, OPACITY) > 10.0 && back[GEOMETRY].get(2, LOG_SCALE) < -10.0);
     let said = DIALECT.open(&bytes).unwrap().warnings;
     assert!(said.lines()[0].contains("1 of 4 Gaussians have opacity +infinity"), "{said:?}");
-    // Nothing that can be drawn: no file.
+    // Nothing that can be rendered: no file.
     let mut lost = gaussians(2, 1);
     (0..2).for_each(|row| lost[GEOMETRY].set(row, 0, f32::NAN));
     let (scene, mut out) = (crate::format::dialect::still(lost), Vec::new());

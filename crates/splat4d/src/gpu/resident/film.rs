@@ -1,4 +1,5 @@
-//! Frames one after the other of a scene that stays on the GPU, none of them read back: how fast a screen could show them.
+//! Frames one after the other of a scene that stays on the GPU, none of them read back: how fast a screen could show
+//! them.
 
 use super::{Tables, at};
 use crate::Result;
@@ -24,8 +25,9 @@ struct Film<'a> {
 }
 
 impl GpuRenderer {
-    /// Draws frames of a scene, which takes the place of whatever is kept, as planes on the GPU: seconds from the first submission to the end of the last.
-    /// `None`: an image must be drawn in bands. Errors: a driver that failed.
+    /// Renders frames of a scene, which takes the place of whatever is kept, as planes on the GPU: seconds from the
+    /// first submission to the end of the last. `None`: an image must be rendered in bands. Errors: a driver that
+    /// failed.
     pub fn film(
         &mut self,
         layers: &[ResidentLayer<'_>],

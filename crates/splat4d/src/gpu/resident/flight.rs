@@ -1,8 +1,9 @@
-//! Steps under way: begun without a wait, and done some steps later, when the GPU has written their record (record.wgsl).
+//! Steps under way: begun without a wait, and done some steps later, when the GPU has written their record
+//! (record.wgsl).
 //!
-//! Where a view has more pairs than there is room for, the GPU stops: nothing that follows is applied, neither of that step nor of
-//! those behind it, which may have been begun already. Who reads the record gives more room, or cuts images into
-//! more bands, and
+//! Where a view has more pairs than there is room for, the GPU stops: nothing that follows is applied, neither of that
+//! step nor of those behind it, which may have been begun already. Who reads the record gives more room, or cuts images
+//! into more bands, and
 //! begins again from that very view on. A step is a function of what it was begun with, so that neither the room nor
 //! the moment at
 //! which its record is read changes a bit.
@@ -19,8 +20,8 @@ use crate::scene::{Camera, Splats, Time};
 use crate::{Error, ErrorKind, Result};
 use std::collections::VecDeque;
 
-/// Steps that are under way at most: enough that a hiccup of the CPU of some steps' length is not seen, few enough that what they
-/// hold (an image each, where images are not kept) is little.
+/// Steps that are under way at most: enough that a hiccup of the CPU of some steps' length is not seen, few enough that
+/// what they hold (an image each, where images are not kept) is little.
 pub(in crate::gpu) const AHEAD: usize = 8;
 /// What stops steps because a number is none (record.wgsl).
 const NOT_FINITE: u32 = u32::MAX;
@@ -33,7 +34,7 @@ pub(super) struct PendingView {
     background: [f32; 3],
     held: Held,
     dssim: f64,
-    /// Number of the camera; one past all where it shows what is drawn.
+    /// Number of the camera; one past all where it shows what is rendered.
     pub rig: usize,
 }
 
@@ -69,7 +70,7 @@ pub(in crate::gpu) struct Flights {
     done: Vec<ResidentStepped>,
     /// Memory of records that are not in use.
     spare: Vec<Grown>,
-    /// Steps that were begun again for want of room.
+    /// Steps that were begun again for lack of room.
     #[cfg(test)]
     pub again: usize,
 }
@@ -81,7 +82,7 @@ struct Record {
 }
 
 impl GpuRenderer {
-    /// Does something with the tables that stay, whose drawn parts take the place of the last scene's meanwhile.
+    /// Does something with the tables that stay, whose rendered parts take the place of the last scene's meanwhile.
     pub(super) fn with_tables<T>(&mut self, f: impl FnOnce(&mut Self, &Tables) -> T) -> T {
         let mut tables = self.resident.take().expect("tables are kept before steps are taken");
         std::mem::swap(&mut self.upload, &mut tables.upload);
@@ -201,8 +202,8 @@ impl GpuRenderer {
         unreachable!("a step has a last view")
     }
 
-    /// Submits a view of a step, and, after its last, what it leaves: so many bytes of its status, and behind them its times.
-    /// Returns the last work, and the stages that are timed.
+    /// Submits a view of a step, and, after its last, what it leaves: so many bytes of its status, and behind them its
+    /// times. Returns the last work, and the stages that are timed.
     fn submit_view(
         &mut self,
         pass: &ResidentPass<'_>,

@@ -1,4 +1,5 @@
-//! The kernels of Gaussians of space and time against the motion model, in f64, at the edges of what numbers can stand too.
+//! The kernels of Gaussians of space and time against the motion model, in f64, at the edges of what numbers can stand
+//! too.
 
 use super::*;
 use crate::gpu::MOST_PAIRS;
@@ -17,7 +18,8 @@ const ROWS: usize = 500;
 /// Largest difference of a column, of the root of the mean square of its numbers.
 const COLUMN: f64 = 1e-4;
 
-/// Thin and thick, short-lived and long-lived ones, some beyond the floor and the ceiling, some with no rotation at all.
+/// Thin and thick, short-lived and long-lived ones, some beyond the floor and the ceiling, some with no rotation at
+/// all.
 fn params<F: Real>(spec: &Native4dSpec) -> (Params<F>, Key, Arc<dyn Motion<F>>) {
     let mut p = Params::<F>::new(ROWS, 1, &[]);
     let motion = build_as(&Spec::Native4d(*spec), &mut p).expect("a sound specification");
@@ -57,7 +59,7 @@ fn slices_equal_the_model_forth_and_back() {
     let Some(mut r) = renderer() else { return };
     let spec = Native4dSpec { speed: 2.0, min_life: 0.05, max_life: 3.0, ..Native4dSpec::default() };
     let ((single, own, _), (double, _, motion), t) = (params::<f32>(&spec), params::<f64>(&spec), 0.125);
-    // The answer and its gradients, in f64.
+    // The result and its gradients, in f64.
     let question = At { p: &double, of: Space::Gaussians, rows: Rows::All, t: Time(t) };
     let (mut tape, mut d) = (Tape::default(), Grads::new(&double));
     motion.at(&question, &Cache::default(), &mut tape);
@@ -67,7 +69,7 @@ fn slices_equal_the_model_forth_and_back() {
         let rng = Rng::new(4, "pulled", row as u64);
         let g: [f32; 10] = std::array::from_fn(|c| rng.normal(c as u64) as f32);
         pulled.write(row, 0, g.map(f64::from));
-        // Mean and opacity, covariance; nothing was drawn, so that colours add nothing.
+        // Mean and opacity, covariance; nothing was rendered, so that colours add nothing.
         back.extend([g[0], g[1], g[2], g[9], g[3], g[4], g[5], g[6], g[7], g[8], 0.0, 0.0].into_iter().chain([0.0; 8]));
     }
     d.activate(Space::Gaussians, Rows::All);

@@ -9,7 +9,7 @@ use frame::RECORD_BYTES;
 const RECORD: f64 = 1e-3;
 /// Largest relative difference of a gradient, as a vector, where both draw the same lists: roundings.
 const VECTOR: f64 = 1e-4;
-/// Of the whole chain, where a splat at the α cut-off may be drawn by one side only.
+/// Of the whole chain, where a splat at the α cut-off may be rendered by one side only.
 const CHAIN: f64 = 2e-3;
 
 /// A gradient to an image: of both signs, different in all planes.

@@ -1,4 +1,5 @@
-//! Comparing on the GPU: value and gradient against the definition in f64, then all of it against the way through the CPU.
+//! Comparing on the GPU: value and gradient against the definition in f64, then all of it against the way through the
+//! CPU.
 
 use super::*;
 use crate::render::{Comparison, PartGrads, Target};
@@ -32,7 +33,7 @@ fn truth(seed: u64, camera: &Camera, eight: bool) -> (Planes<f32>, Planes<f32>) 
     (color, weight)
 }
 
-/// The definition: value and gradient to the drawn image and to the response, every window summed up where it is
+/// The definition: value and gradient to the rendered image and to the response, every window summed up where it is
 /// needed.
 fn defined(drawn: &Planes<f32>, target: &Target<'_>) -> (Comparison, Vec<f64>) {
     let (h, w) = (drawn.height as i64, drawn.width as i64);

@@ -3,8 +3,8 @@
 use super::*;
 use crate::render::RenderStats;
 
-/// Largest difference of a colour or an alpha. A splat at the α cut-off may be drawn on one side only, which is 1/255
-/// of what is left of the light there.
+/// Largest difference of a colour or an alpha. A splat at the α cut-off may be rendered on one side only, which is
+/// 1/255 of what is left of the light there.
 const PIXEL: f32 = 2e-3;
 /// Largest difference of Σ z α T, of the scene's depth.
 const DEPTH: f32 = 2e-3;

@@ -1,4 +1,4 @@
-//! Which questions are one, and that the way there and back is that of the motion models.
+//! Which queries are one, and that the way there and back is that of the motion models.
 
 use super::*;
 use crate::math::Rng;
@@ -36,7 +36,7 @@ fn layer(spec: &Spec, life: LifeKind, seed: u64) -> Layer<f64> {
     Layer::new("made", params, motion, life)
 }
 
-/// One layer with lives, and one whose motion model prepares and finishes.
+/// One layer with lifespans, and one whose motion model prepares and finishes.
 fn layers() -> Vec<Layer<f64>> {
     let skin = SkinSpec { nodes: 5, neighbours: 3, hyper: 2, mask: false };
     let trajectory = TrajectorySpec::Keys { curve: Curve::Cubic, keys: 4 };
@@ -101,7 +101,7 @@ fn active_rows_are_merged_with_requested_rows() {
     }
 }
 
-/// The questions of the tests below: a layer, its rows, a time.
+/// The queries of the tests below: a layer, its rows, a time.
 const ASKED: [(usize, Option<&[u32]>, f64); 4] =
     [(0, Some(&[1, 4, 17]), 0.3), (1, None, 0.3), (0, Some(&[4, 5]), 0.7), (1, Some(&[0, 9]), 0.6)];
 
@@ -114,7 +114,7 @@ fn evaluation(layers: &[Layer<f64>]) -> Evaluation<f64> {
     e
 }
 
-/// dL/d out of question i, row j, column c; L is linear in all answers.
+/// dL/d out of query i, row j, column c; L is linear in all results.
 fn weight(i: usize, j: usize, c: usize) -> f64 {
     0.3 + 0.17 * j as f64 - 0.21 * c as f64 + 0.05 * (c * c) as f64 + 0.4 * i as f64
 }
@@ -136,7 +136,7 @@ fn d_outs(e: &Evaluation<f64>) -> Vec<Table<f64>> {
     e.tapes().enumerate().map(table).collect()
 }
 
-/// Gradients of the layers, and dL/dt by question.
+/// Gradients of the layers, and dL/dt by query.
 fn gradients(layers: &[Layer<f64>]) -> (Vec<Grads<f64>>, Vec<f64>) {
     let mut e = evaluation(layers);
     let mut d: Vec<Grads<f64>> = layers.iter().map(|l| Grads::new(&l.params)).collect();

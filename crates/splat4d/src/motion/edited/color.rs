@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 
 /// c ↦ curve(M c + o), channel by channel in the curve; colours are 0 to 1.
 ///
-/// On spherical harmonics the base colour goes through it and all that varies with direction through its slope there: exact
-/// where there is no curve.
+/// On spherical harmonics the base colour goes through it and all that varies with direction through its slope there:
+/// exact where there is no curve.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ColorMap {
@@ -15,8 +15,8 @@ pub struct ColorMap {
     pub matrix: [[f64; 3]; 3],
     /// o
     pub offset: [f64; 3],
-    /// Corners [in, out] of a broken line, `in` rising; beyond the first and the last it goes on as it did. Fewer than two:
-    /// no curve.
+    /// Corners [in, out] of a broken line, `in` rising; beyond the first and the last it continues as it did. Fewer
+    /// than two: no curve.
     pub curve: Vec<[f64; 2]>,
 }
 

@@ -43,7 +43,7 @@ fn constant_velocity_is_predicted_exactly() {
             assert_near(&p.cov, &shape.cov, 1e-12);
         }
     }
-    // A ball that grows steadily: standard deviations go on in a straight line along the geodesic, variances do not.
+    // A ball that grows steadily: standard deviations continue in a straight line along the geodesic, variances do not.
     let grown = |t: f64| ball([0.0; 3], 1.0 + 0.3 * t);
     let truth = grown(2.0);
     let curved = Prediction::new(Predictor::Wasserstein, &grown(1.0), &grown(0.0), 1).point;
@@ -311,7 +311,7 @@ fn with_the_gradient_stopped_only_the_observation_learns() {
     let stopped = of(around.clone());
     let gains = filled::<f64>(&Spec::Filtered(around), 9).0.find(GAINS).unwrap();
     for j in 0..9 {
-        // μ = κμₒ + (1−κ)(2μ₁−μ₂): all of it is one to the canonical mean, κ alone where earlier answers are constants.
+        // μ = κμₒ + (1−κ)(2μ₁−μ₂): all of it is one to the canonical mean, κ alone where earlier results are constants.
         assert!((whole.table(GEOMETRY).get(j, 0) - 1.0).abs() < 1e-9);
         let kept = stopped.table(GEOMETRY).get(j, 0);
         assert!(kept > 0.2 && kept < 0.9, "{kept}");
@@ -415,7 +415,7 @@ fn models() -> Vec<Spec> {
     all
 }
 
-/// Answers, colours, gradients and velocities of a step with two questions.
+/// Answers, colours, gradients and velocities of a step with two queries.
 fn whole(p: &Params<f64>, model: &dyn Motion<f64>, rows: Rows<'_>) -> Vec<f64> {
     let q = [0.21, 0.77].map(|t| At { p, of: Space::Gaussians, rows, t: Time(t) });
     let (mut cache, mut d_cache, mut d) = (Cache::default(), Cache::default(), Grads::new(p));

@@ -49,7 +49,7 @@ const FASTEST: f64 = 1e9;
 pub struct Native4dSpec {
     /// κ: how many scene units are as far as a second. Rotations mix space with κt, so that a velocity of κ is 45°.
     pub speed: f64,
-    /// No Gaussian's life has a smaller standard deviation than this, seconds.
+    /// No Gaussian's lifespan has a smaller standard deviation than this, seconds.
     pub min_life: f64,
     /// No scale in time counts as more than this, seconds.
     pub max_life: f64,
@@ -107,8 +107,8 @@ impl Model for Native4dSpec {
     }
 }
 
-/// Gives a Gaussian, which may move, another velocity at the middle of its life, scene units a second: its slice there and
-/// its life stay. Panics: the model has not made its table.
+/// Gives a Gaussian, which may move, another velocity at the middle of its lifespan, scene units per second: its slice
+/// there and its lifespan stay. Panics: the model has not made its table.
 pub fn set_velocity(spec: &Native4dSpec, params: &mut Params<f32>, row: usize, velocity: [f64; 3]) {
     let own = params.find(TABLE).expect("the model has made its table");
     let slice = Sliced::of(spec, params, own, row);
@@ -137,8 +137,8 @@ impl Native4d {
     }
 }
 
-/// Makes room for `blocks` blocks of SH coefficients. A table of one block differs from one of several by its width: 1, 4,
-/// 9 and 16 coefficients are no whole number of blocks of one another, but for one block.
+/// Makes room for `blocks` blocks of SH coefficients. A table of one block differs from one of several by its width: 1,
+/// 4, 9 and 16 coefficients are no whole number of blocks of one another, but for one block.
 fn widen<F: Real>(p: &mut Params<F>, blocks: usize) -> Result<()> {
     let (rows, width) = (p.len(), p[SH].width());
     let whole = |width: usize| matches!(width, 3 | 12 | 27 | 48);
@@ -174,8 +174,8 @@ impl<F: Real> Motion<F> for Native4d {
         Spec::Native4d(self.spec)
     }
 
-    /// Q(l X r̄)Q̄ = (Ql) X (Qr)̄: the right quaternion of a rotation of four dimensions rotates as the left one does. A scale
-    /// has no place, since it would change κ.
+    /// Q(l X r̄)Q̄ = (Ql) X (Qr)̄: the right quaternion of a rotation of four dimensions rotates as the left one does.
+    /// A scale has no place, since it would change κ.
     fn apply_transform(&self, p: &mut Params<F>, frame: &Sim3) -> bool {
         if frame.scale != 1.0 {
             return false;
@@ -250,7 +250,7 @@ impl<F: Real> Motion<F> for Native4d {
         }
     }
 
-    /// The slice grows; velocity and life stay.
+    /// The slice grows; velocity and lifespan stay.
     fn resize(&self, p: &mut Params<F>, row: usize, factor: f64) {
         let mut g = Sliced::of(&self.spec, p, self.own, row);
         g.cov = g.cov.map(|x| x * factor * factor);
@@ -274,7 +274,7 @@ impl<F: Real> Motion<F> for Native4d {
     }
 }
 
-/// One question's parameters, read sixteen rows at a time.
+/// One query's parameters, read sixteen rows at a time.
 struct Reader<'a, F> {
     geometry: &'a Table<F>,
     own: &'a Table<F>,
@@ -402,7 +402,7 @@ impl<F: Real> Work<F, 1> for WavesBackward<'_, F> {
     }
 }
 
-/// Centre and log width of the lives.
+/// Centre and log width of the lifespans.
 struct Life<'a, F> {
     geometry: &'a Table<F>,
     own: &'a Table<F>,

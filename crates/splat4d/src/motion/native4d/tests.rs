@@ -72,8 +72,8 @@ fn rotations_are_rotations_and_equal_quaternions_turn_space_alone() {
     }
 }
 
-/// The reference's matrices: M_l M_r with both axes reversed. Its quaternions have x and z swapped and their signs changed,
-/// and, since it turns the conjugate of X, its left one is our right one.
+/// The reference's matrices: M_l M_r with both axes reversed. Its quaternions have x and z swapped and their signs
+/// changed, and, since it turns the conjugate of X, its left one is our right one.
 #[test]
 fn the_reference_writes_the_same_rotation_with_reversed_axes() {
     let m_l = |[a, b, c, d]: [f64; 4]| [[a, -b, -c, -d], [b, a, -d, c], [c, d, a, -b], [d, -c, b, a]];
@@ -214,7 +214,7 @@ fn conversions_agree_at_thirty_times_both_ways() {
             }
         }
     }
-    // A life of STG's is a shorter one of ours; what has no counterpart is refused.
+    // A lifespan of STG's is a shorter one of ours; what has no counterpart is refused.
     let stg = Layer { life: LifeKind::GaussOne, ..kinematic.clone() };
     let same = to_native4d(&stg, SPEC).unwrap();
     let (a, b) = (splats(&stg, 0.3), splats(&same, 0.3));

@@ -1,8 +1,8 @@
 //! Linear blend skinning of a cloud at one time, and its VJP.
 //!
-//! A node's rigid motion is sixteen numbers, one register or two: R (9, rows), c = p + T − R p (3), and R's unit quaternion
-//! (4). A Gaussian blends the numbers of its nodes and goes to M x + c with the blend; it is node by node only that sums are
-//! made, and all else is done for sixteen Gaussians at a time.
+//! A node's rigid motion is sixteen numbers, one register or two: R (9, rows), c = p + T − R p (3), and R's unit
+//! quaternion (4). A Gaussian blends the numbers of its nodes and goes to M x + c with the blend; it is node by node
+//! only that sums are made, and all else is done for sixteen Gaussians at a time.
 
 use super::tasks::{sum_parts, task_rows};
 use super::{POSE, Skin, Weights};
@@ -97,7 +97,7 @@ impl<F: Real> Frames<F> {
     }
 }
 
-/// One question about Gaussians.
+/// One query about Gaussians.
 pub(super) struct Ask<'a, F> {
     pub skin: &'a Skin,
     pub p: &'a Params<F>,

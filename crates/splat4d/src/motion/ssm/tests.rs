@@ -98,7 +98,7 @@ fn error(spec: &SsmSpec, rest: &[[f64; 7]], g: &Motion3) -> (f64, f64) {
     (worst, size)
 }
 
-/// The answer for the scene that was not moved.
+/// The result for the scene that was not moved.
 fn at_rest(spec: &SsmSpec) -> Vec<[f64; 7]> {
     let (p, of) = field(spec, &Motion3::identity());
     poses(&p, &of)

@@ -59,7 +59,7 @@ fn images_with_a_head_equal_the_oracle() {
 fn the_network_is_a_matrix_product_a_pixel() {
     let (s, view) = (Headed::new(20, 0.3), camera(33, 21));
     let got = s.draw(&view, BACKGROUND).color;
-    // Without a head the same splats are drawn with their features as further channels.
+    // Without a head the same splats are rendered with their features as further channels.
     let n = s.scene.splats().len();
     let mut channels = Table::new(&[("further", FURTHER)], n);
     for j in 0..s.scene.direct.rows() {

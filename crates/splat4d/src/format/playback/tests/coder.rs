@@ -125,7 +125,7 @@ fn pages_as_they_are_come_back_almost_unchanged() {
                 (moved, total) = (moved + usize::from((x - y).abs() > 1e-5 * (1.0 + x.abs())), total + 1);
             }
         }
-        // A life that as decoded spans all of its page becomes one for ever, and moves its centre.
+        // A lifespan that as decoded spans all of its page becomes one for ever, and moves its centre.
         assert!(1000 * moved < total, "{moved} of {total} numbers moved");
     }
 }

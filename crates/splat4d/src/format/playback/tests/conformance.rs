@@ -1,5 +1,6 @@
-//! The conformance set of docs/format.md: small files, one per feature, with the numbers that a reader has to get from them,
-//! and files that it has to refuse. `UPDATE_GOLDEN=1` writes the set; otherwise it is read, so that later versions still read it.
+//! The conformance set of docs/format.md: small files, one per feature, with the numbers that a reader has to get from
+//! them, and files that it has to refuse. `UPDATE_GOLDEN=1` writes the set; otherwise it is read, so that later
+//! versions still read it.
 
 use super::hostile::{reseal, with_entry};
 use super::*;
@@ -14,7 +15,8 @@ use std::sync::Arc;
 const LISTED: usize = 6;
 /// Colours are those seen from here.
 const EYE: [f64; 3] = [0.5, -1.0, -4.0];
-/// Least relative distance of an opacity from the threshold below which nothing is rendered: readers may compute in f32.
+/// Least relative distance of an opacity from the threshold below which nothing is rendered: readers may compute in
+/// f32.
 const CLEAR: f64 = 1e-4;
 /// Digits of the numbers.
 const DIGITS: i32 = 7;
@@ -143,7 +145,8 @@ fn growing() -> Vec<u8> {
     growing.file().get_ref().clone()
 }
 
-/// What later versions may add: a minor version, a key of the JSON, an optional section; and a page without its palette.
+/// What later versions may add: a minor version, a key of the JSON, an optional section; and a page without its
+/// palette.
 fn newer() -> Vec<u8> {
     let mut draft = scene(24, 2, 18);
     draft.poster = Some(b"whatever it is".to_vec());
@@ -437,7 +440,7 @@ fn strict_names_what_readers_tolerate() {
     told(with_entry(&sample, page, 4, &[3]), "section 0: unknown flags");
     told(with_entry(&sample, page, 4, &[0]), "section 0: `PAGE` is not marked as required");
     told([&sample[..], b"more"].concat(), "4 bytes after the end");
-    // The life of a block that ends when it begins, and spare bits of word 7.
+    // The lifespan of a block that ends when it begins, and spare bits of word 7.
     told(changed(body + 36, &sample[body + 32..body + 36]), "block 0: visible");
     let planes = body + 96 * n.div_ceil(256);
     told(changed(planes + 31 * n, &[1]), "spare bits");

@@ -1,4 +1,5 @@
-//! Files that grow: what is there plays at any time, and what is finished is a file like any other, in whatever order it was added.
+//! Files that grow: what is there plays at any time, and what is finished is a file like any other, in whatever order
+//! it was added.
 
 use super::*;
 use std::io::{Cursor, ErrorKind as Io, Read, Seek, SeekFrom, Write};
@@ -46,7 +47,7 @@ fn a_growing_file_plays_and_readers_of_an_older_header_are_not_disturbed() {
     let index = Index::of(&second[..64], &second[place.start as usize..place.end as usize]).unwrap();
     assert_eq!((index.meta.parts.clone(), index.meta.gaussians), (vec!["0".into(), "1".into()], 1800 - 2 * 450));
     assert!(Index::grows(&second) && index == Index::parse(&second, None).unwrap());
-    // Who goes on with the file finds what is in it.
+    // Who continues with the file finds what is in it.
     let again = Growing::open(Cursor::new(second)).unwrap();
     assert_eq!(again.index(), &index);
     assert!(Growing::open(Cursor::new(part(1, 0.0))).is_err(), "a finished file grows no more");

@@ -157,7 +157,7 @@ fn inconsistent_sizes_are_refused_by_name() {
     assert!(told(page, 8, &64u64.to_le_bytes()).contains("overlaps"));
     assert!(told(palette, 30, &4u16.to_le_bytes()).contains("degree 4"));
     assert!(told(palette, 32, &70_000u32.to_le_bytes()).contains("70000 entries"));
-    // One entry less than the pages' labels ask for, all sizes consistent: found when the page is expanded.
+    // One entry less than the pages' labels request, all sizes consistent: found when the page is expanded.
     let raw = bytes_of(&tiny(), &WriteConfig { deflate_level: 0, ..WriteConfig::default() }).0;
     let less = with_entry(&raw, palette, 32, &1u32.to_le_bytes());
     let less = with_entry(&less, palette, 20, &(12 + 9u32).to_le_bytes());
