@@ -24,7 +24,7 @@ const LABEL: &str = "right_ball";
 const CAMERAS: usize = 6;
 const GAUSSIANS: usize = 60;
 
-/// Mean squared difference between drawn labels and those of the pixels.
+/// Mean squared difference between rendered labels and those of the pixels.
 struct Labels {
     /// By frame.
     truth: Vec<Planes<f32>>,

@@ -33,7 +33,7 @@ impl Default for Blended {
 }
 
 impl Blended {
-    /// Draws a frame's view with `columns` of what is alive then, the last of which is 1 where a splat has numbers.
+    /// Renders a frame's view with `columns` of what is alive then, the last of which is 1 where a splat has numbers.
     pub(crate) fn draw(
         &mut self,
         scene: &Scene<f32>,
@@ -49,8 +49,8 @@ impl Blended {
         self.renderer.render(&shot, &mut self.image);
     }
 
-    /// The VJP of [`draw`](Self::draw): `give` hears, for every splat, of its layer and row, its number, the gradients to all
-    /// columns and the columns.
+    /// The VJP of [`draw`](Self::draw): `give` hears, for every splat, of its layer and row, its number, the gradients
+    /// to all columns and the columns.
     pub(crate) fn back(
         &mut self,
         scene: &Scene<f32>,

@@ -67,7 +67,7 @@ pub enum Event {
         iterations: usize,
         /// Seconds after the command's start at which it would have ended.
         seconds: f64,
-        /// The minutes that were asked for.
+        /// The minutes that were requested.
         minutes: f64,
     },
     /// A step was taken; sent every so many iterations.
@@ -89,7 +89,7 @@ pub enum Event {
         /// Seconds that are left, estimated.
         seconds_left: f64,
     },
-    /// On what a run trains, where that was asked for or changed.
+    /// On what a run trains, where that was requested or changed.
     Device {
         /// It in words, its driver too.
         name: String,

@@ -1,9 +1,10 @@
 //! Feature channels of a trained scene, learnt from images of features while all else stays as it is.
 //!
-//! A Gaussian has D numbers f_i. A pixel shows F = Σ w_i f_i / Σ w_i, w_i = α_i T_i, and the loss is ½ Σ_pixels |F − F*|² over the
-//! pixels that are known and show something, plus ½ ε Σ |f_i|². With shapes fixed F is linear in f, so that the loss has one
-//! minimum, which conjugate gradients come near in few rounds without any rate (Hestenes and Stiefel 1952), each channel by
-//! itself: a round draws every image once, forth and back. Few rounds also keep what pixels hardly see from growing.
+//! A Gaussian has D numbers f_i. A pixel shows F = Σ w_i f_i / Σ w_i, w_i = α_i T_i, and the loss is ½ Σ_pixels |F −
+//! F*|² over the pixels that are known and show something, plus ½ ε Σ |f_i|². With shapes fixed F is linear in f, so
+//! that the loss has one minimum, which conjugate gradients come near in few rounds without any rate (Hestenes and
+//! Stiefel 1952), each channel by itself: a round renders every image once, forth and back. Few rounds also keep what
+//! pixels hardly see from growing.
 //!
 //! Features of Gaussians as blended channels: Feature 3DGS (Zhou et al. 2024), which learns them by steps next to
 //! colours.
@@ -59,8 +60,9 @@ fn truth(capture: &Capture, frame: usize, channels: Option<usize>) -> Result<Fea
     }
 }
 
-/// ½ Σ |F − s F*|² over the pixels that are known and show something, and its gradient to the blended sums Σ w f into `d_extra`
-/// (whose last plane, that of Σ w, stays 0: shapes do not learn); returns the loss and how many pixels it is of.
+/// ½ Σ |F − s F*|² over the pixels that are known and show something, and its gradient to the blended sums Σ w f into
+/// `d_extra` (whose last plane, that of Σ w, stays 0: shapes do not learn); returns the loss and how many pixels it is
+/// of.
 fn compare(
     values: &Planes<f32>,
     weight: &Planes<f32>,
@@ -148,9 +150,11 @@ fn pass(
 
 /// Learns the features of the capture's training images into the scene, in place of those it had. Returns the mean
 /// loss of a
-/// known pixel before each round and after the last. `progress` receives how many images of how many are done, and may end the work.
+/// known pixel before each round and after the last. `progress` receives how many images of how many are done, and may
+/// end the work.
 ///
-/// Errors: those of `progress`; no training image has features; one that cannot be read, or of other channels than the first.
+/// Errors: those of `progress`; no training image has features; one that cannot be read, or of other channels than the
+/// first.
 pub fn learn(
     scene: &mut Scene<f32>,
     capture: &Capture,
@@ -170,7 +174,7 @@ pub fn learn(
     let total = (rounds + 1) * frames.len();
     let (mut residual, start, pixels) = pass(scene, capture, &frames, 1.0, &mut |i| progress(i, total))?;
     let (ones, minus) = (vec![1.0; channels], vec![-1.0; channels]);
-    // The gradient of features that are 0 is minus what they should be drawn to.
+    // The gradient of features that are 0 is minus what they should be rendered to.
     let zero = residual.clone();
     mix(&mut residual, &minus, &vec![0.0; channels], &zero);
     let (wanted, mut way) = (residual.clone(), residual.clone());

@@ -1,11 +1,11 @@
 //! Labels of a trained scene, learnt from masks of labels in its training images while all else stays as it is.
 //!
-//! A Gaussian has a probability of each label, p_i. A pixel shows P = Σ w_i p_i / Σ w_i, w_i = α_i T_i, and the cross-entropy
-//! −Σ_pixels ln P_y, y the pixel's label, is made least by expectation and maximisation: p_ik becomes the share of label k in
-//! Σ_pixels with y = k of w_i p_ik / P_k. That is exact for blended probabilities, has no rate, and never makes the loss
-//! larger. The first round, from even probabilities, is the vote of FlashSplat (Shen et al. 2024); the following ones give a
-//! pixel to those of its Gaussians that others agree with. The sums are the renderer's gradient to the blended
-//! probabilities, with 1/P_y at label y as the image's gradient.
+//! A Gaussian has a probability of each label, p_i. A pixel shows P = Σ w_i p_i / Σ w_i, w_i = α_i T_i, and the
+//! cross-entropy −Σ_pixels ln P_y, y the pixel's label, is made least by expectation and maximisation: p_ik becomes the
+//! share of label k in Σ_pixels with y = k of w_i p_ik / P_k. That is exact for blended probabilities, has no rate, and
+//! never makes the loss larger. The first round, from even probabilities, is the vote of FlashSplat (Shen et al. 2024);
+//! the following ones give a pixel to those of its Gaussians that others agree with. The sums are the renderer's
+//! gradient to the blended probabilities, with 1/P_y at label y as the image's gradient.
 //!
 //! Shapes and places learn nothing from labels: they are those that make the best images.
 
@@ -37,7 +37,7 @@ pub struct LabelScores {
     pub pictures: usize,
     /// Share of the labelled pixels that show something whose likeliest label is right.
     pub accuracy: f64,
-    /// By label: pixels in both over pixels in either; `None`: it is in no image, neither true nor drawn.
+    /// By label: pixels in both over pixels in either; `None`: it is in no image, neither true nor rendered.
     pub iou: Vec<Option<f64>>,
 }
 
@@ -57,7 +57,8 @@ fn labelled(capture: &Capture, frames: &[usize], most: usize) -> Vec<usize> {
 }
 
 /// Learns the labels of the capture's training images into the scene, in place of those it had. Returns the mean
-/// cross-entropy of a pixel before each round, nats. `progress` receives how many images of how many are done, and may end the work.
+/// cross-entropy of a pixel before each round, nats. `progress` receives how many images of how many are done, and may
+/// end the work.
 ///
 /// Errors: those of `progress`; no training image has labels; a mask that cannot be read.
 pub fn learn(
@@ -211,8 +212,8 @@ mod tests {
 
     const SIDE: u32 = 32;
 
-    /// Two cameras look at a wall at z = 0 from z = 4, one a little to the side; its left half is labelled 0, its right half 1.
-    /// One pixel in nine of the first camera's mask is wrong.
+    /// Two cameras look at a wall at z = 0 from z = 4, one a little to the side; its left half is labelled 0, its right
+    /// half 1. One pixel in nine of the first camera's mask is wrong.
     fn capture(folder: &Path) -> Capture {
         let mut cameras = Vec::new();
         for (c, shift) in [0.0, 0.4].into_iter().enumerate() {

@@ -1,8 +1,8 @@
 //! [`TrainState`]: what learns, with all that is remembered of it from step to step, row by row.
 //!
-//! A step changes numbers. Everything else that happens to a learner (rows come, go and change places, a hook replaces the
-//! scene, opacities are lowered) goes through the methods here, so that scene, moments and statistics cannot come apart,
-//! and all that keep data of rows are notified: the learner notes how far it was `Touched`.
+//! A step changes numbers. Everything else that happens to a learner (rows come, go and change places, a hook replaces
+//! the scene, opacities are lowered) goes through the methods here, so that scene, moments and statistics cannot come
+//! apart, and all that keep data of rows are notified: the learner notes how far it was `Touched`.
 
 mod corrections;
 mod exposure;
@@ -24,7 +24,7 @@ use splat4d::scene::{Born, RowEdit, Rows, Space, Table};
 pub(crate) struct Observation<'a, F> {
     /// The layer.
     pub layer: usize,
-    /// Its rows that were drawn: splat j is row `rows.id(j)`.
+    /// Its rows that were rendered: splat j is row `rows.id(j)`.
     pub rows: Rows<'a>,
     /// |dL/dmean2d| a splat, NDC units.
     pub mean2d: &'a [F],
@@ -38,7 +38,8 @@ const STATS_COLUMNS: [(&str, usize); 3] = [("gradient_sum", 1), ("gradient_count
 /// Statistics of every Gaussian since the last densification.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Stats {
-    /// One a layer, [N, 3]: sum of |dL/dmean2d| (NDC units), number of views that drew it, largest radius (pixels).
+    /// One per layer, [N, 3]: sum of |dL/dmean2d| (NDC units), number of views that rendered it, largest radius
+    /// (pixels).
     pub tables: Vec<Table<f32>>,
 }
 
@@ -61,7 +62,7 @@ impl Stats {
         });
     }
 
-    /// Mean gradient of a row, 0 where never drawn.
+    /// Mean gradient of a row, 0 where never rendered.
     pub(crate) fn gradient(&self, layer: usize, row: usize) -> f32 {
         let [sum, count] = self.tables[layer].read::<2>(row, 0);
         if count > 0.0 { sum / count } else { 0.0 }
@@ -97,7 +98,7 @@ pub struct TrainState {
     moments: Vec<Moments<f32>>,
     stats: Stats,
     touched: Touched,
-    /// Learnable exposures of the cameras; none: they show what is drawn.
+    /// Learnable exposures of the cameras; none: they show what is rendered.
     pub exposure: Option<Exposure>,
     /// Learnable corrections of poses and clocks; none: they are what the capture states.
     pub corrections: Option<Corrections>,
@@ -183,9 +184,9 @@ impl TrainState {
         self.touch(Touched::Rows);
     }
 
-    /// Changes the scene at will: layers, models, tables. Moments that still fit are kept, but for layers of another name;
-    /// those of pages for which `learns` (of a layer and one of its column groups) does not hold are forgotten, and
-    /// statistics begin again.
+    /// Changes the scene at will: layers, models, tables. Moments that still fit are kept, but for layers of another
+    /// name; those of pages for which `learns` (of a layer and one of its column groups) does not hold are forgotten,
+    /// and statistics begin again.
     pub(crate) fn rebuild(
         &mut self,
         learns: &dyn Fn(usize, &str) -> bool,

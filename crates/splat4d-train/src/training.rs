@@ -1,5 +1,5 @@
-//! Training from a program: a capture becomes a run folder, and the run is measured, in a few calls. The command's verbs
-//! `train` and `eval` stand on the same functions of [`train`](crate::run) and [`eval`](crate::eval).
+//! Training from a program: a capture becomes a run folder, and the run is measured, in a few calls. The command's
+//! verbs `train` and `eval` stand on the same functions of [`train`](crate::run) and [`eval`](crate::eval).
 
 use crate::Result;
 use crate::capture::{Capture, ImageStore};
@@ -84,7 +84,7 @@ impl Trained {
         format::scene::read(&bytes).map_err(|e| e.at(path.display()))
     }
 
-    /// Draws the held-out views, compares them with their images and writes `results.json` and `per_view.json`.
+    /// Renders the held-out views, compares them with their images and writes `results.json` and `per_view.json`.
     ///
     /// Errors: those of [`scene`](Self::scene); an image that cannot be read.
     pub fn evaluate(&self) -> Result<Scores> {

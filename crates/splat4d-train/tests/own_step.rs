@@ -152,7 +152,7 @@ impl Maintenance for Whiten {
     }
 }
 
-/// An operation runs, is in checkpoints, and goes on where it was.
+/// An operation runs, is in checkpoints, and continues where it was.
 #[test]
 fn a_custom_operation_runs_and_resumes_bit_for_bit() {
     let start = || trainer(Some(Whiten { next: 0 }));

@@ -17,9 +17,9 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// Allocations a step: lists of a few views, cameras and questions, and blocks of the thread pool's queues.
+/// Allocations a step: lists of a few views, cameras and queries, and blocks of the thread pool's queues.
 const STEADY_ALLOCATIONS: usize = 60;
-/// Bytes a step. One number a Gaussian would be 20,000 already.
+/// Bytes per step. One number a Gaussian would be 20,000 already.
 const STEADY_BYTES: usize = 12_000;
 
 const GAUSSIANS: usize = 5000;

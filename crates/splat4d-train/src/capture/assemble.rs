@@ -133,7 +133,7 @@ fn unread_clouds(take: &mut RawCapture) {
 
 /// Points nearer than this share of all that a training camera sees may be wrong ones.
 const STRAY_POINTS: f64 = 0.01;
-/// Of the distance of the nearest points: Gaussians in front of them are still drawn.
+/// Of the distance of the nearest points: Gaussians in front of them are still rendered.
 const BEFORE_POINTS: f64 = 0.5;
 
 /// Some distance there must be, of the extent: the projection divides by it.
@@ -142,7 +142,8 @@ const SMALLEST_NEAR: f64 = 1e-3;
 /// Of the wanted share, where no points say how near things come.
 const UNKNOWN_DEPTH: f64 = 0.25;
 
-/// How near splats are drawn, scene units: this share of the extent, or half way to the nearest of the capture's points.
+/// How near splats are rendered, scene units: this share of the extent, or half way to the nearest of the capture's
+/// points.
 pub(super) fn near(capture: &Capture, share: f64) -> f64 {
     let cloud = capture.points.as_ref().map_or(&[][..], |p| &p.points);
     let mut depths: Vec<f64> = Vec::new();
@@ -222,8 +223,8 @@ fn check_frame(frame: &mut RawFrame, camera: &str, options: &CaptureOptions) -> 
     Ok(())
 }
 
-/// Cameras without frames would be rows without meaning everywhere else. `listed` are those that had some before missing images
-/// were skipped, which was said.
+/// Cameras without frames would be rows without meaning everywhere else. `listed` are those that had some before
+/// missing images were skipped, which was said.
 fn drop_unused_cameras(take: &mut RawCapture, listed: &BTreeSet<usize>) {
     let used: BTreeSet<usize> = take.frames.iter().map(|f| f.camera).collect();
     let unused: Vec<&str> =

@@ -147,7 +147,7 @@ pub trait Frames: Send + Sync {
     }
     /// Reads frame i.
     fn load(&self, i: usize, out: &mut Picture) -> Result<()>;
-    /// These will be asked for soon; must not change any result.
+    /// These will be requested soon; must not change any result.
     fn prefetch(&self, _frames: &[usize]) {}
 }
 

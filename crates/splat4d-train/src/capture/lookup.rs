@@ -1,8 +1,9 @@
 //! Finds the files that a capture names: one lookup for every layout.
 //!
-//! Captures travel between programs and systems. Names then differ from the files by slashes, letter case, ending, Unicode
-//! normal form (macOS decomposes umlauts) and leading folders (absolute paths of another machine). The exact name goes
-//! first; else the one file that fits is taken, and one remark counts such names. Several files that fit are an error.
+//! Captures travel between programs and systems. Names then differ from the files by slashes, letter case, ending,
+//! Unicode normal form (macOS decomposes umlauts) and leading folders (absolute paths of another machine). The exact
+//! name goes first; else the one file that fits is taken, and one remark counts such names. Several files that fit are
+//! an error.
 
 mod twins;
 
@@ -123,7 +124,7 @@ pub(super) fn key(name: &str) -> String {
 }
 
 impl Lookup {
-    /// A lookup below `root`. Errors: the folder of images that was asked for is not there.
+    /// A lookup below `root`. Errors: the folder of images that was requested is not there.
     pub(super) fn new(root: &Path, options: &CaptureOptions) -> Result<Self> {
         let chosen = options.images.as_ref().map(|name| root.join(name));
         if let Some(folder) = chosen.as_ref().filter(|f| !f.is_dir()) {
@@ -240,8 +241,8 @@ impl Lookup {
         Ok(found)
     }
 
-    /// The image that `plain` leads to in another spelling, or after leading folders that are not there; `name` as it is
-    /// written. Errors: as [`Self::image`].
+    /// The image that `plain` leads to in another spelling, or after leading folders that are not there; `name` as it
+    /// is written. Errors: as [`Self::image`].
     fn spelled_otherwise(&self, bases: &[PathBuf], plain: &str, name: &str) -> Result<Option<PathBuf>> {
         let (parts, absolute) = parts(plain);
         let there = |first: &str| {
@@ -271,8 +272,8 @@ impl Lookup {
         Ok(None)
     }
 
-    /// The only image below the capture's folder with this name, whatever folder it is in. `None`: there is none, or there
-    /// are several.
+    /// The only image below the capture's folder with this name, whatever folder it is in. `None`: there is none, or
+    /// there are several.
     pub(super) fn anywhere(&self, name: &str) -> Result<Option<PathBuf>> {
         let mut folders = self.folders();
         folders.extend(self.other_folders());

@@ -2,8 +2,8 @@
 //!
 //! [`Capture::open`] identifies the layout of a folder, reads poses and times, checks them and converts them to one
 //! form: pinhole cameras with OpenCV axes, seconds, and one held-out split. An [`ImageStore`] decodes images on demand
-//! within a byte budget. Every reader produces a `RawCapture` (the content of the files); `assemble` alone turns takes into
-//! captures, so all layouts are checked alike.
+//! within a byte budget. Every reader produces a `RawCapture` (the content of the files); `assemble` alone turns takes
+//! into captures, so all layouts are checked alike.
 
 mod account;
 mod assemble;
@@ -81,8 +81,8 @@ use std::sync::Arc;
 /// A reader: the capture's folder and the marker file that was found, to what the files say.
 type Reader = fn(&Path, &Path, &CaptureOptions) -> Result<RawCapture>;
 
-/// The list of layouts: a reader is its file, its name in [`CaptureKind`] and an entry here. Marker files (or folders) in the
-/// order in which they are looked for, with their readers.
+/// The list of layouts: a reader is its file, its name in [`CaptureKind`] and an entry here. Marker files (or folders)
+/// in the order in which they are looked for, with their readers.
 const READERS: &[(&str, Reader)] = &[
     ("capture.json", own::read),
     (transforms::TRAIN, transforms::read),
@@ -230,7 +230,7 @@ pub struct Capture {
     /// photo of a
     /// time, or stands for many.
     pub named: bool,
-    /// All images, or those that were asked for ([`CaptureOptions::frames`]).
+    /// All images, or those that were requested ([`CaptureOptions::frames`]).
     pub frames: Vec<Frame>,
     /// The whole capture, whatever of it is listed.
     pub take: Extent,
@@ -250,8 +250,8 @@ pub struct Capture {
     pub points: Option<PointCloud>,
     /// The background of transparent pixels, sRGB from 0 to 1; `None`: the images have no alpha.
     pub background: Option<[f32; 3]>,
-    /// What was subtracted from the world coordinates of poses and points, because f32 resolves them badly; zero near the
-    /// origin ([`splat4d::scene::offset`]).
+    /// What was subtracted from the world coordinates of poses and points, because f32 resolves them badly; zero near
+    /// the origin ([`splat4d::scene::offset`]).
     pub offset: [f64; 3],
     /// Upwards in the world (unit); estimated from the cameras where the data set states none.
     pub up: [f64; 3],
@@ -397,7 +397,7 @@ impl Capture {
         times
     }
 
-    /// Adds points to its own, and draws as near as they come; `near`: as [`CaptureOptions::near`].
+    /// Adds points to its own, and renders as near as they come; `near`: as [`CaptureOptions::near`].
     pub(crate) fn add_points(&mut self, mut more: PointCloud, near: f64) {
         let points = self.points.get_or_insert_default();
         points.points.append(&mut more.points);

@@ -25,7 +25,7 @@ const POINTS: &[&str] = &["points.ply", "points3D.ply", "points3D_downsample2.pl
 
 /// Folder of the notes of extracted frames (`splat4d_import::shipped`).
 const NOTES: &str = "import";
-/// Rates are stated in steps of this, frames a second: intervals in files are rounded.
+/// Rates are stated in steps of this, frames per second: intervals in files are rounded.
 const WHOLE_RATE: f64 = 0.01;
 
 /// A folder of frames: its camera's name and the images.
@@ -112,8 +112,8 @@ fn extracted_rate(root: &Path, camera: &str) -> Option<f64> {
     super::options::check_rate("frame rate", rate).ok().map(|()| rate)
 }
 
-/// The row of poses that each camera has, of so many: in the order of names; or, where cameras are missing, by the number in the
-/// name, which counts from 0. `None`: they do not fit.
+/// The row of poses that each camera has, of so many: in the order of names; or, where cameras are missing, by the
+/// number in the name, which counts from 0. `None`: they do not fit.
 pub fn rows_of(names: &[String], rows: usize) -> Option<Vec<usize>> {
     if names.len() == rows {
         return Some((0..rows).collect());
@@ -150,8 +150,8 @@ pub fn about_rows(names: &[String], which: &[usize], rows: usize) -> Vec<(Severi
     out
 }
 
-/// The frame numbers of every folder's images: as named, counted from the smallest of all, so that a lost frame does not
-/// shift those after it; else their order.
+/// The frame numbers of every folder's images: as named, counted from the smallest of all, so that a lost frame does
+/// not shift those after it; else their order.
 fn numbers(folders: &[Folder], account: &mut Account) -> Vec<Vec<usize>> {
     let named = |image: &PathBuf| rig::trailing_number(&image.file_name()?.to_string_lossy());
     let told: Option<Vec<Vec<usize>>> =

@@ -214,8 +214,8 @@ pub struct CaptureOptions {
     pub unit_time_seconds: Option<f64>,
     /// Most points of the initial cloud; larger clouds are thinned by voxel.
     pub max_points: usize,
-    /// How near to a camera splats are drawn, as a share of the cameras' extent; less where the capture's points come
-    /// nearer, and a quarter of it where it has none.
+    /// How near to a camera splats are rendered, as a share of the cameras' extent; less where the capture's points
+    /// come nearer, and a quarter of it where it has none.
     pub near: f64,
     /// The folder of images below the capture's, in place of the one that the capture names.
     pub images: Option<String>,

@@ -38,9 +38,9 @@ impl Header {
 /// Decoded samples.
 #[derive(Debug, PartialEq)]
 pub(super) enum Samples {
-    /// 8 bits a sample.
+    /// 8 bits per sample.
     Eight(Vec<u8>),
-    /// 16 bits a sample.
+    /// 16 bits per sample.
     Sixteen(Vec<u16>),
 }
 
@@ -380,8 +380,8 @@ const LABELS: u16 = 16;
 
 /// A mask's values from 0 to 1, one per pixel, from the alpha channel if `use_alpha`, else from the first channel.
 ///
-/// Some tools write masks of zeros and ones, or of the numbers of labels: where no value is above 16, all but 0 count as
-/// white. Others write the mask into the alpha of an image of one colour.
+/// Some tools write masks of zeros and ones, or of the numbers of labels: where no value is above 16, all but 0 count
+/// as white. Others write the mask into the alpha of an image of one colour.
 pub(super) fn mask_values(raster: &Raster, use_alpha: bool) -> Vec<f32> {
     let n = raster.width * raster.height;
     let of = |channel: usize, p: usize| match &raster.samples {

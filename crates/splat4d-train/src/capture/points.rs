@@ -151,7 +151,7 @@ impl PointCloud {
         let sorted = self.cells(low, f64::exp2(coarse) / side);
         let cells: Vec<&[(Cell, usize)]> = sorted.chunk_by(|a, b| a.0 == b.0).collect();
         let mut out = Self::default();
-        // More distinct times than points are asked for: no voxel size helps, so every n-th cell is kept.
+        // More distinct times than points are requested: no voxel size helps, so every n-th cell is kept.
         let stride = cells.len().div_ceil(max_points);
         for members in cells.iter().step_by(stride) {
             let weight = 1.0 / members.len() as f64;

@@ -1,7 +1,7 @@
 //! Images on demand: decoded, composited, undistorted and downscaled, in a byte budget shared by all threads.
 //!
 //! An image is a pure function of its files and the capture's options, so neither the order of loads nor the prefetch
-//! thread nor eviction can change a result. Plain 8-bit images stay 8 bits a sample, exactly as in the file; whatever
+//! thread nor eviction can change a result. Plain 8-bit images stay 8 bits per sample, exactly as in the file; whatever
 //! was composited, resampled or averaged is kept in 16 bits, whose rounding (1/131070) is far below the half 8-bit step
 //! (1/510) that an 8-bit copy would lose, at half the memory of f32.
 
@@ -79,7 +79,8 @@ impl StoredPicture {
         self.weights_into(self.valid.as_deref(), out)
     }
 
-    /// Writes the depth as [1, height, width] and states what kind it is; `None` (and `out` untouched) if there is none.
+    /// Writes the depth as [1, height, width] and states what kind it is; `None` (and `out` untouched) if there is
+    /// none.
     pub(crate) fn depth_into(&self, out: &mut Planes<f32>) -> Option<DepthKind> {
         let (values, kind) = self.depth.as_ref()?;
         (out.channels, out.height, out.width) = (1, self.height, self.width);
@@ -231,7 +232,7 @@ impl ImageStore {
         let mut worker = self.worker.lock().unwrap_or_else(|e| e.into_inner());
         if worker.is_none() {
             let shared = Arc::clone(&self.shared);
-            // Without a thread (a process limit, say) images are simply decoded when they are asked for.
+            // Without a thread (a process limit, say) images are simply decoded when they are requested.
             *worker = std::thread::Builder::new().name("prefetch".into()).spawn(move || shared.work()).ok();
         }
     }

@@ -1,4 +1,4 @@
-//! End-point errors of drawn flow against the flow that a capture brings along (`flow` in capture.json), in pixels.
+//! End-point errors of rendered flow against the flow that a capture brings along (`flow` in capture.json), in pixels.
 
 use crate::Result;
 use crate::capture::Capture;
@@ -16,7 +16,7 @@ const MOVES: f32 = 0.5;
 /// End-point errors within which a pixel counts as right, pixels.
 pub(crate) const WITHIN: [f64; 3] = [1.0, 3.0, 5.0];
 
-/// How well drawn flow agrees with known flow.
+/// How well rendered flow agrees with known flow.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FlowError {
     /// Images that were measured.
@@ -37,8 +37,8 @@ pub struct FlowError {
     pub drawn: f64,
 }
 
-/// Measures a scene on the held-out views that know their flow, or where there are none on those of training. `None`: none
-/// knows its flow.
+/// Measures a scene on the held-out views that know their flow, or where there are none on those of training. `None`:
+/// none knows its flow.
 ///
 /// Errors: a file of flow that cannot be read.
 pub fn flow_error(scene: &Scene<f32>, capture: &Capture) -> Result<Option<FlowError>> {

@@ -5,8 +5,9 @@
 //! from the image, by Gauss and Newton's method with damping (Levenberg and Marquardt) and a robust loss, in larger and
 //! larger images: there are six unknowns of the pose, one of the time where the scene moves, and one of the focal
 //! length where
-//! it is asked for, so that derivatives are differences of renders. A gain and an offset of each colour are free, since another camera
-//! has another exposure. What does not fit the scene much better than one plain colour would is refused ([`Located::is_sure`]).
+//! it is requested, so that derivatives are differences of renders. A gain and an offset of each colour are free, since
+//! another camera has another exposure. What does not fit the scene much better than one plain colour would is refused
+//! ([`Located::is_sure`]).
 
 use crate::Result;
 use crate::train_state::moved;
@@ -50,7 +51,7 @@ pub const SURE: f64 = 1.0 / 3.0;
 /// What is asked.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Question {
-    /// How the scene is drawn.
+    /// How the scene is rendered.
     pub antialias: Antialias,
     /// Whether the focal length is searched for too.
     pub lens: bool,
@@ -105,7 +106,7 @@ struct Search<'a> {
 /// that were
 /// followed, and all.
 ///
-/// Errors: those of drawing. Panics: no starts; a start of another size than the image's.
+/// Errors: those of rendering. Panics: no starts; a start of another size than the image's.
 pub fn localise(
     scene: &Scene<f32>,
     picture: &Planes<f32>,
@@ -163,7 +164,7 @@ impl Search<'_> {
         Ok(out)
     }
 
-    /// Draws what a candidate sees, in an image so many times smaller.
+    /// Renders what a candidate sees, in an image so many times smaller.
     fn draw(&mut self, candidate: &Candidate, times: usize, depth: bool) -> Result<&Image<f32>> {
         self.scene.at(Time(candidate.time), &mut self.instant);
         let splats = self.scene.splats(&self.instant);
@@ -295,7 +296,8 @@ impl Compared {
         Self { residuals, gains, cost, difference }
     }
 
-    /// Of the weighted linear least squares in the unknowns: matrix [n, n] and right side. `slopes`: of the render, without gains.
+    /// Of the weighted linear least squares in the unknowns: matrix [n, n] and right side. `slopes`: of the render,
+    /// without gains.
     fn normal_equations(&self, slopes: &[Vec<f32>]) -> (Vec<f64>, Vec<f64>) {
         let n = slopes.len();
         let (mut matrix, mut right) = (vec![0.0; n * n], vec![0.0; n]);

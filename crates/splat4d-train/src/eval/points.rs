@@ -4,8 +4,8 @@
 //! In the world distances are compared with shares of the height of all points together, in images with pixels, as in
 //! TAP-Vid (Doersch et al. 2022) but for the images' own size, over the points that are truly seen. Where a capture
 //! brings
-//! `truth/tracks_visible.npy`, uint8 [cameras, frames, points], that states who is seen, and the drawn visibility is compared
-//! with it; else every point in the image counts.
+//! `truth/tracks_visible.npy`, uint8 [cameras, frames, points], that states who is seen, and the rendered visibility is
+//! compared with it; else every point in the image counts.
 
 use crate::capture::Capture;
 use crate::eval::tracks::Truth;
@@ -37,8 +37,8 @@ pub struct PointErrors {
     pub within: [f64; 5],
     /// Share of (point, later frame) at which nothing carries the point any more.
     pub lost: f64,
-    /// Slope of ln(root mean square distance) over ln(frames since the first): ½ a random walk, 1 a constant bias; `None`:
-    /// too few frames, or no error.
+    /// Slope of ln(root mean square distance) over ln(frames since the first): ½ a random walk, 1 a constant bias;
+    /// `None`: too few frames, or no error.
     pub slope: Option<f64>,
     /// The same in images.
     pub pictures: Option<PixelErrors>,

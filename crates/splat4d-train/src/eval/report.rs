@@ -172,7 +172,7 @@ pub struct Conditions {
     pub background: Option<[f32; 3]>,
     /// Instructions of the kernels: `scalar`, `avx2`, `avx512` or `neon`. Levels round differently.
     pub simd: &'static str,
-    /// What drew.
+    /// What rendered.
     pub device: String,
 }
 
@@ -183,7 +183,7 @@ pub struct Report {
     pub iteration: u64,
     /// What the figures hold for.
     pub conditions: Conditions,
-    /// The views that were asked for: those held out, by default.
+    /// The views that were requested: those held out, by default.
     pub test: Split,
     /// Training cameras, written apart under `train`; `None` where they were not evaluated.
     pub train: Option<Split>,
@@ -195,9 +195,11 @@ impl Report {
         format!("{METHOD}{}", self.iteration)
     }
 
-    /// `results.json`: `{"ours_7000": {"SSIM": …, "PSNR": …, "notes": {…}, "cameras": {…}}, "train": {"ours_7000": {…}}}`.
+    /// `results.json`:
+    /// `{"ours_7000": {"SSIM": …, "PSNR": …, "notes": {…}, "cameras": {…}}, "train": {"ours_7000": {…}}}`.
     ///
-    /// `cameras` holds for every camera `{"PSNR": …, "PSNR-cc": …, "colour": [[m, m, m, offset] × 3]}`. A metric that is not defined is null, and `notes` states why.
+    /// `cameras` holds for every camera `{"PSNR": …, "PSNR-cc": …, "colour": [[m, m, m, offset] × 3]}`. A metric that
+    /// is not defined is null, and `notes` states why.
     pub fn results(&self) -> Value {
         self.nested(Split::results_json)
     }

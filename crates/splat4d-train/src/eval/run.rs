@@ -1,5 +1,5 @@
-//! Evaluation of a scene on a capture: every held-out view is drawn and compared with its image, a few training views
-//! too; scores, images and a summary are written as 3DGS users know them.
+//! Evaluation of a scene on a capture: every held-out view is rendered and compared with its image, a few training
+//! views too; scores, images and a summary are written as 3DGS users know them.
 //!
 //! | file | content |
 //! |---|---|
@@ -45,7 +45,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 const TRAIN_VIEWS: usize = 24;
 /// A mean difference of the channels as large as this is the last colour of an error image.
 const ERROR_FULL: f32 = 0.25;
-/// What draws: figures are the CPU renderer's, which defines what others draw.
+/// What renders: figures are the CPU renderer's, which defines what others draw.
 const DEVICE: &str = "CPU";
 /// Mask values above this are foreground.
 const FOREGROUND: f32 = 0.5;
@@ -102,7 +102,7 @@ pub struct EvalOptions {
     pub place: Option<String>,
     /// How held-out views are aligned, to be measured a second time (`PSNR-aligned`); `None`: not.
     pub align: Option<Align>,
-    /// What draws; the metrics are the CPU's.
+    /// What renders; the metrics are the CPU's.
     pub device: Device,
 }
 
@@ -166,10 +166,10 @@ enum Views<'a> {
     Train,
 }
 
-/// Draws and measures the held-out views of `capture` (and a few training views), and writes the files above.
+/// Renders and measures the held-out views of `capture` (and a few training views), and writes the files above.
 ///
-/// Errors: an image that cannot be read, weights that do not fit, a folder that cannot be written; `stop` was raised, which is
-/// checked before each view.
+/// Errors: an image that cannot be read, weights that do not fit, a folder that cannot be written; `stop` was raised,
+/// which is checked before each view.
 pub fn evaluate(
     scene: &Scene<f32>,
     capture: &Capture,
@@ -199,7 +199,7 @@ pub fn evaluate(
     Ok(evaluation)
 }
 
-/// The same without the two JSON files; images only if the options ask for them.
+/// The same without the two JSON files; images only if the options request them.
 ///
 /// Errors: those of [`evaluate`].
 pub fn assess(
@@ -344,7 +344,8 @@ impl<'a> Judge<'a> {
         Ok(split)
     }
 
-    /// Measures `PSNR-aligned` and `PSNR-dynamic-aligned` of frames that `split` holds. Returns how far they were moved.
+    /// Measures `PSNR-aligned` and `PSNR-dynamic-aligned` of frames that `split` holds. Returns how far they were
+    /// moved.
     fn align(
         &mut self,
         align: &Align,
@@ -380,7 +381,8 @@ impl<'a> Judge<'a> {
         Ok(mean.mean().expect("a camera has at least one frame"))
     }
 
-    /// Draws a frame from where `capture` has it: the render, clean of pixels without truth, the truth, and the sums of both.
+    /// Renders a frame from where `capture` has it: the render, clean of pixels without truth, the truth, and the sums
+    /// of both.
     fn draw(&mut self, capture: &Capture, frame: usize) -> Result<(Planes<f32>, Planes<f32>, ColourSums)> {
         let stored = self.store.load(frame)?;
         let (info, mut truth) = (&capture.frames[frame], Planes::default());
@@ -398,7 +400,7 @@ impl<'a> Judge<'a> {
         Ok((image, truth, sums))
     }
 
-    /// Draws one frame and measures it.
+    /// Renders one frame and measures it.
     fn view(&mut self, name: &str, frame: usize, mean: Option<&Planes<f32>>) -> Result<Drawn> {
         let (image, truth, sums) = self.draw(self.capture, frame)?;
         let stored = self.store.load(frame)?;
@@ -417,7 +419,7 @@ impl<'a> Judge<'a> {
     }
 }
 
-/// A frame that was drawn and measured.
+/// A frame that was rendered and measured.
 struct Drawn {
     view: View,
     /// The render, clean of pixels without truth.

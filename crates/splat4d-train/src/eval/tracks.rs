@@ -1,8 +1,9 @@
-//! 3D error of tracks against known ones: captures that were drawn come with the true paths of points of their surfaces.
+//! 3D error of tracks against known ones: captures that were rendered come with the true paths of points of their
+//! surfaces.
 //!
-//! `truth/tracks.npy` holds float32 [frames, points, 3], world positions. Every point at the first frame is a question, as
-//! in benchmarks of point tracking: the few Gaussians nearest to it then carry it on by their mean displacement, and the
-//! error is its distance to the truth at all later frames. Next to it stands the error of the nearest Gaussian
+//! `truth/tracks.npy` holds float32 [frames, points, 3], world positions. Every point at the first frame is a query, as
+//! in benchmarks of point tracking: the few Gaussians nearest to it then carry it on by their mean displacement, and
+//! the error is its distance to the truth at all later frames. Next to it stands the error of the nearest Gaussian
 //! itself, its
 //! distance at the first frame included (the median trajectory error of Luiten et al. 2024). Times at which none of a
 //! point's Gaussians is alive are not counted, but the share that is counted is reported.

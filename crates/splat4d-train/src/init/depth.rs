@@ -31,9 +31,9 @@ struct Candidate {
     still: bool,
 }
 
-/// About `count` points of metric depth maps that are static; none where there are no such maps. With `moving`, up to as
-/// many again on dynamic regions: few pixels show it, and at every time others. They are taken from every image that is
-/// examined.
+/// About `count` points of metric depth maps that are static; none where there are no such maps. With `moving`, up to
+/// as many again on dynamic regions: few pixels show it, and at every time others. They are taken from every image that
+/// is examined.
 pub(crate) fn points(frames: &dyn Frames, count: usize, moving: bool, rng: Rng) -> Result<Seeds> {
     let step = frames.len().div_ceil(VIEWS).max(1);
     let chosen: Vec<usize> = (0..frames.len()).step_by(step).collect();
@@ -74,7 +74,7 @@ pub(crate) fn points(frames: &dyn Frames, count: usize, moving: bool, rng: Rng) 
     times.dedup();
     if let [first, .., last] = times[..] {
         let gap = (last - first) / (times.len() - 1) as f64;
-        // The integral of a life exp(−½(t/w)²) is √(2π)w.
+        // The integral of a lifespan exp(−½(t/w)²) is √(2π)w.
         let wanted = ALIVE_SHARE * count as f64 / alive.len().max(1) as f64 * (last - first) / TAU.sqrt();
         out.life = Some(wanted.clamp(LIFE[0] * gap, LIFE[1] * gap));
     }

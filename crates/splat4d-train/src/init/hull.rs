@@ -17,11 +17,11 @@ const CANDIDATES: usize = 40;
 const ROUNDS: u64 = 4;
 /// The next round's box is this much larger on every side than what was kept.
 const MARGIN: f64 = 0.05;
-/// A point may be outside this share of the silhouettes that see it: masks have ragged edges, and what moves has holes where
-/// it looks like what is behind it (0.25 gave more ghosts: 0.3 dB less where nothing moves).
+/// A point may be outside this share of the silhouettes that see it: masks have ragged edges, and what moves has holes
+/// where it looks like what is behind it (0.25 gave more ghosts: 0.3 dB less where nothing moves).
 const MISSES: f64 = 0.05;
 const MOVING_MISSES: f64 = 0.15;
-/// Points of dynamic regions, of those that are asked for: all of them took Gaussians away from the static background
+/// Points of dynamic regions, of those that are requested: all of them took Gaussians away from the static background
 /// (0.4 dB less there, as good where things move).
 const MOVING_SHARE: f64 = 0.3;
 /// What moves is grown by so many pixels, since it hides the edges of what is behind it.
@@ -77,8 +77,8 @@ pub(crate) fn carve(
     Ok(out)
 }
 
-/// The distinct time nearest to t and its frames; of cameras whose shutters do not open at once the frame that is nearest
-/// to it, if that is less than half a frame.
+/// The distinct time nearest to t and its frames; of cameras whose shutters do not open at once the frame that is
+/// nearest to it, if that is less than half a frame.
 pub(super) fn pictures_near(frames: &dyn Frames, t: f64) -> (f64, Vec<usize>) {
     let all = || (0..frames.len()).map(|i| (frames.rig(i), frames.time(i).0));
     let Some(best) = all().map(|(_, time)| time).min_by(|a, b| (a - t).abs().total_cmp(&(b - t).abs())) else {

@@ -31,9 +31,9 @@ pub struct Seeds {
     pub colors: Vec<[f32; 3]>,
     /// When the point was seen, seconds; `None`: during the whole clip.
     pub times: Vec<Option<f64>>,
-    /// How fast it moves, scene units a second; zero where unknown.
+    /// How fast it moves, scene units per second; zero where unknown.
     pub velocities: Vec<[f64; 3]>,
-    /// Width of the lives of points with a time, seconds; `None`: the recipe's.
+    /// Width of the lifespans of points with a time, seconds; `None`: the recipe's.
     pub life: Option<f64>,
 }
 
@@ -99,9 +99,9 @@ settings! {
         /// Source of initial Gaussians: `auto`, `points`, `pictures` (found in the images), `hull`, `random`, or a .ply
         /// file.
         source: Source = Source::Auto;
-        /// Number of initial Gaussians; 0: 10,000, and more in proportion for static scenes of more than 30,000 Gaussians. If
-        /// a capture has fewer points, more are placed between them along surfaces; hulls of masks and of dynamic regions,
-        /// and random points, add as many.
+        /// Number of initial Gaussians; 0: 10,000, and more in proportion for static scenes of more than 30,000
+        /// Gaussians. If a capture has fewer points, more are placed between them along surfaces; hulls of masks and of
+        /// dynamic regions, and random points, add as many.
         count: usize = 0 => any().when(IsNot("init.source", &["points"]));
         /// Initial opacity.
         opacity: f64 = 0.1 => inside_share();
@@ -114,17 +114,17 @@ settings! {
     }
 }
 
-/// Initial Gaussians where [`InitSettings::count`] is 0: what small captures are tuned for (docs/suite.md). A static scene
-/// of many Gaussians has a third of them at once: a real room at half size gains 0.3 dB by half of them in the same steps, at an
-/// eighth more time (studies/records/2026-11-27-real-size.md).
+/// Initial Gaussians where [`InitSettings::count`] is 0: what small captures are tuned for (docs/suite.md). A static
+/// scene of many Gaussians has a third of them at once: a real room at half size gains 0.3 dB by half of them in the
+/// same steps, at an eighth more time (studies/records/2026-11-27-real-size.md).
 pub(crate) const COUNT: usize = 10_000;
 
 /// Where the first Gaussians are.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Source {
-    /// The capture's points and those of its depth maps; without maps, where points are few or leave out a part of what cameras
-    /// see, those that its images show, and more between them; the hull of masks, or of dynamic regions before fixed
-    /// cameras; else at random.
+    /// The capture's points and those of its depth maps; without maps, where points are few or leave out a part of what
+    /// cameras see, those that its images show, and more between them; the hull of masks, or of dynamic regions before
+    /// fixed cameras; else at random.
     Auto,
     /// The capture's points.
     Points,
@@ -171,12 +171,13 @@ impl Value for Source {
 
 /// A random colour would have to be unlearnt; grey is the least wrong.
 const UNKNOWN_COLOR: [f32; 3] = [0.5; 3];
-/// A life this many clips wide is practically for ever: at the clip's ends σ is still above 0.96.
+/// A lifespan this many clips wide is practically for ever: at the clip's ends σ is still above 0.96.
 const LONG_LIFE_CLIPS: f64 = 2.0;
 /// One keyframe of initial points about every so many frames.
 const FRAMES_PER_KEYFRAME: usize = 5;
-/// Initial scales are clamped to this share of the extent, or of the distance from the cameras where that is more: a lone point
-/// would otherwise hide the scene, and a far background of points that are a pixel wide would have to grow first.
+/// Initial scales are clamped to this share of the extent, or of the distance from the cameras where that is more: a
+/// lone point would otherwise hide the scene, and a far background of points that are a pixel wide would have to grow
+/// first.
 const LARGEST_SCALE: f64 = 0.05;
 /// Smallest initial scale, of the extent.
 const SMALLEST_SCALE: f64 = 1e-5;
@@ -322,7 +323,7 @@ pub fn scene(
     Ok(Scene { layers, background, clip, fps, up, head, ..Scene::default() })
 }
 
-/// Centre and width (seconds) of the life that a Gaussian at a seed starts with.
+/// Centre and width (seconds) of the lifespan that a Gaussian at a seed starts with.
 fn first_life(plan: &TrainContext, settings: &InitSettings, seeds: &Seeds, i: usize) -> (f64, f64) {
     let gap = plan.seconds() / keyframes(plan, settings).len() as f64;
     let short = match seeds.life {

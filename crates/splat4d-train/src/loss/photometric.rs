@@ -10,8 +10,8 @@ use splat4d::scene::Planes;
 use splat4d::simd::{Simd, dispatch_pass};
 use std::sync::Mutex;
 
-/// Most rows of a strip, the unit of parallel work: strips are of even size, and that depends on the image alone, so that
-/// sums do not depend on the number of threads. Every strip works on a window's halo of ten rows in addition.
+/// Most rows of a strip, the unit of parallel work: strips are of even size, and that depends on the image alone, so
+/// that sums do not depend on the number of threads. Every strip works on a window's halo of ten rows in addition.
 const STRIP_ROWS: usize = 128;
 /// Strips are whole groups of rows of the kernel.
 const GROUP_ROWS: usize = 4;
@@ -23,7 +23,7 @@ pub struct Photometric<F = f32> {
     pub lambda_dssim: f32,
     simd: Simd,
     taps: [F; kernel::TAPS],
-    /// One a thread of the pool; a thread holds its own only while it works on one strip.
+    /// One per thread of the pool; a thread holds its own only while it works on one strip.
     scratch: Vec<Mutex<Scratch<F>>>,
     /// [channels, strips] sums, added up in order.
     sums: Vec<[f64; 3]>,

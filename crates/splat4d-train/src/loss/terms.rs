@@ -7,7 +7,7 @@ use splat4d::math::Real;
 use splat4d::render::{ResidentTies, RowWeights};
 use splat4d::scene::{Grads, Space, Table, Time};
 
-/// Where in training a loss is asked.
+/// Where in training a loss is queried.
 #[derive(Clone, Debug)]
 pub struct StepInfo {
     /// Steps taken before this one.
@@ -85,8 +85,8 @@ pub trait ParamLoss<F: Real>: Send + Sync {
 }
 
 /// A codec between the parameters that learn and the images they are judged by: a file that will hold them
-/// coarsely. Images are drawn from what its reader would see, and the gradient goes to the parameters as if there were
-/// no difference (the straight-through estimator: Bengio et al. 2013).
+/// coarsely. Images are rendered from what its reader would see, and the gradient goes to the parameters as if there
+/// were no difference (the straight-through estimator: Bengio et al. 2013).
 pub trait Codec<F: Real>: Send + Sync {
     /// Its name, in messages.
     fn name(&self) -> &str;

@@ -69,7 +69,7 @@ impl Choice for Option<Metric> {
 pub(crate) struct TransportConfig {
     /// The quantities that distances are between.
     pub metric: Metric,
-    /// How shapes go on at constant velocity.
+    /// How shapes continue at constant velocity.
     pub predictor: Predictor,
     /// Weight of the temporal term.
     pub temporal: f64,
@@ -128,7 +128,7 @@ impl TransportConfig {
 pub(crate) struct Transport {
     settings: TransportConfig,
     layer: usize,
-    /// The schedule's factor in the step whose probes were asked last, as bits.
+    /// The schedule's factor in the step whose probes were queried last, as bits.
     now: AtomicU64,
 }
 
@@ -150,7 +150,7 @@ impl Transport {
             return None;
         }
         let own = info.times.first().map_or(s.clip[0], |t| t.0);
-        // A view's time stays the number it is, so that its question is shared.
+        // A view's time stays the number it is, so that its query is shared.
         let middle = own.max(s.clip[0] + s.frame).min(s.clip[1] - s.frame);
         Some([middle - s.frame, middle, middle + s.frame].map(Time))
     }

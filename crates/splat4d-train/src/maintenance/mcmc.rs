@@ -1,7 +1,8 @@
 //! Densification as Markov chain Monte Carlo: dead Gaussians are moved onto live ones so that the image stays the same,
 //! the cloud grows by 5 % a time up to the cap, and positions are shaken while a Gaussian is nearly transparent.
 //!
-//! Where they go is drawn in space-time from opacity and screen gradient (FreeTimeGS): a row carries its life with it.
+//! Where they go is drawn in space-time from opacity and screen gradient (FreeTimeGS): a row carries its lifespan with
+//! it.
 //! Source: Kheradmand et al. 2024 (3DGS as MCMC) §3; Wang et al. 2025 (FreeTimeGS) §3.3.
 
 use super::{
@@ -158,8 +159,8 @@ impl Places {
     }
 }
 
-/// Moves the rows `moves` (increasing) onto drawn places of the same layer and adds `added` more there; those that share a
-/// place then look together as its one Gaussian did: [`relocated`].
+/// Moves the rows `moves` (increasing) onto drawn places of the same layer and adds `added` more there; those that
+/// share a place then look together as its one Gaussian did: [`relocated`].
 pub(super) fn join(
     train_state: &mut TrainState,
     limits: &Limits,

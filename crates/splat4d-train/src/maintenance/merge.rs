@@ -121,7 +121,7 @@ impl MergeSettings {
         Some(edit)
     }
 
-    /// Pairs (a < b) of rows that are each other's nearest and alike in place, size, colour and life.
+    /// Pairs (a < b) of rows that are each other's nearest and alike in place, size, colour and lifespan.
     fn pairs(&self, scene: &Scene<f32>, layer: usize) -> Vec<(usize, usize)> {
         let l = &scene.layers[layer];
         let (n, g) = (l.params.len(), &l.params[GEOMETRY]);

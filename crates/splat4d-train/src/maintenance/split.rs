@@ -15,7 +15,7 @@ use std::sync::Arc;
 
 /// Times at which rows are looked at, evenly over the clip: an odd number has the middle.
 const LOOKS: usize = 17;
-/// A row whose life falls below this share anywhere in the clip comes or goes, and is not still.
+/// A row whose lifespan falls below this share anywhere in the clip comes or goes, and is not still.
 const LASTING: f64 = 0.9;
 /// Change of the covariance, of its trace, from which on a shape counts as changed.
 const SAME_SHAPE: f64 = 0.05;
@@ -72,8 +72,8 @@ impl Maintenance for Split {
     }
 }
 
-/// Moves rows whose mean stays within `reach` (scene units) of its middle, whose shape stays and whose life lasts, into a
-/// still layer behind the others; returns how many. A scene whose rows all move is left as it is.
+/// Moves rows whose mean stays within `reach` (scene units) of its middle, whose shape stays and whose lifespan lasts,
+/// into a still layer behind the others; returns how many. A scene whose rows all move is left as it is.
 pub(crate) fn split(scene: &mut Scene<f32>, reach: f64) -> Result<usize> {
     let mut moved = 0;
     for index in 0..scene.layers.len() {

@@ -23,8 +23,8 @@ pub struct CaptureStats {
     pub cameras: f64,
     /// Share of the pixels of fixed cameras that change from one of their frames to the next; none where undetermined.
     pub changing: Option<f64>,
-    /// How far matches of frames of a moving camera agree with a static scene; none where cameras are fixed, or too little
-    /// matches.
+    /// How far matches of frames of a moving camera agree with a static scene; none where cameras are fixed, or too
+    /// little matches.
     pub agreement: Option<Agreement>,
     /// Fewest images of fixed cameras at a time.
     pub fewest: usize,
@@ -218,7 +218,7 @@ mod tests {
         // Shutters that do not open at once: by little, and by up to a frame.
         is(Made { late: 0.002, ..Made::new(6, 10, 4, true) }, true, "spacetime", "6 cameras");
         is(Made { late: 0.005, ..Made::new(6, 10, 4, true) }, true, "spacetime", "4 cameras");
-        // What is to go on needs Gaussians that last, where cameras can follow them.
+        // What is to continue needs Gaussians that last, where cameras can follow them.
         is(Made { observe: 0.8, ..Made::new(6, 10, 4, true) }, true, "tracked", "prediction");
         is(Made { observe: 0.8, ..Made::new(2, 10, 4, true) }, true, "control", "2.0 cameras");
         is(Made { observe: 0.8, ..Made::new(1, 50, 4, true) }, false, "control", "one camera");

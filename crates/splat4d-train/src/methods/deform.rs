@@ -15,18 +15,19 @@ const LARGE: (usize, usize, usize) = (8, 256, 4);
 const LARGE_X_LEVELS: usize = 10;
 /// Grids learn so much faster than networks: an entry is met by few Gaussians.
 const GRID_SPEEDUP: f64 = 50.0;
-/// Canonical positions start so much slower than the recipe's, which suit Gaussians that live for a moment: a cloud that
-/// is seen at every time has to settle. Chosen next to other settings in runs of 400 steps; not measured alone.
+/// Canonical positions start so much slower than the recipe's, which suit Gaussians that live for a moment: a cloud
+/// that is seen at every time has to settle. Chosen next to other settings in runs of 400 steps; not measured alone.
 const CANONICAL_SLOWDOWN: f64 = 4.0;
 /// Share of the iterations until the noise on time is zero: 20,000 of 40,000 (Yang et al. 2024).
 const NOISE_STEPS: f64 = 0.5;
-/// Steps over which the rates of networks and grids rise. Adam's first step is as long as the rate whatever the gradient, and
-/// at once it threw a settled cloud 25 pixels about: training views of a hand-held take fell by 4.6 dB in one step. With
-/// it 0.2 dB more are held out there (docs/suite.md). Source of linear warm-up: Goyal et al. 2017, §2.2.
+/// Steps over which the rates of networks and grids rise. Adam's first step is as long as the rate whatever the
+/// gradient, and at once it threw a settled cloud 25 pixels about: training views of a hand-held take fell by 4.6 dB in
+/// one step. With it 0.2 dB more are held out there (docs/suite.md). Source of linear warm-up: Goyal et al. 2017, §2.2.
 pub(super) const WARM_UP: usize = 50;
 /// Short runs have no time for it: at most this part of the iterations.
 pub(super) const WARM_UP_SHARE: usize = 20;
-/// The grid over space: a sixteenth of the published entries, since Gaussians are thousands and not millions of samples.
+/// The grid over space: a sixteenth of the published entries, since Gaussians are thousands and not millions of
+/// samples.
 const SPACE: HashShape = HashShape { levels: 8, features: 2, log2_size: 15, base: 8, finest: 256 };
 /// The grids over two axes and time.
 const TIME: HashShape = HashShape { levels: 6, features: 2, log2_size: 15, base: 4, finest: 128 };
@@ -144,8 +145,9 @@ fn check(plan: &TrainContext, deform: &DeformSettings) -> Result<()> {
 fn spec(plan: &TrainContext, deform: &DeformSettings) -> DeformSpec {
     let encoded = |x_levels| Input::Encoded { x_levels, t_levels: deform.t_levels, time_net: deform.time_net };
     let trunk = match deform.trunk {
-        // Grids follow more motion: by a small network a ball before a wall is lost, and a hand-held take has 1.9 dB less
-        // (docs/suite.md). Of one object alone, seen once a time, the network generalises better (docs/models.md).
+        // Grids follow more motion: by a small network a ball before a wall is lost, and a hand-held take has 1.9 dB
+        // less (docs/suite.md). Of one object alone, seen once per time, the network generalises better
+        // (docs/models.md).
         Trunk::Auto if plan.masks && plan.fixed_cameras == 0 => Trunk::Small,
         Trunk::Auto => Trunk::Hash,
         chosen => chosen,

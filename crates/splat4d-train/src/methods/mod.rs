@@ -1,9 +1,10 @@
 //! How motion models are learned: one [`Method`] per model, which makes the list of [`Stage`]s that the trainer runs.
 //!
-//! `splat4d::motion::x` holds a model's mathematics, `methods::x` its stages, rates, losses and what it needs of a capture.
+//! `splat4d::motion::x` holds a model's mathematics, `methods::x` its stages, rates, losses and what it needs of a
+//! capture.
 
-/// The list of methods: how a motion model is trained is its file and an entry here, which names its table of settings and makes
-/// it from the recipe `r`. `auto` asks them in this order.
+/// The list of methods: how a motion model is trained is its file and an entry here, which names its table of settings
+/// and makes it from the recipe `r`. `auto` asks them in this order.
 macro_rules! methods {
     // Tables of settings, between those before and after in the recipe.
     (tables $then:ident { $($before:tt)* } { $($after:tt)* }) => {
@@ -220,8 +221,8 @@ pub struct Stage {
     pub groups: Vec<Group>,
     /// The part of the stage, in shares of it, over which all rates fall linearly to a tenth; empty: they do not.
     ///
-    /// A step sees one image, and moves parameters towards that image alone. At full rates a run therefore ends some tenths of a
-    /// decibel short of what it has learned; small rates from the start would learn less.
+    /// A step sees one image, and moves parameters towards that image alone. At full rates a run therefore ends some
+    /// tenths of a decibel short of what it has learned; small rates from the start would learn less.
     pub settling: Range<f64>,
     /// Losses over several times.
     pub probes: Vec<Box<dyn ProbeLoss<f32>>>,
@@ -319,7 +320,7 @@ impl Stage {
         self
     }
 
-    /// The highest SH degree that is drawn after so many steps, of `most`.
+    /// The highest SH degree that is rendered after so many steps, of `most`.
     pub(crate) fn sh_degree(&self, step: usize, most: usize) -> usize {
         (self.sh_from + step).checked_div(self.sh_interval).map_or(most, |unlocked| unlocked.min(most))
     }
@@ -334,9 +335,9 @@ impl Stage {
 /// How a Gaussian begins, as far as its seed states it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct InitialMotion {
-    /// Centre and width of its life, seconds.
+    /// Centre and width of its lifespan, seconds.
     pub life: (f64, f64),
-    /// At the centre of its life, scene units a second.
+    /// At the centre of its lifespan, scene units per second.
     pub velocity: [f64; 3],
 }
 
@@ -348,10 +349,10 @@ pub trait Method: Send + Sync {
     fn build(&self, plan: &TrainContext, params: &mut Params) -> Result<Arc<dyn Motion>> {
         build(&self.spec(plan), params)
     }
-    /// The life its Gaussians have: the recipe's. Where it leaves the choice to the model, those of a cloud that lasts
-    /// ([`one_moment`](Self::one_moment)) may come and go before fixed cameras, which see that a place is empty before something
-    /// comes there (docs/models.md); a camera that moves sees every place at few times, and lives gain nothing. Others,
-    /// and those whose future is to be predicted, are there for ever.
+    /// The lifespan its Gaussians have: the recipe's. Where it leaves the choice to the model, those of a cloud that
+    /// lasts ([`one_moment`](Self::one_moment)) may come and go before fixed cameras, which see that a place is empty
+    /// before something comes there (docs/models.md); a camera that moves sees every place at few times, and lifespans
+    /// gain nothing. Others, and those whose future is to be predicted, are there for ever.
     fn life(&self, plan: &TrainContext) -> LifeKind {
         let lasting = self.one_moment(plan) && plan.fixed_cameras > 0 && !plan.predicted;
         plan.common.life.kind.unwrap_or(if lasting { LifeKind::Interval } else { LifeKind::Infinite })
@@ -375,7 +376,7 @@ pub trait Method: Send + Sync {
     fn capabilities(&self, plan: &TrainContext) -> Capabilities {
         self.spec(plan).capabilities().unwrap_or_default()
     }
-    /// The reason for which `auto` takes it for such a capture; none: it is taken where it is asked for.
+    /// The reason for which `auto` takes it for such a capture; none: it is taken where it is requested.
     fn suits(&self, _seen: &CaptureStats) -> Option<String> {
         None
     }

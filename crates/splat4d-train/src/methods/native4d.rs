@@ -1,7 +1,7 @@
 //! `native4d`: one stage; both quaternions, scales and times learn next to geometry and colour.
 //!
-//! Rates follow those of `spacetime`, since the two are charts of the same Gaussians: a step of both quaternions changes
-//! the velocity by twice its size in extents a clip, which is the unit of the rotation (`Native4dSpec::speed`).
+//! Rates follow those of `spacetime`, since the two are charts of the same Gaussians: a step of both quaternions
+//! changes the velocity by twice its size in extents a clip, which is the unit of the rotation (`Native4dSpec::speed`).
 
 use super::{Group, InitialMotion, Method, Rate, Stage, TrainContext, still};
 use crate::loss::scene::LivingOpacity;
@@ -51,7 +51,7 @@ impl Method for Native4dMethod {
         })
     }
 
-    /// The life is in the model.
+    /// The lifespan is in the model.
     fn life(&self, _plan: &TrainContext) -> LifeKind {
         LifeKind::Infinite
     }

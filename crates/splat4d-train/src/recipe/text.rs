@@ -6,8 +6,8 @@ use crate::settings::{Setting, When, is_off, nearest};
 use crate::{Error, Result};
 
 impl Recipe {
-    /// Reads TOML: tables, or names without a table. Errors: syntax, an unknown key (with the nearest known one), a wrong
-    /// type or range.
+    /// Reads TOML: tables, or names without a table. Errors: syntax, an unknown key (with the nearest known one), a
+    /// wrong type or range.
     pub fn from_toml(text: &str) -> Result<Self> {
         let file: toml::Table = toml::from_str(text).map_err(|e| {
             Error::input(format!("the recipe is not valid TOML: {}", e.message()))
@@ -152,8 +152,8 @@ impl Recipe {
         Ok(())
     }
 
-    /// The recipe in the names and the order that it had before it had tables, byte for byte: what checkpoints know it by, so that
-    /// runs of then go on. Settings that came later count where they are not at their default.
+    /// The recipe in the names and the order that it had before it had tables, byte for byte: what checkpoints know it
+    /// by, so that runs of then continue. Settings that came later count where they are not at their default.
     pub fn flat_toml(&self) -> String {
         let mut text: String =
             FLAT.iter().map(|(flat, key)| line(flat, &self.get(key).expect("FLAT names settings"))).collect();

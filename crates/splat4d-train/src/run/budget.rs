@@ -1,8 +1,8 @@
-//! [`Budget`]: a run that is to end on time. Before the first step its length follows from steps that were timed; while it
-//! goes, the machine may turn out to be slower or faster than then, and what is left is planned again.
+//! [`Budget`]: a run that is to end on time. Before the first step its length follows from steps that were timed; while
+//! it goes, the machine may turn out to be slower or faster than then, and what is left is planned again.
 //!
 //! A new plan is one row of `run.replans` and depends on the clock; all else follows from the rows
-//! ([`Pace`](crate::step::pace::Pace)), so that a run that repeats or goes on with them gives the same bits.
+//! ([`Pace`](crate::step::pace::Pace)), so that a run that repeats or continues with them gives the same bits.
 
 use super::minutes::Timing;
 use crate::methods::Stage;
@@ -10,15 +10,16 @@ use crate::step::replans::ScheduleChange;
 use crate::step::trainer::{Position, Trainer};
 use serde::{Deserialize, Serialize};
 
-/// Looks at the clock in a whole run. A change of speed is seen within one of them and taken for lasting after some: what
-/// the last ones miss is less than a tenth of the time ([`tests`] holds it on machines that turn slower and faster).
+/// Looks at the clock in a whole run. A change of speed is seen within one of them and taken for lasting after some:
+/// what the last ones miss is less than a tenth of the time ([`tests`] holds it on machines that turn slower and
+/// faster).
 const LOOKS: f64 = 32.0;
 /// Of the time, what the end may be off before a run is planned again.
 const TOLERANCE: f64 = 0.015;
 /// Weight of what was measured since the last look in the machine's speed: one busy time is not taken for the rest.
 const NEWEST: f64 = 0.5;
-/// Steps of the schedule that a step may stand for, and steps that may stand for one of the schedule: with fewer the scene
-/// would be taken apart by rates and densifications meant for many.
+/// Steps of the schedule that a step may stand for, and steps that may stand for one of the schedule: with fewer the
+/// scene would be taken apart by rates and densifications meant for many.
 const MOST: usize = 8;
 /// Of the time, what is too late: more than `--minutes` promises.
 const LATE: f64 = 1.1;
@@ -113,7 +114,8 @@ impl Planner {
         self.budget.minutes
     }
 
-    /// Remembers a step: the seconds that it and what belongs to it took, and those that were expected where it was taken.
+    /// Remembers a step: the seconds that it and what belongs to it took, and those that were expected where it was
+    /// taken.
     pub(super) fn add(&mut self, seconds: f64, expected: f64) {
         self.taken[0] += seconds;
         self.taken[1] += expected;

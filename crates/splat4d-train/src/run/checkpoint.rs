@@ -2,8 +2,8 @@
 //! losses, codecs and maintenance, how far the run is. Random
 //! numbers and samplers are functions of the step and need no saving. A resumed run is bit for bit the unbroken one.
 //!
-//! The file is a scene file with more arrays (`moments.L.TABLE`, `stats.L`, `exposure…`), so that every reader of scenes
-//! opens it too.
+//! The file is a scene file with more arrays (`moments.L.TABLE`, `stats.L`, `exposure…`), so that every reader of
+//! scenes opens it too.
 
 use crate::optim::Moments;
 use crate::step::trainer::{Position, Trainer};
@@ -192,7 +192,7 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
     };
     let followed = json!(trainer.replans_before(progress.iteration));
     if followed != *meta.get("replans").unwrap_or(&json!([])) {
-        // No damage: an older checkpoint, from before the first of them, would go on as if nothing were wrong.
+        // No damage: an older checkpoint, from before the first of them, would continue as if nothing were wrong.
         let what = "the checkpoint followed other changes of plan than `run.replans` in recipe.toml says";
         return Err(Error::new(ErrorKind::Unsupported, what)
             .remedy("Put recipe.toml back as the run wrote it, or start a new run with -o"));

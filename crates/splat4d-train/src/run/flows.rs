@@ -1,4 +1,4 @@
-//! Optical flow of our own, where a capture brings none and the recipe asks for it: followed once from every training
+//! Optical flow of our own, where a capture brings none and the recipe requests it: followed once from every training
 //! image to the next one of its camera, kept next to the run in `flow/`, and from then on the capture's own.
 
 use super::checkpoint::write_atomically;

@@ -20,13 +20,14 @@ const STORED_BYTES: [u64; 2] = [4, 7];
 /// Bytes that nothing below counts: the program, threads, what the allocator holds back. Chosen on the runs of
 /// docs/models.md.
 const PROCESS_BYTES: u64 = 80 << 20;
-/// While a checkpoint is written, values and moments stand twice more in memory: as rows, and as the file. Of the tables.
+/// While a checkpoint is written, values and moments stand twice more in memory: as rows, and as the file. Of the
+/// tables.
 const CHECKPOINT: [u64; 2] = [3, 2];
 /// Bytes of a number.
 const F32: u64 = 4;
 /// Numbers of a learnable number: itself, its gradient, two moments.
 const LEARNT: u64 = 4;
-/// Numbers a splat has in an answer, and as many in its gradient.
+/// Numbers a splat has in a result, and as many in its gradient.
 const ANSWER: u64 = 2 * splat_numbers();
 /// Rows on which a model without nodes is made.
 const FEW: usize = 16;

@@ -1,5 +1,5 @@
-//! [`OpenCapture`]: a capture as a recipe wants it, opened for training, and what is made of it: a plan, a first scene, a
-//! trainer.
+//! [`OpenCapture`]: a capture as a recipe wants it, opened for training, and what is made of it: a plan, a first scene,
+//! a trainer.
 
 use super::dataset::Dataset;
 use crate::capture::frames::{Frames, Picture};
@@ -53,8 +53,8 @@ pub fn open_capture(path: &Path, recipe: &Recipe) -> Result<Capture> {
     open_frames(path, recipe, Vec::new(), &Lenses::default())
 }
 
-/// The same for a part of a long capture: only images with these frame numbers are listed ([`CaptureOptions::frames`]). `lenses`:
-/// what another part of it found ([`Capture::lenses`]).
+/// The same for a part of a long capture: only images with these frame numbers are listed ([`CaptureOptions::frames`]).
+/// `lenses`: what another part of it found ([`Capture::lenses`]).
 pub fn open_frames(path: &Path, recipe: &Recipe, frames: Vec<Range<usize>>, lenses: &Lenses) -> Result<Capture> {
     let options = CaptureOptions { frames, lenses: lenses.clone(), ..capture_options(recipe)? };
     let mut capture = Capture::open(path, &options)?;
@@ -174,8 +174,8 @@ fn mean_color(frames: &dyn Frames) -> Result<[f32; 3]> {
     Ok(sums.map(|s| (s / pixels.max(1.0)) as f32))
 }
 
-/// What of cameras a recipe lets learn. Clocks say nothing where nothing moves, and nothing can be asked between the frames
-/// of a model that is learnt frame by frame.
+/// What of cameras a recipe lets learn. Clocks say nothing where nothing moves, and nothing can be asked between the
+/// frames of a model that is learnt frame by frame.
 pub(crate) fn learnable(recipe: &Recipe) -> RefineSettings {
     let timed = !["still", "tracked"].contains(&recipe.run.motion.as_str());
     RefineSettings { times: recipe.refine.times && timed, ..recipe.refine.clone() }
@@ -196,7 +196,7 @@ impl OpenCapture {
         Self { capture: frames.capture().clone(), frames, simd: Simd::detect(), device: Device::Cpu }
     }
 
-    /// The same, drawn by another device.
+    /// The same, rendered by another device.
     pub(crate) fn on(self, device: Device) -> Self {
         Self { device, ..self }
     }
@@ -283,7 +283,7 @@ impl OpenCapture {
         let program = recipe.program()?;
         let mut trainer = self.trainer_of(recipe, plan, scene, stages(program.as_ref(), plan));
         trainer.replan(recipe.run.replans.rows());
-        // What a still scene cannot show must not draw it away from what it can.
+        // What a still scene cannot show must not render it away from what it can.
         let strength = if program.capabilities(plan).moves { plan.common.loss.moving } else { 0.0 };
         trainer.emphasise(Emphasis::new(self.frames.as_ref(), strength)?);
         Ok(trainer)

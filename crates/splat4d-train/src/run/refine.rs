@@ -24,7 +24,7 @@ use std::sync::atomic::AtomicBool;
 
 /// A refinement of a scene.
 pub(crate) struct Refine {
-    /// The verb that asks for it: run.json names it, and errors suggest to continue with it.
+    /// The verb that requests it: run.json names it, and errors suggest to continue with it.
     pub made_by: String,
     /// The scene before the first stage.
     pub scene: Scene<f32>,
@@ -32,10 +32,10 @@ pub(crate) struct Refine {
     pub stages: Vec<Stage>,
     /// The frames that the scene is compared with (`training_frames`).
     pub frames: Arc<Dataset>,
-    /// Losses, background, SH degree, seed, thresholds, steps between checkpoints. Its motion model and its iterations do
-    /// not count: the scene and the stages have theirs.
+    /// Losses, background, SH degree, seed, thresholds, steps between checkpoints. Its motion model and its iterations
+    /// do not count: the scene and the stages have theirs.
     pub recipe: Recipe,
-    /// Exposures of the cameras; none: they show what is drawn, unless the recipe lets them learn.
+    /// Exposures of the cameras; none: they show what is rendered, unless the recipe lets them learn.
     pub exposure: Option<Exposure>,
     /// All else that the result depends on, as text: settings and a fingerprint of the scene. A run is only continued
     /// with the same.
@@ -56,8 +56,8 @@ pub(crate) struct Refined {
 
 /// Begins the run in the folder `run`, or continues it, exactly, where that holds one.
 ///
-/// A stage's start is not run again once a checkpoint holds a step of the stage: what codecs, losses and layers remember
-/// comes from the checkpoint. Errors: the folder holds another run; what stages and files may say.
+/// A stage's start is not run again once a checkpoint holds a step of the stage: what codecs, losses and layers
+/// remember comes from the checkpoint. Errors: the folder holds another run; what stages and files may say.
 pub(crate) fn refine(
     job: Refine,
     run: &Path,

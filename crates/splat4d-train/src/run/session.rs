@@ -30,7 +30,7 @@ use std::time::{Duration, Instant as Clock};
 /// Options of a run in addition to its recipe.
 #[derive(Clone, Debug, Default)]
 pub struct TrainOptions {
-    /// What draws. It is no part of the recipe: a run may be resumed on another device, whose last bits are others.
+    /// What renders. It is no part of the recipe: a run may be resumed on another device, whose last bits are others.
     pub device: Device,
     /// Keep all from the clock's zero to the end of what follows training to so long: iterations are fitted to it, and
     /// fitted again while the run goes.
@@ -38,7 +38,8 @@ pub struct TrainOptions {
     /// What the caller does after training (measuring, filming, baking) takes as long as about so many steps at the end
     /// of training; `minutes` leaves room for it.
     pub finish: f64,
-    /// Time steps before the run and say by [`Event::Predicted`] how long it will take. With `minutes` it is said anyhow.
+    /// Time steps before the run and say by [`Event::Predicted`] how long it will take. With `minutes` it is said
+    /// anyhow.
     pub predict: bool,
     /// The clock of `minutes`; its zero is when the command began, or these options were made.
     pub clock: Stopwatch,
@@ -87,8 +88,9 @@ pub struct Outcome {
 
 /// Share of the largest number of Gaussians from which on a run is at its cap.
 const AT_CAP: f64 = 0.98;
-/// PSNR of training views below which a cloud at its cap is too small for them, dB: a real room of 292 photos ends at 26.5
-/// with 30,000 Gaussians and at 27.4 with 150,000; captures that have enough end above 29 (studies/records/2026-11-26-real-size.md).
+/// PSNR of training views below which a cloud at its cap is too small for them, dB: a real room of 292 photos ends at
+/// 26.5 with 30,000 Gaussians and at 27.4 with 150,000; captures that have enough end above 29
+/// (studies/records/2026-11-26-real-size.md).
 const UNDER_FITTED: f64 = 28.0;
 
 /// Advice for a run that ends at its cap with blurred training views.
@@ -375,7 +377,7 @@ impl Session<'_> {
         Ok(Outcome { run: self.run.to_owned(), iteration, gaussians, seconds: state.seconds, interrupted: !done })
     }
 
-    /// Says on what it trains, where that was asked for or is not what it was before.
+    /// Says on what it trains, where that was requested or is not what it was before.
     fn report_device(&self, trainer: &Trainer<'_>, listen: &mut dyn FnMut(&Event)) {
         let device = &trainer.device;
         // Older runs, from before other devices existed, name none.
@@ -458,8 +460,8 @@ impl Session<'_> {
         write_atomically(&self.run.join("run.json"), text.as_bytes())
     }
 
-    /// Back to the last checkpoint with half the rates; the third time the run is given up. A device that failed is not to blame for
-    /// the numbers: the rates stay.
+    /// Back to the last checkpoint with half the rates; the third time the run is given up. A device that failed is not
+    /// to blame for the numbers: the rates stay.
     fn roll_back(&self, trainer: &mut Trainer<'_>, fault: &Fault, listen: &mut dyn FnMut(&Event)) -> Result<RunState> {
         let Fault(what, blame, _) = fault;
         let (strike, share) = if *blame == Blame::Device { (0, 1.0) } else { (1, ROLLBACK_RATE) };

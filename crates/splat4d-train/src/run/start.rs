@@ -1,4 +1,4 @@
-//! How a run begins, and how it goes on from its folder.
+//! How a run begins, and how it continues from its folder.
 
 use super::budget::{Budget, PROBES};
 use super::checkpoint;
@@ -113,7 +113,7 @@ struct Timed {
     budget: Option<Budget>,
 }
 
-/// Times steps where the options ask for it, and fits the recipe to its minutes.
+/// Times steps where the options request it, and fits the recipe to its minutes.
 fn timed(
     opened: &OpenCapture,
     recipe: Recipe,
@@ -187,8 +187,8 @@ pub fn forecast(capture: Arc<Capture>, listen: &mut dyn FnMut(&Event)) -> Result
     Ok(Forecast { motion: choice.motion, why: choice.why, iterations: recipe.run.iterations, gaussians, memory })
 }
 
-/// As [`resume`]; of the options only `device`, `own_loss`, `snapshots` and `clock` count, the rest was settled at the start. A run with
-/// `minutes` keeps to what is left of them: time between the commands does not count.
+/// As [`resume`]; of the options only `device`, `own_loss`, `snapshots` and `clock` count, the rest was settled at the
+/// start. A run with `minutes` keeps to what is left of them: time between the commands does not count.
 pub fn resume_with(
     run: &Path,
     options: &TrainOptions,

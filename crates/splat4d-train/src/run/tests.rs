@@ -1,5 +1,5 @@
-//! Whole runs on a tiny capture on disk: the same bits for any number of threads, after any stop and after a crash; faults
-//! that roll back; outputs, memory and checkpoints that are refused.
+//! Whole runs on a tiny capture on disk: the same bits for any number of threads, after any stop and after a crash;
+//! faults that roll back; outputs, memory and checkpoints that are refused.
 
 mod device;
 mod observe;
@@ -116,7 +116,7 @@ impl Place {
         train(self.open(recipe), recipe.clone(), &run, &TrainOptions::default(), &AtomicBool::new(false), &mut |_| {})
     }
 
-    /// As `train`, with another drawing device and ears.
+    /// As `train`, with another rendering device and ears.
     fn train_with(
         &self,
         name: &str,
@@ -308,8 +308,8 @@ fn a_killed_run_resumes_from_whatever_is_on_disk() {
             let run = place.run(&name);
             let list = checkpoint::list(&run);
             let newest = std::fs::read(&list[list.len() - 1]).unwrap();
-            // A crash in the middle of a write: a stale temporary file. A disk that lost blocks: a newest checkpoint cut
-            // short, beyond the sound one.
+            // A crash in the middle of a write: a stale temporary file. A disk that lost blocks: a newest checkpoint
+            // cut short, beyond the sound one.
             std::fs::write(run.join("checkpoints/.00000099.safetensors.123.tmp"), &newest[..newest.len() / 3]).unwrap();
             let mut damaged = newest[..newest.len() / 2].to_vec();
             if i % 2 == 1 {
@@ -434,7 +434,8 @@ fn foreign_checkpoints_are_refused_with_a_reason() {
         place.run(name)
     };
     let newest = |run: &Path| checkpoint::list(run).pop().unwrap();
-    // Another version, the one before or a later one: the last number called `version` in the header is the checkpoint's own.
+    // Another version, the one before or a later one: the last number called `version` in the header is the
+    // checkpoint's own.
     for version in [b'2', b'9'] {
         let run = copy(&format!("version-{version}"));
         let mut bytes = std::fs::read(newest(&run)).unwrap();
@@ -637,7 +638,7 @@ fn scenes_with_a_head_are_evaluated_with_it_and_not_exported_without() {
     let params = &scene.layers[layer].params;
     assert_eq!(keys, HeadKeys::of(params).unwrap());
     assert!((0..18).any(|i| params[keys.second].get(i, 0).abs() > 1e-3), "the network has learnt something");
-    // Evaluation draws the head: one that is turned up changes the score.
+    // Evaluation renders the head: one that is turned up changes the score.
     let mut loud = scene.clone();
     loud.layers[layer].params[keys.second].fill(2.0);
     // Hidden units that the held-out camera wakes, which looks along -x; by chance it may wake none.

@@ -1,6 +1,6 @@
 //! The fixed chain of one step: `motion.at → render → loss → render.backward → motion.backward`.
 //!
-//! Views and the questions of losses that look at several times are merged: one `prepare`, one `at` and one `backward`
+//! Views and the queries of losses that look at several times are merged: one `prepare`, one `at` and one `backward`
 //! for every distinct (layer, space, time), one `finish`.
 
 use super::channels::{Channels, Source};
@@ -22,7 +22,7 @@ use std::time::{Duration, Instant as Clock};
 pub struct Timings {
     /// `prepare` and `at`.
     pub motion: Duration,
-    /// Drawing; of a device that does it all at once also comparing and the renderer's VJP.
+    /// Rendering; of a device that does it all at once also comparing and the renderer's VJP.
     pub render: Duration,
     /// Image, probe and parameter losses with their gradients.
     pub loss: Duration,
@@ -59,13 +59,13 @@ impl StepReport {
 /// The input of one step.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Step<'a, F: Real> {
-    /// The scene to draw.
+    /// The scene to render.
     pub scene: &'a Scene<F>,
     /// The views to compare it with.
     pub views: &'a [View<'a, F>],
     /// Where in training.
     pub info: &'a StepInfo,
-    /// Highest degree of spherical harmonics drawn.
+    /// Highest degree of spherical harmonics rendered.
     pub sh_degree: usize,
 }
 
@@ -107,7 +107,7 @@ impl<F: Real> Work<'_, F> {
 }
 
 impl<F: Real> Chain<F> {
-    /// One step: adds all gradients to `d` (one a layer, cleared by the caller). `observe` is called with every view.
+    /// One step: adds all gradients to `d` (one per layer, cleared by the caller). `observe` is called with every view.
     ///
     /// Errors: those of the backend.
     pub(crate) fn step(
@@ -145,7 +145,7 @@ impl<F: Real> Chain<F> {
         Ok(report)
     }
 
-    /// Collects the questions: what views see is what is alive, probes add their rows, channels other times.
+    /// Collects the queries: what views see is what is alive, probes add their rows, channels other times.
     fn request(&mut self, step: &Step<'_, F>, image: &dyn ImageTerm<F>, probes: &[Vec<Probe>]) {
         self.evaluation.begin();
         for view in step.views {
@@ -168,14 +168,14 @@ impl<F: Real> Chain<F> {
         }
     }
 
-    /// By layer the question for its Gaussians at a time of this step.
+    /// By layer the query for its Gaussians at a time of this step.
     fn asked(&self, scene: &Scene<F>, t: Time) -> Vec<usize> {
         let question =
             |layer| self.evaluation.find(layer, Space::Gaussians, t).expect("every time of a step was asked");
         (0..scene.layers.len()).map(question).collect()
     }
 
-    /// Draws one view, compares it, and takes the gradient back to its splats.
+    /// Renders one view, compares it, and takes the gradient back to its splats.
     fn view(&mut self, step: &Step<'_, F>, view: &View<'_, F>, work: &mut Work<'_, F>) -> Result<()> {
         let mut clock = Clock::now();
         let scene = step.scene;
@@ -215,7 +215,7 @@ impl<F: Real> Chain<F> {
         Ok(())
     }
 
-    /// Shows a loss the rows it asked for and scatters its gradient back.
+    /// Shows a loss the rows it requested and scatters its gradient back.
     fn probe(&mut self, scene: &Scene<F>, loss: &dyn ProbeLoss<F>, probes: &[Probe]) -> f64 {
         let mut places = Vec::new();
         let mut seen = Vec::new();
@@ -269,7 +269,7 @@ impl<F: Real> Compared<F> {
         work.record_loss(value);
     }
 
-    /// Drawing, the image loss and the backend's VJP, all on its device. Returns whether it could.
+    /// Rendering, the image loss and the backend's VJP, all on its device. Returns whether it could.
     fn compare_there(
         &mut self,
         view: &View<'_, F>,

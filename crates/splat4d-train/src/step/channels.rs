@@ -1,5 +1,5 @@
-//! Further channels of the splats of a view, so that losses can look at them: normals, the way to another time, a column of
-//! the Gaussians. Each has its forward and its VJP here.
+//! Further channels of the splats of a view, so that losses can look at them: normals, the way to another time, a
+//! column of the Gaussians. Each has its forward and its VJP here.
 
 use crate::loss::image::{Channel, View};
 use rayon::prelude::*;
@@ -18,14 +18,14 @@ const CHUNK: usize = 512;
 pub(super) struct Source<'a, F: Real> {
     pub(super) scene: &'a Scene<F>,
     pub(super) view: &'a View<'a, F>,
-    /// By layer: the question that the view's splats answer.
+    /// By layer: the query that the view's splats answer.
     pub(super) asked: &'a [usize],
 }
 
-/// The answers in which a layer's splats are at another time.
+/// The results in which a layer's splats are at another time.
 struct Later {
     question: usize,
-    /// A row a splat of the view; `None`: it was not asked for.
+    /// A row per splat of the view; `None`: it was not requested.
     rows: Vec<Option<usize>>,
 }
 
@@ -33,14 +33,14 @@ struct Later {
 pub(super) struct Channels<F> {
     /// [all splats, C]
     pub(super) table: Table<F>,
-    /// The drawn channels, each with its first column.
+    /// The rendered channels, each with its first column.
     pub(super) places: Vec<(Channel, usize)>,
-    /// By channel that draws a way, by layer, where it goes.
+    /// By channel that renders a way, by layer, where it goes.
     later: Vec<(Channel, Vec<Later>)>,
 }
 
 impl<F: Real> Channels<F> {
-    /// Of the splats that `evaluation` has of a view. `None`: there is nothing to draw.
+    /// Of the splats that `evaluation` has of a view. `None`: there is nothing to render.
     pub(super) fn new(wanted: &[Channel], source: Source<'_, F>, evaluation: &Evaluation<F>) -> Option<Self> {
         let drawn = wanted.iter().filter(|c| match c {
             Channel::Sigmoid(column) => source.scene.layers.iter().any(|l| logit_of(&l.params, column).is_some()),
@@ -67,7 +67,7 @@ impl<F: Real> Channels<F> {
         Some(out)
     }
 
-    /// From the gradient of the table to those of the answers, and of the layers' columns.
+    /// From the gradient of the table to those of the results, and of the layers' columns.
     pub(super) fn backward(
         &self,
         d_table: &Table<F>,

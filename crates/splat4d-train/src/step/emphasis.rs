@@ -1,9 +1,9 @@
 //! [`Emphasis`]: pixels that show what moves weigh more. What moves is a small part of most images and the hardest,
 //! since
-//! a still Gaussian learns from every frame and a moving one from those of its life.
+//! a still Gaussian learns from every frame and a moving one from those of its lifespan.
 //!
-//! Source: the importance of DyNeRF (Li et al. 2022) by the distance from the temporal median, which draws rays there and
-//! weighs pixels here: w = 1 + k·⅓ Σ_c ψ(I_c − median_c), ψ(x) = x²/(x² + γ²).
+//! Source: the importance of DyNeRF (Li et al. 2022) by the distance from the temporal median, which draws rays there
+//! and weighs pixels here: w = 1 + k·⅓ Σ_c ψ(I_c − median_c), ψ(x) = x²/(x² + γ²).
 
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};

@@ -1,5 +1,5 @@
-//! [`Engine`]: takes steps on a learner. The processor's is [`CpuEngine`]; one whose tables stay on a device can stand in its
-//! place, since a plan states all that a step is of, and a learner states what happened to it between steps.
+//! [`Engine`]: takes steps on a learner. The processor's is [`CpuEngine`]; one whose tables stay on a device can stand
+//! in its place, since a plan states all that a step is of, and a learner states what happened to it between steps.
 
 use super::chain::{Chain, ImageTerm, Losses, Step, StepInfo, StepReport, View};
 use super::loss::TrainLoss;
@@ -28,7 +28,7 @@ pub struct StepPlan<'a> {
     pub info: &'a StepInfo,
     /// Steps of the stage that were taken before.
     pub stage_step: usize,
-    /// Highest SH degree drawn.
+    /// Highest SH degree rendered.
     pub sh_degree: usize,
     /// Every rate is multiplied by this.
     pub rate_scale: f64,
@@ -58,7 +58,8 @@ pub struct Measured {
 pub struct Stepped {
     /// Timings and gradients to times and cameras; losses too, where the step is done.
     pub report: StepReport,
-    /// What steps measured that are done now and were not before: this one, or, of a device that is still at it, earlier ones.
+    /// What steps measured that are done now and were not before: this one, or, of a device that is still at it,
+    /// earlier ones.
     pub measured: Vec<Measured>,
     /// Loading images.
     pub load: Duration,
@@ -68,7 +69,7 @@ pub struct Stepped {
     pub other: Duration,
     /// Gaussians born, moved, removed.
     pub change: Change,
-    /// What the user should know of the device that draws.
+    /// What the user should know of the device that renders.
     pub notices: Vec<String>,
 }
 
@@ -81,19 +82,19 @@ pub enum Blame {
     Device,
 }
 
-/// A step that was spoilt, so that nothing of the learner is to be trusted any more: what and where, by what, and the numbers of the
-/// frames that it examined, where it is not the last one that was begun.
+/// A step that was spoilt, so that nothing of the learner is to be trusted any more: what and where, by what, and the
+/// numbers of the frames that it examined, where it is not the last one that was begun.
 #[derive(Clone, Debug)]
 pub struct Fault(pub String, pub Blame, pub Option<Vec<usize>>);
 
 /// Takes steps on a learner.
 pub trait Engine: Send {
-    /// One step: evaluate, draw, compare, back, Adam, noise. A device may still be at it afterwards. Inner error: it, or one before it,
-    /// was spoilt. Errors: those of what draws.
+    /// One step: evaluate, draw, compare, back, Adam, noise. A device may still be at it afterwards. Inner error: it,
+    /// or one before it, was spoilt. Errors: those of what renders.
     fn step(&mut self, train_state: &mut TrainState, plan: &mut StepPlan<'_>) -> Result<Result<Stepped, Fault>>;
 
-    /// The learner was changed in other ways than by a step (it was settled before), or another stage begins: what is remembered
-    /// of it is stale.
+    /// The learner was changed in other ways than by a step (it was settled before), or another stage begins: what is
+    /// remembered of it is stale.
     fn changed(&mut self, train_state: &TrainState);
 
     /// Waits for the steps that a device is still at: what they measured. Errors: one was spoilt.
@@ -112,7 +113,7 @@ pub trait Engine: Send {
         Vec::new()
     }
 
-    /// As it draws.
+    /// As it renders.
     fn antialias(&self) -> Antialias;
 }
 
@@ -139,11 +140,11 @@ pub(super) fn rates_of(scene: &Scene<f32>, plan: &StepPlan<'_>, all: &mut Rates)
     }
 }
 
-/// Share of a stage after which exposures come to rest: before it they learn at a constant rate, since a rate that falls from the
-/// start leaves them short in runs of a few dozen images a camera (docs/suite.md).
+/// Share of a stage after which exposures come to rest: before it they learn at a constant rate, since a rate that
+/// falls from the start leaves them short in runs of a few dozen images a camera (docs/suite.md).
 const EXPOSURE_RESTS: f64 = 0.7;
-/// What is left of their rate at the end: Adam moves a camera's colours by up to the rate a step whatever the gradient, and at the
-/// full rate images end a thousandth off.
+/// What is left of their rate at the end: Adam moves a camera's colours by up to the rate a step whatever the gradient,
+/// and at the full rate images end a thousandth off.
 const EXPOSURE_END: f64 = 0.01;
 
 /// What is left of the exposures' rate at a place in the stage.
@@ -179,7 +180,7 @@ pub(super) fn noise_stream(plan: &StepPlan<'_>) -> Rng {
     Rng::new(plan.info.seed, "noise", plan.info.iteration as u64)
 }
 
-/// Steps on the processor, with whatever draws.
+/// Steps on the processor, with whatever renders.
 pub struct CpuEngine<'a> {
     backend: Box<dyn Backend<f32> + 'a>,
     chain: Chain<f32>,
@@ -195,7 +196,7 @@ pub struct CpuEngine<'a> {
 }
 
 impl<'a> CpuEngine<'a> {
-    /// An engine that draws with `backend`.
+    /// An engine that renders with `backend`.
     pub fn new(backend: Box<dyn Backend<f32> + 'a>) -> Self {
         Self {
             backend,
@@ -208,12 +209,12 @@ impl<'a> CpuEngine<'a> {
         }
     }
 
-    /// What draws.
+    /// What renders.
     pub(super) fn backend(&mut self) -> &mut (dyn Backend<f32> + 'a) {
         self.backend.as_mut()
     }
 
-    /// Draws on the processor from now on, by the same limits.
+    /// Renders on the processor from now on, by the same limits.
     pub(super) fn leave_device(&mut self) {
         self.backend = device::cpu(*self.backend.config());
     }

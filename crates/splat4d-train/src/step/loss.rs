@@ -8,7 +8,7 @@ use splat4d::render::{Comparison, Target};
 use splat4d::scene::Planes;
 
 /// The loss on images: terms, in the order in which their values and gradients are summed. The exposure of the
-/// view's camera is between the drawn image and all of them.
+/// view's camera is between the rendered image and all of them.
 pub struct TrainLoss {
     terms: Vec<Box<dyn ImageTerm>>,
     exposed: Planes<f32>,
@@ -167,7 +167,7 @@ mod tests {
         exposure
     }
 
-    /// Value and gradient to the drawn colours of one view.
+    /// Value and gradient to the rendered colours of one view.
     fn eval(
         loss: &mut TrainLoss,
         stage: &mut [Box<dyn ImageTerm>],

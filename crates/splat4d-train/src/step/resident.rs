@@ -1,5 +1,5 @@
-//! [`DeviceEngine`]: steps on a device that keeps the tables, where a stage lets it; all others are the CPU's, with whatever
-//! draws.
+//! [`DeviceEngine`]: steps on a device that keeps the tables, where a stage lets it; all others are the CPU's, with
+//! whatever renders.
 
 use super::chain::ImageTerm;
 use super::engine::{
@@ -59,7 +59,7 @@ pub(crate) struct DeviceEngine<'a> {
 }
 
 impl<'a> DeviceEngine<'a> {
-    /// An engine that draws with `backend`, and takes steps with it where it keeps tables.
+    /// An engine that renders with `backend`, and takes steps with it where it keeps tables.
     pub(crate) fn new(backend: Box<dyn Backend<f32> + 'a>) -> Self {
         let (cpu, rates) = (CpuEngine::new(backend), Rates::default());
         Self {
@@ -295,7 +295,7 @@ impl Engine for DeviceEngine<'_> {
         }
         let clock = Clock::now();
         if let Err(error) = self.keep(train_state, plan) {
-            // It may well go on drawing.
+            // It may well continue rendering.
             self.given_up = true;
             self.report(&error.cause(), &mut notices);
             return self.step_on_cpu(train_state, plan, notices);
@@ -320,7 +320,7 @@ impl Engine for DeviceEngine<'_> {
         let resident = self.cpu.backend().resident().expect("it was there before");
         let done = match resident.step(&step) {
             Ok(Some(done)) => done,
-            // An image too large for one piece: the CPU's engine draws it in several.
+            // An image too large for one piece: the CPU's engine renders it in several.
             Ok(None) => return self.step_on_cpu(train_state, plan, notices),
             Err(error) => {
                 if self.newest != Newest::Both {
@@ -330,7 +330,7 @@ impl Engine for DeviceEngine<'_> {
                 self.given_up = true;
                 self.newest = Newest::TrainState;
                 if error.kind() == ErrorKind::Memory {
-                    // Drawing needs less of it.
+                    // Rendering needs less of it.
                     self.report(&error.cause(), &mut notices);
                 } else {
                     self.cpu.leave_device();

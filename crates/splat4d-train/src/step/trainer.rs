@@ -61,14 +61,14 @@ pub struct Position {
     pub strikes: usize,
 }
 
-/// The device that draws.
+/// The device that renders.
 #[derive(Clone, Debug)]
 pub(crate) struct TrainedOn {
     /// It in words, its driver too.
     pub(crate) name: String,
     /// What was taken and why, in a line.
     pub(crate) why: String,
-    /// Whether it is not the one that was asked for.
+    /// Whether it is not the one that was queried for.
     pub(crate) missed: bool,
 }
 
@@ -84,7 +84,7 @@ pub struct Trainer<'a> {
     pub loss: TrainLoss,
     /// Settings that hold for all stages.
     pub settings: Settings,
-    /// What draws.
+    /// What renders.
     pub(crate) device: TrainedOn,
     /// The pace through the schedule; none: a step is one of the schedule.
     pace: Option<Pace>,
@@ -163,13 +163,14 @@ impl<'a> Trainer<'a> {
         self.pace = (!replans.is_empty()).then(|| Pace::new(self.schedule(), replans));
     }
 
-    /// Changes of plan that were followed in the first `taken` steps: the step at which each came, and the steps in all.
+    /// Changes of plan that were followed in the first `taken` steps: the step at which each came, and the steps in
+    /// all.
     pub(crate) fn replans_before(&self, taken: usize) -> Vec<[usize; 2]> {
         self.pace.as_ref().map_or_else(Vec::new, |p| p.replans_before(taken))
     }
 
-    /// Steps of the current stage's schedule that will be behind the run after this step: at most to the stage's end, so
-    /// that no stage is passed over.
+    /// Steps of the current stage's schedule that will be behind the run after this step: at most to the stage's end,
+    /// so that no stage is passed over.
     fn next_place(&self) -> usize {
         let Position { iteration, stage, stage_step, .. } = self.progress;
         match &self.pace {
@@ -437,8 +438,8 @@ impl<'a> Trainer<'a> {
         Ok(())
     }
 
-    /// Runs the operations of `which` that are due after any of these steps of the stage's schedule, once each and where
-    /// they are due last, and notifies losses of what they did.
+    /// Runs the operations of `which` that are due after any of these steps of the stage's schedule, once each and
+    /// where they are due last, and notifies losses of what they did.
     fn keep_up(&mut self, passed: RangeInclusive<usize>, which: impl Fn(&dyn Maintenance) -> bool) -> Result<Change> {
         let Stage { maintenance, groups, iterations, .. } = &mut self.stages[self.progress.stage];
         let at = |step| At { step, steps: *iterations };

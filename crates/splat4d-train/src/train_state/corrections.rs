@@ -1,10 +1,10 @@
 //! `Corrections`: what training learns of where cameras stand and when they looked.
 //!
-//! A correction of a pose is a twist ξ = (ρ, θ) in the camera's axes, `exp(ξ)·cam_from_world`; all frames of a fixed camera
-//! share one. A correction of a focal length is a share of it, of a camera. A correction of a clock is a shift of
-//! all times of a camera. Images say nothing of where the scene as a whole
-//! stands, how large it is and when it begins: the cameras' mean motion, their mean growth and the median of their clocks
-//! stay. The median, since of a rig with one clock that is wrong the others are right.
+//! A correction of a pose is a twist ξ = (ρ, θ) in the camera's axes, `exp(ξ)·cam_from_world`; all frames of a fixed
+//! camera share one. A correction of a focal length is a share of it, of a camera. A correction of a clock is a shift
+//! of all times of a camera. Images say nothing of where the scene as a whole
+//! stands, how large it is and when it begins: the cameras' mean motion, their mean growth and the median of their
+//! clocks stay. The median, since of a rig with one clock that is wrong the others are right.
 
 use crate::optim::step_row;
 use crate::settings::settings;
@@ -59,8 +59,8 @@ settings! {
 
 /// Terms of the exponential's series: twists are small, and below one radian the next term is lost in rounding.
 const TERMS: usize = 16;
-/// Share of a frame by which cameras' times differ at least. Views at one time share one gradient to it; at times that are
-/// hardly different each has its own.
+/// Share of a frame by which cameras' times differ at least. Views at one time share one gradient to it; at times that
+/// are hardly different each has its own.
 const APART: f64 = 1e-6;
 
 /// Share by which a correction of a focal length falls back in every step: what images do not ask for goes away. Our
@@ -68,7 +68,7 @@ const APART: f64 = 1e-6;
 const PULL: f64 = 1e-4;
 /// Largest correction of a focal length, a share of it.
 const FOCAL_LIMIT: f64 = 0.2;
-/// Share of the run by which clocks were searched: then the scene is sharp enough for gradients to go on. Not swept.
+/// Share of the run by which clocks were searched: then the scene is sharp enough for gradients to continue. Not swept.
 const SEARCHED: f64 = 0.5;
 /// Searches that look as far as clocks may be wrong, in whole frames; later ones look about in halves.
 const WIDE_SEARCHES: usize = 3;
@@ -360,8 +360,8 @@ impl Corrections {
         }
     }
 
-    /// What was learnt, a row for every camera (or image of a moving one), as plain data. `name` returns of a frame: its
-    /// camera's name, and its number where that camera moves.
+    /// What was learnt, a row for every camera (or image of a moving one), as plain data. `name` returns of a frame:
+    /// its camera's name, and its number where that camera moves.
     pub(crate) fn report(&self, name: &dyn Fn(usize) -> (String, Option<usize>)) -> Value {
         let row = |(row, (_, frame)): (usize, &(Se3, usize))| {
             let (camera, index) = name(*frame);

@@ -17,8 +17,9 @@ const LANES: usize = 16;
 /// Groups of [`LANES`] pixels after which a lane's sums in f32 are added to those in f64.
 const RUN: usize = 32;
 
-/// A colour matrix I + M and an offset c a camera: the colour x that is drawn is shown as (I + M)x + c. The mean over the
-/// cameras is held at the identity, so that the scene keeps the rig's mean colours and held-out cameras are drawn with them.
+/// A colour matrix I + M and an offset c a camera: the colour x that is rendered is shown as (I + M)x + c. The mean
+/// over the cameras is held at the identity, so that the scene keeps the rig's mean colours and held-out cameras are
+/// rendered with them.
 /// Source: FreeTimeGS++ 2026 (an affine colour correction a camera); the fixed mean is ours.
 #[derive(Debug)]
 pub struct Exposure {
@@ -153,7 +154,7 @@ impl Exposure {
         pieces(color).for_each(|colors| respond(&row, colors));
     }
 
-    /// Writes the colours that camera `rig` shows of what was drawn.
+    /// Writes the colours that camera `rig` shows of what was rendered.
     pub(crate) fn show(&self, rig: usize, drawn: &Planes<f32>, out: &mut Planes<f32>) {
         let row = self.response(rig);
         if (out.channels, out.height, out.width) != (drawn.channels, drawn.height, drawn.width) {
@@ -168,8 +169,8 @@ impl Exposure {
         });
     }
 
-    /// The VJP of [`respond`](Self::respond) at what was drawn: turns the gradient to the shown colours into that to the
-    /// drawn ones, and adds to the camera's.
+    /// The VJP of [`respond`](Self::respond) at what was rendered: turns the gradient to the shown colours into that to
+    /// the rendered ones, and adds to the camera's.
     pub(crate) fn respond_backward(&mut self, rig: usize, drawn: &Planes<f32>, d_color: &mut Planes<f32>) {
         let (row, simd) = (self.response(rig), Simd::detect());
         let sums: Vec<[f64; COLUMNS]> = pieces(d_color)

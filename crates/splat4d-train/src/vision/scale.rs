@@ -13,7 +13,7 @@ pub(crate) struct Scale {
 
 /// Points nearer than this share of all that a camera sees may be wrong ones.
 const STRAY: f64 = 1e-3;
-/// Of the distance of the nearest points: surfaces go on a little before them.
+/// Of the distance of the nearest points: surfaces continue a little before them.
 const BEFORE: f64 = 0.5;
 /// Cameras that must see a point.
 const SEEN_BY: usize = 2;

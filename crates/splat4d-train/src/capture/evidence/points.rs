@@ -1,4 +1,5 @@
-//! Initial points: which part is in front of the cameras and in their images, and whether their colours are those there.
+//! Initial points: which part is in front of the cameras and in their images, and whether their colours are those
+//! there.
 
 use super::super::account::Severity;
 use super::super::lens::Distortion;
@@ -17,8 +18,8 @@ const CAMERAS: usize = 24;
 const POINTS: usize = 400;
 /// Share of points in images, and gain of colours, from which poses are right.
 pub(super) const CONVINCES: (f64, f64) = (0.03, MISFIT);
-/// Gain of colours below which points do not fit their images, if that many were compared: chance gives 0, exchanged images of
-/// one scene 0.14, and real captures 0.38 and more (studies/records, 26 November 2026).
+/// Gain of colours below which points do not fit their images, if that many were compared: chance gives 0, exchanged
+/// images of one scene 0.14, and real captures 0.38 and more (studies/records, 26 November 2026).
 const MISFIT: f64 = 0.2;
 const MANY: usize = 200;
 /// Share of points in images below which, of that many points, they are of another place.
@@ -144,8 +145,8 @@ fn in_image<'a>(frame: &Frame, points: impl Iterator<Item = &'a [f64; 3]>) -> Ve
     points.filter_map(|&p| Some((pixel_of(camera, &lens, pose, p)?, pose.apply(p)[2]))).collect()
 }
 
-/// Part of the points that a camera has in its image in the middle, from which one that has none is remarkable, and part of the
-/// cameras that have none at most.
+/// Part of the points that a camera has in its image in the middle, from which one that has none is remarkable, and
+/// part of the cameras that have none at most.
 const USUAL: f64 = 0.1;
 const EXCEPTIONS: f64 = 0.2;
 
@@ -208,8 +209,8 @@ fn by_points(capture: &Capture) -> Option<f64> {
 const FACTORS: [f64; 2] = [1e-5, 1e5];
 /// Pixels of a map that another map is compared with, along each side.
 const GRID: usize = 24;
-/// Two maps agree at a pixel within this share of the depth; and how many pixels agree in one unit, of those that both show, and how
-/// many times as many as in another.
+/// Two maps agree at a pixel within this share of the depth; and how many pixels agree in one unit, of those that both
+/// show, and how many times as many as in another.
 const AGREE: f64 = 0.03;
 const UNIT: (f64, f64) = (0.4, 1.5);
 
@@ -220,8 +221,8 @@ struct Asked<'a> {
     expected: Vec<(usize, f64)>,
 }
 
-/// The factor at which metric depth maps of neighbouring views agree with each other; `None`: with none, or with several. Factors
-/// next to 1 are within what is right.
+/// The factor at which metric depth maps of neighbouring views agree with each other; `None`: with none, or with
+/// several. Factors next to 1 are within what is right.
 fn by_views(capture: &Capture) -> Option<f64> {
     let metric = |i: &&usize| capture.frames[**i].depth.as_ref().is_some_and(|d| d.kind == DepthKind::Metric);
     let all: Vec<usize> = capture.train.iter().filter(metric).copied().collect();
@@ -258,7 +259,8 @@ fn by_views(capture: &Capture) -> Option<f64> {
         factors.extend([power, 2.0 * power, 5.0 * power].into_iter().filter(|f| f.max(1.0 / f) >= SAME_UNIT));
         power *= 10.0;
     }
-    // By map: pixels that any unit asks for, with the unit and the depth that it expects there. Every map is decoded once.
+    // By map: pixels that any unit requests, with the unit and the depth that it expects there. Every map is decoded
+    // once.
     let mut asked: Vec<Asked<'_>> = Vec::new();
     for (frame, other, ray) in &samples {
         let (camera, pose) = (&other.source, &other.source.cam_from_world);

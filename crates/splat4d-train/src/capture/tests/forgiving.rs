@@ -203,7 +203,7 @@ fn numbered_frames_without_times_are_a_film() {
     let photos = open_as(&sample, Sequence::Photos);
     assert_eq!((photos.timing, photos.times(), photos.cameras.len()), (Timing::Moment, vec![0.0], 20));
     assert!(photos.warnings.is_empty());
-    // Given times are not in question.
+    // Given times are not in query.
     sample.edit("transforms.json", |v| (0..20).for_each(|c| v["frames"][c]["time"] = json!(0.1 * c as f64)));
     for sequence in [Sequence::Auto, Sequence::Photos] {
         let capture = open_as(&sample, sequence);

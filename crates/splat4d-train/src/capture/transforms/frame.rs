@@ -64,7 +64,7 @@ pub(super) fn read(file: &File<'_>, node: &Node<'_>) -> Result<Entry> {
 /// Nerfstudio's name for equirectangular panoramas, whose focal lengths say nothing.
 const PANORAMA: &str = "EQUIRECTANGULAR";
 
-/// Units of the scene a stored number of a depth map where a file does not say: thousandths, as Nerfstudio has it.
+/// Units of the scene a stored number of a depth map where a file does not say: thousandths, as in Nerfstudio.
 const DEPTH_UNIT: f64 = 1e-3;
 
 /// A depth map in units of `depth_unit_scale_factor`, whatever its kind of file (Nerfstudio).
@@ -165,7 +165,8 @@ fn focal(top: &Node<'_>, node: &Node<'_>, keys: [&str; 3], side: usize) -> Resul
 /// By how much an angle of view and a focal length in pixels may differ: angles are sometimes of undistorted images.
 const SAME_FOCAL: f64 = 1.1;
 
-/// What to say where the file's angle of view is another than its focal length in pixels, which is the one that is read.
+/// What to say where the file's angle of view is another than its focal length in pixels, which is the one that is
+/// read.
 pub(super) fn contradiction(top: &Node<'_>, entries: &[Entry]) -> Result<Option<String>> {
     let (Some(angle), Some(entry)) = (top.opt("camera_angle_x")?, entries.first()) else { return Ok(None) };
     let (angle, camera) = (angle.number()?, &entry.source);

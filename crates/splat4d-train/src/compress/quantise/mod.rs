@@ -40,13 +40,13 @@ pub(crate) struct Quantised {
 /// State kept from step to step.
 #[derive(Debug)]
 struct Memory {
-    /// One a layer: its rows' entries of the palette.
+    /// One per layer: its rows' entries of the palette.
     labels: Vec<Vec<u16>>,
-    /// One a layer: how important the page is, 0 the most.
+    /// One per layer: how important the page is, 0 the most.
     tiers: Vec<u16>,
     /// Spherical harmonics above degree 0; none: base colours only.
     shared: Option<Shared>,
-    /// One a layer: blocks of the file whose rows have changed since they were shown.
+    /// One per layer: blocks of the file whose rows have changed since they were shown.
     dirty: Vec<Vec<bool>>,
 }
 
@@ -183,8 +183,8 @@ pub(crate) fn palette_rate(rates: &RateSettings, share: f64) -> Rate {
     Rate { start: rate, end: FALL * rate }
 }
 
-/// A stage on the pages of a file, whatever model they were baked from: all groups of kinematic primitives with a life,
-/// in every layer. Its `start` is still to be set: it ends with [`Quantised::begin`].
+/// A stage on the pages of a file, whatever model they were baked from: all groups of kinematic primitives with a
+/// lifespan, in every layer. Its `start` is still to be set: it ends with [`Quantised::begin`].
 pub(crate) fn stage(
     recipe: &Recipe,
     plan: &TrainContext,
@@ -195,7 +195,7 @@ pub(crate) fn stage(
     let rotates = recipe.program().is_ok_and(|p| p.capabilities(plan).rotates);
     let spacetime = SpacetimeSettings {
         order: 1,
-        // A turn that no model asked for would cost two bytes a Gaussian.
+        // A turn that no model requested would cost two bytes per Gaussian.
         rotation_rate: recipe.spacetime.rotation_rate || rotates,
         ..recipe.spacetime.clone()
     };
@@ -210,7 +210,7 @@ pub(crate) fn stage(
         name: "quantised".into(),
         iterations,
         groups: tuned(base.groups, share).into_iter().map(|g| Group { layer: EVERY, ..g }).collect(),
-        // Pages say with a width next to nothing that a life is a time.
+        // Pages say with a width next to nothing that a lifespan is a time.
         min_log_life: None,
         half_size_steps: 0,
         sh_interval: 0,

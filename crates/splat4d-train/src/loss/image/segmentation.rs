@@ -1,4 +1,4 @@
-//! Segmentation: a column of the Gaussians that states who is foreground, drawn and compared with the masks.
+//! Segmentation: a column of the Gaussians that states who is foreground, rendered and compared with the masks.
 
 use super::{Channel, ImageTerm, Needs, PictureGrads, Shown, View};
 use crate::loss::photometric::Photometric;

@@ -1,5 +1,5 @@
-//! The contract of losses on rendered images, [`ImageTerm`]: it states which channels it needs, looks at an image and its
-//! truth, and adds its gradient.
+//! The contract of losses on rendered images, [`ImageTerm`]: it states which channels it needs, looks at an image and
+//! its truth, and adds its gradient.
 
 use crate::capture::frames::{DepthTruth, FlowTruth};
 use crate::loss::terms::StepInfo;
@@ -48,18 +48,18 @@ pub struct View<'a, F = f32> {
 }
 
 /// A further channel: a number or a few of every splat, blended as colours are, over nothing. The declared order is the
-/// order in which they are drawn.
+/// order in which they are rendered.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Channel {
     /// Σ α T n, n the shortest axis of a splat towards the camera, camera axes, 3 planes.
     Normals,
-    /// Σ α T f, f the way of a splat's centre on the screen to where the view's flow goes, pixels, 2 planes, and Σ α T of
-    /// the splats that have an f. Only views that know their flow may ask for it.
+    /// Σ α T f, f the way of a splat's centre on the screen to where the view's flow goes, pixels, 2 planes, and Σ α T
+    /// of the splats that have an f. Only views that know their flow may request it.
     Flow,
     /// The same for where the view's tracks go.
     Tracks,
-    /// Σ α T s, s the sigmoid of this column of the Gaussians, 1 plane; 0 in layers without that column, and not drawn where
-    /// no layer has it.
+    /// Σ α T s, s the sigmoid of this column of the Gaussians, 1 plane; 0 in layers without that column, and not
+    /// rendered where no layer has it.
     Sigmoid(String),
 }
 
@@ -80,7 +80,7 @@ impl Channel {
         }
     }
 
-    /// What is known of the way that it draws.
+    /// What is known of the way that it renders.
     pub(crate) fn way<'a, F: Copy>(&self, view: &View<'a, F>) -> Option<FlowTruth<'a, F>> {
         match self {
             Channel::Flow => view.flow,
@@ -90,7 +90,7 @@ impl Channel {
     }
 }
 
-/// The planes to draw of a view next to colour and alpha.
+/// The planes to render of a view next to colour and alpha.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Needs {
     /// Σ z α T.
@@ -125,12 +125,12 @@ pub struct Shown<'a, F = f32> {
 }
 
 impl<'a, F: Real> Shown<'a, F> {
-    /// A drawn image with these further channels.
+    /// A rendered image with these further channels.
     pub(crate) fn new(image: &'a Image<F>, channels: &'a [(Channel, usize)]) -> Self {
         Self { color: &image.color, alpha: &image.alpha, depth: &image.depth, extra: &image.extra, channels }
     }
 
-    /// First plane of a channel, and a copy of its planes; `None`: it was not drawn.
+    /// First plane of a channel, and a copy of its planes; `None`: it was not rendered.
     pub fn channel(&self, channel: &Channel) -> Option<(usize, Planes<F>)> {
         let first = self.channels.iter().find(|(c, _)| c == channel)?.1;
         let (n, channels) = (self.extra.pixels(), channel.width());

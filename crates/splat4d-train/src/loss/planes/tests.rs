@@ -82,7 +82,7 @@ fn gradients_equal_differences_and_locked_levels_rest() {
                         value
                     };
                     let fd = (side(1e-6) - side(-1e-6)) / 2e-6;
-                    // The gradient was asked for three times over.
+                    // The gradient was requested three times over.
                     let got = d.table(key).get(i, 0) / 3.0;
                     assert!((fd - got).abs() < 1e-8 * (1.0 + fd.abs()), "level {level}, {i}: {fd} {got}");
                 }

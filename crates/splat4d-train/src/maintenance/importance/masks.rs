@@ -1,5 +1,5 @@
 //! Which Gaussians are rendered around which key time: the temporal filter of 4DGS-1K (Yuan et al. 2025, §4.2),
-//! united with the lives that no key time meets.
+//! united with the lifespans that no key time meets.
 
 use super::temporal::Spatial;
 use super::weighing::Weighing;
@@ -47,8 +47,8 @@ pub(super) fn keys(interval: usize, times: &[f64], fps: f64) -> Vec<f64> {
 }
 
 /// Gives every layer of `scene` masks: at a key time, the Gaussians that any training view of that time shows (weight
-/// above 0, behind what hides them). One whose life is between two key times and meets none is admitted at both; one
-/// that lives wholly before or after all training frames at none. Masks that the layers have count for nothing.
+/// above 0, behind what hides them). One whose lifespan is between two key times and meets none is admitted at both;
+/// one that lives wholly before or after all training frames at none. Masks that the layers have count for nothing.
 /// `progress` hears of views done and in all.
 ///
 /// Errors: there is no frame.

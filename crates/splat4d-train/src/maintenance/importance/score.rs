@@ -1,4 +1,4 @@
-//! Importance scores of Gaussians: how much of the training images each is, at times that its life serves well.
+//! Importance scores of Gaussians: how much of the training images each is, at times that its lifespan serves well.
 //!
 //! Source: 4DGS-1K (Yuan et al. 2025, §4.1); the volume as LightGaussian (Fan et al. 2024).
 
@@ -29,16 +29,16 @@ pub(crate) const UNIT_FRAMES: f64 = 30.0;
 pub(crate) struct ScoreConfig {
     /// The quantity of a view that counts.
     pub spatial: Spatial,
-    /// The temporal score of the life.
+    /// The temporal score of the lifespan.
     pub temporal: Temporal,
     /// How it meets the spatial score.
     pub combine: Combine,
     /// Whether the temporal score is multiplied with a power of the volume in space and time.
     pub volume: bool,
-    /// Power of the mean share that a Gaussian has of the pixels it touches. Above 0, haze goes first: it costs a blend as
-    /// much a pixel as what is solid does, and gives less (our own addition; 0: as published).
+    /// Power of the mean share that a Gaussian has of the pixels it touches. Above 0, haze goes first: it costs a blend
+    /// as much a pixel as what is solid does, and gives less (our own addition; 0: as published).
     pub cost: f64,
-    /// Frames of a unit of time, in which derivatives of the life are measured (`UNIT_FRAMES`).
+    /// Frames of a unit of time, in which derivatives of the lifespan are measured (`UNIT_FRAMES`).
     pub unit: f64,
     /// Every so many of the views at a time are examined, another choice at each time, and at least one.
     pub every: usize,
@@ -172,7 +172,7 @@ pub(crate) fn score(
             }
         }
     }
-    // A Gaussian that is not finite is not drawn; its life may be anything.
+    // A Gaussian that is not finite is not rendered; its lifespan may be anything.
     layers.iter_mut().flatten().filter(|s| s.is_nan()).for_each(|s| *s = 0.0);
     Ok(Scores { layers, spatial, views: total })
 }

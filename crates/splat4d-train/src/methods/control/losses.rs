@@ -20,12 +20,12 @@ const WINDOW: f64 = 0.05;
 /// Acceleration is taken over so many frames to both sides (SC-GS).
 const ACCELERATION_FRAMES: f64 = 3.0;
 
-/// Positions of all rows of an answer.
+/// Positions of all rows of a result.
 fn positions<F: Real>(seen: &Table<F>) -> Vec<[F; 3]> {
     (0..seen.rows()).map(|r| seen.read::<3>(r, 0)).collect()
 }
 
-/// Adds gradients of positions to an answer's gradient.
+/// Adds gradients of positions to a result's gradient.
 fn give<F: Real>(to: &mut Table<F>, d: &[[F; 3]]) {
     d.iter().enumerate().for_each(|(r, d)| to.add(r, 0, *d));
 }

@@ -38,7 +38,7 @@ fn every_gradient_of_features_and_head_equals_finite_differences() {
     }
 }
 
-/// With `detach` Δ is a constant to features too: the life's centre learns from opacity alone.
+/// With `detach` Δ is a constant to features too: the lifespan's centre learns from opacity alone.
 #[test]
 fn detached_features_give_lifespans_no_gradient() {
     let gradient = |detach: bool| {

@@ -93,7 +93,7 @@ fn smooth() -> RenderConfig {
     RenderConfig { alpha_min: 1e-14, alpha_max: 1.0 - 1e-9, transmittance_min: 0.0, ..RenderConfig::default() }
 }
 
-/// The oracle as a drawing device: a forward without gradients.
+/// The oracle as a rendering device: a forward without gradients.
 struct Oracle(RenderConfig);
 
 impl Backend<f64> for Oracle {
@@ -173,7 +173,7 @@ fn shots(list: &[(usize, f64)]) -> Vec<Shot> {
 /// The losses of a check next to the images.
 type Probes = Vec<Box<dyn ProbeLoss<f64>>>;
 
-/// One step of the chain with any drawing device.
+/// One step of the chain with any rendering device.
 fn step(
     scene: &Scene<f64>,
     shots: &[Shot],
@@ -214,8 +214,9 @@ fn assert_close(got: f64, fd: f64, what: &str) {
     assert!((got - fd).abs() <= floor + relative * fd.abs(), "{what}: chain {got:e}, differences {fd:e}");
 }
 
-/// Every column of a few rows of every trainable table, and dL/dt and dL/d pose of every view, against central differences. Returns
-/// the largest gradient of every table of every layer, so that a test can say which parameters must be reached.
+/// Every column of a few rows of every trainable table, and dL/dt and dL/d pose of every view, against central
+/// differences. Returns the largest gradient of every table of every layer, so that a test can say which parameters
+/// must be reached.
 fn check_gradients(scene: &Scene<f64>, shots: &[Shot], probes: &Probes) -> Vec<Vec<(String, f64)>> {
     let (report, d, _) = step(scene, shots, probes, &mut Renderer::new(smooth()));
     assert_close(report.loss, value(scene, shots, probes), "the loss");

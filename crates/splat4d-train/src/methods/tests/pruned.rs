@@ -1,4 +1,5 @@
-//! Pruning and masks take part in any model's training: a deformation model, whose Gaussians nodes carry, with a life.
+//! Pruning and masks take part in any model's training: a deformation model, whose Gaussians nodes carry, with a
+//! lifespan.
 
 use super::nodes::Skinned;
 use super::*;

@@ -43,8 +43,8 @@ pub struct Joined {
     pub peak_memory: u64,
 }
 
-/// Flicker (mean over neighbouring frames of |(R' − R) − (G' − G)|·255) where chunks meet, and for as many frames in their
-/// midst.
+/// Flicker (mean over neighbouring frames of |(R' − R) − (G' − G)|·255) where chunks meet, and for as many frames in
+/// their midst.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Seams {
     /// Where they overlap.
@@ -120,7 +120,8 @@ impl Chunked {
         Ok([from - 0.5 / capture.fps, to + 0.5 / capture.fps])
     }
 
-    /// A finished chunk as a scene of one layer, which is seen as it will be in the whole capture; what all share is left out.
+    /// A finished chunk as a scene of one layer, which is seen as it will be in the whole capture; what all share is
+    /// left out.
     ///
     /// Errors: files that cannot be read.
     pub fn alone(&self, chunk: usize) -> Result<Scene<f32>> {
@@ -237,7 +238,7 @@ impl Chunked {
     }
 }
 
-/// Draws what cameras saw.
+/// Renders what cameras saw.
 struct CameraRenders<'a> {
     store: ImageStore,
     backend: Box<dyn splat4d::render::Backend<f32>>,

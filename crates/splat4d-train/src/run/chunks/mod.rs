@@ -39,7 +39,8 @@ use std::time::Duration;
 
 /// Frames of a chunk where the recipe leaves it open (STG: 50).
 const FRAMES: usize = 60;
-/// A capture of so many frames is learnt at once where the recipe leaves it open: the cap's Gaussians are enough for it.
+/// A capture of so many frames is learnt at once where the recipe leaves it open: the cap's Gaussians are enough for
+/// it.
 const WHOLE: usize = 300;
 /// Seconds between two looks whether other workers are done.
 const POLL: Duration = Duration::from_secs(1);
@@ -90,9 +91,11 @@ pub struct Chunked {
 }
 
 impl Chunked {
-    /// Begins the run of a capture in the folder `run`, or finds it begun, by whichever worker. `None`: the capture is learnt at once.
+    /// Begins the run of a capture in the folder `run`, or finds it begun, by whichever worker. `None`: the capture is
+    /// learnt at once.
     ///
-    /// Errors: what the recipe asks for cannot be had in chunks; the folder holds the run of another recipe, capture or version.
+    /// Errors: what the recipe requests cannot be had in chunks; the folder holds the run of another recipe, capture or
+    /// version.
     pub fn begin(
         capture: &Arc<Capture>,
         recipe: &Recipe,
@@ -176,8 +179,8 @@ impl Chunked {
         &self.plan
     }
 
-    /// All parts, in an order in which one worker can do them: an odd chunk as soon as both its neighbours are there, so that
-    /// what is finished has few gaps.
+    /// All parts, in an order in which one worker can do them: an odd chunk as soon as both its neighbours are there,
+    /// so that what is finished has few gaps.
     pub fn parts(&self) -> Vec<Part> {
         let count = self.plan.len();
         let chunks = (0..count).map(|k| match k {
@@ -223,8 +226,8 @@ impl Chunked {
         })
     }
 
-    /// Does one part; nothing where it is done. Errors: parts before it are missing, another worker has it, and those of
-    /// training.
+    /// Does one part; nothing where it is done. Errors: parts before it are missing, another worker has it, and those
+    /// of training.
     pub fn work(
         &self,
         part: Part,
@@ -406,7 +409,7 @@ fn chosen(first: &Arc<Capture>, recipe: Recipe, listen: &mut dyn FnMut(&Event)) 
     opened.counted(recipe, &mut listen)
 }
 
-/// Errors: what a recipe asks for that chunks cannot have together.
+/// Errors: what a recipe requests that chunks cannot have together.
 fn check(recipe: &Recipe) -> Result<()> {
     let learnt = learnable(recipe);
     let (what, remedy) = if recipe.spacetime.has_features() {

@@ -1,8 +1,8 @@
 //! What chunks share: the layer of the static background all the time, and the cameras' exposures.
 //!
-//! Temporal medians of every fixed camera over parts of the capture are a capture of their own, on which a still scene is trained
-//! as any other run is. Of its Gaussians those stay that most cameras see where next to nothing ever changes: what is left out
-//! is learnt by the chunks, what would be wrong in there they could not mend.
+//! Temporal medians of every fixed camera over parts of the capture are a capture of their own, on which a still scene
+//! is trained as any other run is. Of its Gaussians those stay that most cameras see where next to nothing ever
+//! changes: what is left out is learnt by the chunks, what would be wrong in there they could not mend.
 
 use super::Chunked;
 use crate::Result;
@@ -40,8 +40,8 @@ const CAPTURE: &str = "capture";
 const PARTS: usize = 4;
 /// Frames whose median that is.
 const MEDIAN_OF: usize = 9;
-/// A pixel that differs by more from the median (mean of the channels, in [0, 1]) has changed: above the noise of ordinary
-/// cameras.
+/// A pixel that differs by more from the median (mean of the channels, in [0, 1]) has changed: above the noise of
+/// ordinary cameras.
 const CHANGED: f32 = 0.06;
 /// A pixel is calm where at most this share of the frames that are examined has changed.
 const CALM: f64 = 0.1;
@@ -61,7 +61,7 @@ pub(super) struct Shared {
     pub print: String,
 }
 
-/// Trains the part, or goes on with it. `None`: there is nothing that chunks could share.
+/// Trains the part, or continues with it. `None`: there is nothing that chunks could share.
 pub(super) fn train(
     chunked: &Chunked,
     options: &TrainOptions,
@@ -121,7 +121,7 @@ pub(super) fn read(folder: &Path) -> Result<Shared> {
 }
 
 impl Shared {
-    /// The exposures for a capture's cameras; those that are not known show what is drawn. `None`: none was learnt.
+    /// The exposures for a capture's cameras; those that are not known show what is rendered. `None`: none was learnt.
     pub(super) fn exposure(&self, capture: &Capture) -> Option<Exposure> {
         if self.exposures.is_empty() {
             return None;

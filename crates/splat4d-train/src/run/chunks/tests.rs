@@ -1,4 +1,5 @@
-//! A tiny take in three chunks: the same scene in whatever order workers take the parts, and clear words where something is missing.
+//! A tiny take in three chunks: the same scene in whatever order workers take the parts, and clear words where
+//! something is missing.
 
 use super::tie::{Neighbour, Tie};
 use super::*;
@@ -205,7 +206,7 @@ fn the_parts_end_on_time_on_a_machine_that_is_slower_than_it_was_timed() {
         let begun = Chunked::begin(&capture, &outlook.recipe, &place.run(name), &mut |_| {}).unwrap().unwrap();
         let run = begun.paced(outlook.pacing.filter(|_| paced));
         let options = TrainOptions { clock: clock.clone(), ..TrainOptions::default() };
-        // Stopped once, after a chunk was planned again: it goes on with the plans that it followed.
+        // Stopped once, after a chunk was planned again: it continues with the plans that it followed.
         let (stop, mut stopped) = (AtomicBool::new(false), false);
         let first = run.folder(Part::Chunk(0));
         let mut hear = |event: &Event| {

@@ -31,7 +31,7 @@ const COVERED: f64 = 2.0;
 /// Share of the room for Gaussians that those of neighbours may take at the start.
 const TAKEN_OVER: f64 = 0.5;
 
-/// Trains a chunk, or goes on with it.
+/// Trains a chunk, or continues with it.
 pub(super) fn train(
     chunked: &Chunked,
     chunk: usize,
@@ -106,8 +106,8 @@ fn neighbours(chunked: &Chunked, chunk: usize, capture: &Capture) -> Result<Vec<
     chunked.neighbours(chunk).map(one).collect()
 }
 
-/// The scene that a chunk begins with: its own first Gaussians where the shared layer shows nothing, those of its neighbours in
-/// the middle of what they share, and the shared layer, which does not learn.
+/// The scene that a chunk begins with: its own first Gaussians where the shared layer shows nothing, those of its
+/// neighbours in the middle of what they share, and the shared layer, which does not learn.
 fn first_scene(
     opened: &OpenCapture,
     recipe: &Recipe,
@@ -128,7 +128,8 @@ fn first_scene(
         }
     }
     let room = plan.common.densify.max_cap.saturating_sub(still.map_or(0, |l| l.params.len())).max(1);
-    // A Gaussian that lives all the time starts where it is in the middle of the chunk, of which neighbours know nothing.
+    // A Gaussian that lives all the time starts where it is in the middle of the chunk, of which neighbours know
+    // nothing.
     let mut taken: Vec<Params<f32>> = Vec::new();
     if !program.one_moment(plan) {
         let share = (TAKEN_OVER * room as f64) as usize / neighbours.len().max(1);

@@ -1,4 +1,4 @@
-//! Losses that callers bring along: they count, they may fail within a step, and a run goes on only with them.
+//! Losses that callers bring along: they count, they may fail within a step, and a run continues only with them.
 
 use super::*;
 use crate::loss::image::{ImageTerm, Needs, PictureGrads, Shown, View};

@@ -87,7 +87,7 @@ impl Bed {
         self.start_on(Device::Cpu, recipe)
     }
 
-    /// The same, drawn by another device.
+    /// The same, rendered by another device.
     pub(super) fn start_on(&self, device: Device, recipe: &Recipe) -> Trainer<'static> {
         let opened = OpenCapture::with(self.frames.clone()).on(device);
         let plan = opened.plan(recipe);
@@ -101,7 +101,7 @@ impl Bed {
         self.resumed_on(Device::Cpu, recipe, checkpoint)
     }
 
-    /// The same, drawn by another device.
+    /// The same, rendered by another device.
     pub(super) fn resumed_on(&self, device: Device, recipe: &Recipe, checkpoint: &[u8]) -> Trainer<'static> {
         let opened = OpenCapture::with(self.frames.clone()).on(device);
         let plan = opened.plan(recipe);

@@ -1,4 +1,4 @@
-//! What a device does with the tables that it keeps in addition to drawing them, against the CPU: ties of tracked
+//! What a device does with the tables that it keeps in addition to rendering them, against the CPU: ties of tracked
 //! poses, losses on rows and
 //! noise on positions. The camera looks away, so that a step has no other gradient.
 

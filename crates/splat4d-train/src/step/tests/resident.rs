@@ -14,7 +14,7 @@ use splat4d::render::{
 use splat4d::scene::{GEOMETRY, Table};
 use splat4d::{Error, ErrorKind, Result};
 
-/// Recipes that stay on the device throughout: every kind of motion and of life.
+/// Recipes that stay on the device throughout: every kind of motion and of lifespan.
 const STAYS: [&str; 12] = [
     "motion=still strategy=adc sh_degree=3 sh_degree_interval=1",
     "motion=spacetime strategy=adc exposure=true antialias=true",
@@ -27,11 +27,13 @@ const STAYS: [&str; 12] = [
     "motion=native4d strategy=none sh_harmonics=2 sh_degree=3 sh_degree_interval=1 batch_size=2",
     "motion=native4d strategy=mcmc sh_harmonics=1 batch_size=2",
     "motion=tracked strategy=adc",
-    // Frame 1 from the second step on. Without what ties its poses to those of frame 0, of which they are copies at that step: there
-    // these losses are at their kinks, and a card's roundings alone decide which way they pull. `ties_pull_as_on_the_cpu` has them.
+    // Frame 1 from the second step on. Without what ties its poses to those of frame 0, of which they are copies at
+    // that step: there these losses are at their kinks, and a card's roundings alone decide which way they pull.
+    // `ties_pull_as_on_the_cpu` has them.
     "motion=tracked strategy=none tracked.first_share=0.001 rigid_neighbours=5 tracked.rigid=0 tracked.rot=0 tracked.iso=0",
 ];
-/// Largest relative difference of a table's gradient, as a vector: a splat at the α cut-off may be drawn by one side only.
+/// Largest relative difference of a table's gradient, as a vector: a splat at the α cut-off may be rendered by one side
+/// only.
 const GRADIENT: f64 = 5e-3;
 /// Largest relative difference of a statistic's sum: two of the fifty Gaussians of a tracked frame make 4 %.
 const STATISTICS: f64 = 5e-2;
@@ -101,7 +103,8 @@ fn gradients_of_the_whole_chain_equal_the_cpus() {
             let sums = stats.map(|s| s.chunks_exact(3).map(|r| [r[0], r[1], r[2]].map(f64::from)).collect::<Vec<_>>());
             for c in 0..3 {
                 let [a, b] = sums.each_ref().map(|s| s.iter().map(|r| r[c]).sum::<f64>());
-                // The CPU looks whether an ellipse meets bins, the GPU whether it meets tiles: a few are drawn by one side only.
+                // The CPU looks whether an ellipse meets bins, the GPU whether it meets tiles: a few are rendered by
+                // one side only.
                 assert!((a - b).abs() <= STATISTICS * b, "{line}: statistics {c}: {a} {b}");
             }
         }

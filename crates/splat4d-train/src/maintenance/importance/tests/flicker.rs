@@ -1,4 +1,5 @@
-//! A still backdrop that every short life repeats: four of five Gaussians are superfluous, and the score finds them.
+//! A still backdrop that every short lifespan repeats: four of five Gaussians are superfluous, and the score finds
+//! them.
 
 use super::*;
 use crate::eval::metrics::psnr;
@@ -134,7 +135,7 @@ fn a_flickering_copy_of_the_background_is_pruned_and_the_image_stays() {
     assert!(random < after - 1.0, "{random} dB at random, {after} dB by score");
 }
 
-/// In training: rows go at the interval's steps, and a run that is taken up again from a checkpoint's state goes on
+/// In training: rows go at the interval's steps, and a run that is taken up again from a checkpoint's state continues
 /// alike.
 #[test]
 fn rows_go_while_a_scene_is_trained_and_the_run_repeats() {
