@@ -1,5 +1,5 @@
-//! Captures that are shipped as a video per camera and their poses: Neural 3D Video (`cam00.mp4` …, `poses_bounds.npy`).
-//! Frames are extracted once, below the capture, where its reader searches for them.
+//! Captures that are shipped as a video per camera and their poses: Neural 3D Video (`cam00.mp4` …,
+//! `poses_bounds.npy`). Frames are extracted once, below the capture, where its reader searches for them.
 
 use crate::video::{self, Info, Selection, Source};
 use crate::write::{self, Clip, Format};
@@ -60,7 +60,7 @@ fn stem(video: &Path) -> String {
 }
 
 /// Extracts the frames of such a capture into its folder `images/`; what is there already is left, and work that was
-/// interrupted goes on. `None`: it is no such capture. `stop` is asked after every few frames.
+/// interrupted continues. `None`: it is no such capture. `stop` is asked after every few frames.
 ///
 /// Errors: other poses than videos, a video that cannot be read, no space; of kind `Interrupted` where `stop` said so.
 pub fn extract(root: &Path, progress: &mut Progress<'_>, stop: &dyn Fn() -> bool) -> Result<Option<Extracted>> {
@@ -175,7 +175,8 @@ fn is_extracted(root: &Path, video: &Path) -> bool {
     note.is_some_and(|n| n["complete"] == true)
 }
 
-/// What such a capture holds; `None`: it is no such capture, or all frames are extracted. Errors: as [`extract`], but of space.
+/// What such a capture holds; `None`: it is no such capture, or all frames are extracted. Errors: as [`extract`], but
+/// of space.
 pub fn contents(root: &Path) -> Result<Option<Contents>> {
     let videos = videos(root);
     if videos.iter().all(|v| is_extracted(root, v)) {

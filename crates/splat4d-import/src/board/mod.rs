@@ -14,7 +14,8 @@ use splat4d::scene::Planes;
 use splat4d_train::vision::raster::sample;
 use std::str::FromStr;
 
-/// A kind of tags: how many bits they have, and which patterns are among them. Dictionaries of fewer tags are beginnings of these.
+/// A kind of tags: how many bits they have, and which patterns are among them. Dictionaries of fewer tags are
+/// beginnings of these.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Family {
     /// Its name.
@@ -23,7 +24,7 @@ pub struct Family {
     side: usize,
     /// Bits that may be wrong: fewer than half of the least distance of two patterns, and so few that noise makes none.
     wrong: u32,
-    /// Patterns row by row, white 1, the first bit highest, as OpenCV draws them; hexadecimal.
+    /// Patterns row by row, white 1, the first bit highest, as OpenCV renders them; hexadecimal.
     codes: &'static str,
 }
 
@@ -93,7 +94,8 @@ impl FromStr for Board {
 pub(crate) struct Tag {
     /// Its number in its family.
     pub id: usize,
-    /// Pixels of the dark square's corners: from the first bit's on, as the hands of a clock go when the tag is examined.
+    /// Pixels of the dark square's corners: from the first bit's on, as the hands of a clock go when the tag is
+    /// examined.
     pub corners: [[f64; 2]; 4],
 }
 
@@ -182,7 +184,8 @@ struct Square {
 }
 
 impl Square {
-    /// (Heckbert 1989, "Fundamentals of texture mapping and image warping", section 2.2.3.) None: three of them are on a line.
+    /// (Heckbert 1989, "Fundamentals of texture mapping and image warping", section 2.2.3.) None: three of them are on
+    /// a line.
     fn new(&[a, b, c, d]: &[[f64; 2]; 4]) -> Option<Self> {
         let (e, f) = ([b[0] - c[0], b[1] - c[1]], [d[0] - c[0], d[1] - c[1]]);
         let sum = [a[0] - b[0] + c[0] - d[0], a[1] - b[1] + c[1] - d[1]];

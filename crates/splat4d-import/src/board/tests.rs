@@ -61,7 +61,7 @@ fn family(name: &str) -> Family {
     FAMILIES.into_iter().find(|f| f.name == name).expect("it is known")
 }
 
-/// Pixels between the drawn corners and the found ones, at most.
+/// Pixels between the rendered corners and the found ones, at most.
 fn worst(camera: &Camera, put: &Put, found: &Tag) -> f64 {
     let corners =
         [put.corner, add(put.corner, put.right), add(add(put.corner, put.right), put.down), add(put.corner, put.down)];

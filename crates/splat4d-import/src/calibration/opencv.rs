@@ -1,5 +1,6 @@
-//! Camera matrix, distortion, rotation and translation as OpenCV has them, under the names that programs give them: OpenCV's and
-//! ROS' file for each camera, OpenPose's XML, the tables of anipose, Pose2Sim, FreeMoCap and Caliscope, JSON with a key per camera.
+//! Camera matrix, distortion, rotation and translation as in OpenCV, under the names that programs give them: OpenCV's
+//! and ROS' file for each camera, OpenPose's XML, the tables of anipose, Pose2Sim, FreeMoCap and Caliscope, JSON with a
+//! key per camera.
 
 use super::tree::{Matrix, Tree};
 use super::{Dialect, Part, Said, Text};

@@ -1,4 +1,4 @@
-//! Poses of fixed cameras by the COLMAP program, where it is installed: one image a camera, of the static background.
+//! Poses of fixed cameras by the COLMAP program, where it is installed: one image per camera, of the static background.
 
 use super::stored::Stored;
 use crate::calibration::{self, Calibration};
@@ -29,7 +29,8 @@ struct Step {
     options: &'static [(&'static str, &'static str)],
 }
 
-/// What was measured to work best on the bundled capture and a hall (methods of wide baselines: affine shapes, domain sizes).
+/// What was measured to work best on the bundled capture and a hall (methods of wide baselines: affine shapes, domain
+/// sizes).
 const STEPS: [Step; 3] = [
     Step {
         name: "feature_extractor",

@@ -134,7 +134,7 @@ struct Camera {
 /// Makes a capture. `stop` is asked between steps and between frames.
 ///
 /// Errors: inputs that cannot be read, cameras that share no time, images that do not show one scene, no space; of kind
-/// `Interrupted` where `stop` said so. What was stored until then is kept, and the same request goes on from there.
+/// `Interrupted` where `stop` said so. What was stored until then is kept, and the same request continues from there.
 pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() -> bool) -> Result<Report> {
     request.selection.check()?;
     let folder = &request.folder;

@@ -1,4 +1,4 @@
-//! The stored images as structure from motion asks for them.
+//! The stored images as structure from motion requests them.
 
 use crate::sfm;
 use crate::sfm::lens::Known;

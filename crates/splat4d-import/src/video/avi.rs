@@ -1,5 +1,5 @@
-//! Motion JPEG in AVI without any program: what some sports cameras and most frame grabbers write. Each frame is a JPEG; the
-//! rest of the file is a list.
+//! Motion JPEG in AVI without any program: what some sports cameras and most frame grabbers write. Each frame is a
+//! JPEG; the rest of the file is a list.
 
 use super::folder::scaled;
 use super::{Color, Frame, Info, Range, Reader, Rgb8, Selection, Source, Transfer, fingerprint_of_file, fnv1a, stem};
@@ -262,7 +262,7 @@ mod tests {
         let path = folder.path().join("film.avi");
         std::fs::write(&path, bytes).unwrap();
         let opened = open_with(&path, 30.0, Err(Error::input("there is no ffmpeg")))?;
-        // Frames are read when they are asked for.
+        // Frames are read when they are requested.
         std::mem::forget(folder);
         Ok(opened)
     }

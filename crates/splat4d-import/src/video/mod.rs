@@ -28,8 +28,8 @@ pub use splat4d_train::capture::Rgb8;
 use splat4d::{Error, ErrorKind, Result};
 use std::path::Path;
 
-/// Samples per second of what [`Source::sound`] gives: 62 µs a sample, an 18th of what a metre of way makes, and above twice
-/// the highest frequency that sound is compared at.
+/// Samples per second of what [`Source::sound`] gives: 62 µs a sample, an 18th of what a metre of way makes, and above
+/// twice the highest frequency that sound is compared at.
 pub(crate) const SOUND_RATE: f64 = 16_000.0;
 
 /// Which frames of a source, and how large.
@@ -87,7 +87,7 @@ impl Selection {
         self.crop.map_or(Ok(()), |crop| crop.check(info.size))
     }
 
-    /// The size that images of `size` get: cropped, their shorter side as asked for.
+    /// The size that images of `size` get: cropped, their shorter side as requested.
     pub(crate) fn scaled(&self, size: [usize; 2]) -> [usize; 2] {
         let [width, height] = self.crop.map_or(size, |c| [c.width, c.height]);
         match self.size {
