@@ -60,15 +60,16 @@ const TOO_LARGE: f64 = 1.03;
 const FINER: f64 = 1.05;
 /// A file this much more like its model than wanted, dB, is cut again, coarser.
 const SPARE: f64 = 2.0;
-/// Of the seconds that are left for baking, what the first sampling of the model may take. Sampling between frames, fitting,
-/// packing and comparing take the rest.
+/// Of the seconds that are left for baking, what the first sampling of the model may take. Sampling between frames,
+/// fitting, packing and comparing take the rest.
 const SAMPLING: f64 = 0.25;
 /// The same of renders that measure how strongly images react to errors, of fixed cameras and of one that moves; and
 /// how many ordinary renders one of them takes.
 const WEIGHING: f64 = 0.1;
 /// See [`WEIGHING`].
 const WEIGHING_RENDERS: f64 = 3.0;
-/// Seconds in which a primitive is fitted and packed, on a slow machine; and the share of what is left that may go into it.
+/// Seconds in which a primitive is fitted and packed, on a slow machine; and the share of what is left that may go into
+/// it.
 const SECONDS_A_PRIMITIVE: f64 = 4e-5;
 const FITTING: f64 = 0.4;
 /// Another cut takes about as long as the last one took, and this many times it is kept for it.
@@ -197,7 +198,7 @@ impl Kitchen<'_> {
         (bytes / bytes_a_primitive).min(FITTING * left / SECONDS_A_PRIMITIVE)
     }
 
-    /// The price that the curve asks for, before anything was compared.
+    /// The price that the curve requests, before anything was compared.
     fn first_price(&self, curve: &Curve) -> f64 {
         let wanted = curve.price_for(mse(LIKE + MARGIN)).unwrap_or(0.0);
         wanted.max(curve.price_of(self.most(BYTES_A_PRIMITIVE)))
@@ -240,7 +241,8 @@ fn mse(psnr: f64) -> f64 {
 
 /// Bakes a run or a scene file into the file `out`, and writes how well as JSON into `report`; returns the same.
 ///
-/// Errors: a name that is not one of a playback file; no scene; an empty one; files of the input in the place of outputs.
+/// Errors: a name that is not one of a playback file; no scene; an empty one; files of the input in the place of
+/// outputs.
 pub fn bake(from: &Path, out: &Path, report: Option<&Path>, baking: &Baking, listener: &dyn Listener) -> Result<Value> {
     if !files::is_playback(out) && !out.starts_with("/dev") {
         return Err(Error::input("the name does not end in .s4d")
@@ -342,8 +344,8 @@ impl Cooked {
     }
 }
 
-/// Bakes and packs a scene within its bytes and time, and compares it with its model. Cuts it again where the first cut was
-/// further off than a comparison can measure, without sampling the model again.
+/// Bakes and packs a scene within its bytes and time, and compares it with its model. Cuts it again where the first cut
+/// was further off than a comparison can measure, without sampling the model again.
 pub fn bake_like(source: &Source, title: &str, baking: &Baking, console: &dyn Listener) -> Result<Cooked> {
     let (scene, deadline) = (&source.scene, &baking.deadline);
     let views = source.views()?;
@@ -445,7 +447,8 @@ fn compare(
     })
 }
 
-/// Compares what a file shows with what its scene shows, until `go_on` states no; it is given how many renders are done, of how many.
+/// Compares what a file shows with what its scene shows, until `go_on` states no; it is given how many renders are
+/// done, of how many.
 pub fn likeness(
     scene: &Scene<f32>,
     played: &Scene<f32>,

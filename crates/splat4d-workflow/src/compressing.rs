@@ -28,12 +28,12 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-/// Times that the guard (or the size) may ask for another round.
+/// Times that the guard (or the size) may request another round.
 const MOST_TRIES: usize = 3;
 /// The guard takes back this share of the pruning.
 const GENTLER: f64 = 0.5;
 
-/// Settings that the user asked for; they are in [`ORDER`], so that an interrupted compression knows them.
+/// Settings that the user requested; they are in [`ORDER`], so that an interrupted compression knows them.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CompressJob {
@@ -78,8 +78,8 @@ pub struct CompressOptions {
     pub max_bytes: Option<u64>,
     /// Total steps of fine-tuning. `None`: a share of the run's steps, by level.
     pub fine_tune: Option<usize>,
-    /// Largest loss of training views, dB; beyond it half as much is pruned, at most twice (with `prune`: only a warning). 0:
-    /// no guard.
+    /// Largest loss of training views, dB; beyond it half as much is pruned, at most twice (with `prune`: only a
+    /// warning). 0: no guard.
     pub guard: f64,
     /// Also train the unpruned scene for as many steps, and compare with it.
     pub unpruned: bool,
@@ -146,8 +146,8 @@ impl CompressOptions {
     }
 }
 
-/// Makes a trained run smaller and faster to play: prunes, masks, quantises, fine-tunes, measures before and after. Returns the
-/// folder of the result, a run with `scene.s4d` and `report.html`.
+/// Makes a trained run smaller and faster to play: prunes, masks, quantises, fine-tunes, measures before and after.
+/// Returns the folder of the result, a run with `scene.s4d` and `report.html`.
 ///
 /// Errors: the run is unfinished or its capture has moved; options that do not fit together; `stop` was raised, after a
 /// checkpoint was saved ([`resume`] continues).
@@ -170,7 +170,8 @@ pub fn compress(run: &Path, options: &CompressOptions, stop: &AtomicBool, listen
     work.run(options.eval, &options.measure, stop, listener)
 }
 
-/// Continues a compression from its newest checkpoint. Of the options only `eval`, `size`, `device` and `measure` count.
+/// Continues a compression from its newest checkpoint. Of the options only `eval`, `size`, `device` and `measure`
+/// count.
 ///
 /// Errors: the folder contains no compression; those of [`compress()`].
 pub fn resume(dir: &Path, options: &CompressOptions, stop: &AtomicBool, listener: &dyn Listener) -> Result<PathBuf> {
@@ -199,8 +200,8 @@ const SAVING: &str = "stopping: a checkpoint is being saved";
 /// What an owner's record calls this verb.
 const COMMAND: &str = "compress";
 
-/// Reports whether the stop flag is polled after this event: steps poll it, the start of a stage (scores, baking, masks) does
-/// not for seconds.
+/// Reports whether the stop flag is polled after this event: steps poll it, the start of a stage (scores, baking,
+/// masks) does not for seconds.
 fn report_polling(event: &Event, kept: &str, console: &dyn Listener) {
     match event {
         Event::Phase { .. } => console.stop_not_polled(kept),

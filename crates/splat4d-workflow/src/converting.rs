@@ -123,7 +123,7 @@ impl Target {
 }
 
 impl Conversion {
-    /// A whole scene as one file, nothing else asked for.
+    /// A whole scene as one file, nothing else requested.
     pub fn new(input: impl Into<PathBuf>, output: impl Into<PathBuf>) -> Self {
         Self {
             input: input.into(),
@@ -412,7 +412,7 @@ fn rotate(scene: &mut Scene<f32>, up: Up, target: Target, console: &dyn Listener
     r
 }
 
-/// The first camera of the data set, if it is at hand: a place from which the scene looks right.
+/// The first camera of the data set, if it is available: a place from which the scene looks right.
 fn first_camera(source: &Source) -> Option<Camera> {
     Some(source.views().ok()?.into_iter().next()?.camera)
 }

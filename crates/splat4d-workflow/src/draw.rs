@@ -158,7 +158,7 @@ impl Rgb {
     }
 }
 
-/// Draws, on the CPU by default; memory is reused from image to image.
+/// Renders, on the CPU by default; memory is reused from image to image.
 pub struct Painter<'a> {
     player: Player<'a>,
     scene: &'a Scene<f32>,
@@ -172,7 +172,7 @@ pub struct Painter<'a> {
     pub image: Image<f32>,
     bytes: Vec<[u8; 4]>,
     channel: Channel,
-    /// A number a Gaussian, by layer and row, of channels that show one.
+    /// A number per Gaussian, by layer and row, of channels that show one.
     numbers: Vec<Vec<f32>>,
     instant: Evaluation<f32>,
     /// Of the last image: the channel's values and the weight of what has one.
@@ -180,7 +180,7 @@ pub struct Painter<'a> {
 }
 
 impl<'a> Painter<'a> {
-    /// `depth`: whether images of depth will be asked for.
+    /// `depth`: whether images of depth will be requested.
     pub fn new(scene: &'a Scene<f32>, background: [f32; 3], antialias: bool, depth: bool) -> Self {
         let config = RenderConfig { antialias: self::antialias(antialias), ..RenderConfig::default() };
         let (player, backend, image) = (Player::of_scene(scene), device::cpu(config), Image::default());
@@ -242,8 +242,8 @@ impl<'a> Painter<'a> {
         Ok(self)
     }
 
-    /// The same on another device: `open` gets the limits of the renderer and what the scene needs. A device that fails later is
-    /// reported to `listener`.
+    /// The same on another device: `open` gets the limits of the renderer and what the scene needs. A device that fails
+    /// later is reported to `listener`.
     pub fn on(
         mut self,
         open: impl FnOnce(RenderConfig, &Wanted) -> Box<dyn Backend>,
@@ -259,7 +259,7 @@ impl<'a> Painter<'a> {
         self.backend.name()
     }
 
-    /// Draws into [`image`](Self::image). A GPU that fails on the way is said, and left for the CPU.
+    /// Renders into [`image`](Self::image). A GPU that fails on the way is said, and left for the CPU.
     pub fn draw(&mut self, camera: &Camera, time: f64) {
         if self.channel.is_field() {
             return self.draw_field(camera, time);
@@ -273,7 +273,7 @@ impl<'a> Painter<'a> {
         }
     }
 
-    /// Draws the means of the channel's numbers into `field`.
+    /// Renders the means of the channel's numbers into `field`.
     fn draw_field(&mut self, camera: &Camera, time: f64) {
         let scene = self.scene;
         // As players do: what is beyond the clip of spans is its end.
@@ -304,8 +304,8 @@ impl<'a> Painter<'a> {
     }
 
     /// The numbers of the last image, plane by plane (`Channel::planes`), NaN where nothing has any: colours over the
-    /// background; alpha; expected depth, scene units; flow, pixels; velocity, scene units a second; unit normals in camera
-    /// axes (x right, y down, z forward); the number of the likeliest label, −1 for none; seconds; scene units.
+    /// background; alpha; expected depth, scene units; flow, pixels; velocity, scene units per second; unit normals in
+    /// camera axes (x right, y down, z forward); the number of the likeliest label, −1 for none; seconds; scene units.
     pub fn raw(&self) -> Planes<f32> {
         let (values, weight) = &self.field;
         let known = |p: usize| weight.data[p] >= DEPTH_ALPHA;
@@ -340,7 +340,7 @@ impl<'a> Painter<'a> {
         }
     }
 
-    /// Draws and takes over the image in 8 bits, without more of it where the device has a way to that; `range` as in
+    /// Renders and takes over the image in 8 bits, without more of it where the device has a way to that; `range` as in
     /// [`rgb`](Self::rgb).
     pub fn picture(&mut self, camera: &Camera, time: f64, channel: Channel, range: [f32; 2]) -> Rgb {
         if channel == Channel::Color {
@@ -381,8 +381,8 @@ impl<'a> Painter<'a> {
 
     /// The range of the last image's numbers that its colours spread over, without the outermost hundredths: of
     /// depth and
-    /// uncertainty from the least on, of flow and velocity the largest length behind 0, of life the whole clip. `None`:
-    /// nothing is seen, or the channel needs no range.
+    /// uncertainty from the least on, of flow and velocity the largest length behind 0, of lifespan the whole clip.
+    /// `None`: nothing is seen, or the channel needs no range.
     pub fn range(&self) -> Option<[f32; 2]> {
         if self.channel == Channel::Life {
             return Some([0.0, (self.scene.clip[1] - self.scene.clip[0]) as f32]);

@@ -1,5 +1,5 @@
-//! The work behind `view --edit`: a page asks, and a list of edits is replayed, examined, baked and saved, by the same code
-//! as `edit`. It writes one file, the list, and reads nothing that a page names but files next to the list.
+//! The work behind `view --edit`: a page asks, and a list of edits is replayed, examined, baked and saved, by the same
+//! code as `edit`. It writes one file, the list, and reads nothing that a page names but files next to the list.
 
 use crate::baking::{Baking, pack_scene};
 use crate::draw::color_rgb;
@@ -25,7 +25,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// Replayed lists that are kept: undo and redo are then there at once.
 const KEPT: usize = 4;
-/// Most pixels of an image's side that a page may ask for.
+/// Most pixels of an image's side that a page may request.
 const MOST_SIDE: usize = 1280;
 /// Longer side of the image in which depths are looked up, pixels.
 const PICK_SIDE: usize = 240;
@@ -90,7 +90,7 @@ struct Pulled {
     by: [f64; 3],
 }
 
-/// What a page can ask for.
+/// What a page can request.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(tag = "do", rename_all = "kebab-case", deny_unknown_fields)]
 enum Ask {
@@ -180,9 +180,9 @@ impl Editor {
         self.bake(&scene, console).map(Some)
     }
 
-    /// Does what a page asks for.
+    /// Does what a page requests.
     ///
-    /// Errors: what is no question, and those of its work; nothing is changed then.
+    /// Errors: what is no query, and those of its work; nothing is changed then.
     pub fn answer(&self, asked: Value) -> Result<EditAnswer> {
         let ask: Ask = serde_json::from_value(asked)
             .map_err(|e| Error::input(format!("unknown request of the page: {e}")).remedy("Reload the page"))?;
@@ -602,7 +602,8 @@ mod tests {
         assert!(bench.refused(json!({"do": "show", "steps": [], "view": wide, "t": 0.0})).contains("camera"));
     }
 
-    /// What would have taken all memory, or made numbers of none: the server answers, and goes on with the page's steps.
+    /// What would have taken all memory, or made numbers of none: the server answers, and continues with the page's
+    /// steps.
     #[test]
     fn excessive_requests_are_refused_and_others_continue() {
         let bench = Bench::new();

@@ -1,5 +1,5 @@
-//! What follows training: scores and renders of held-out views, the playback file, an orbit film and the report, within what is
-//! left of `--minutes`.
+//! What follows training: scores and renders of held-out views, the playback file, an orbit film and the report, within
+//! what is left of `--minutes`.
 
 use crate::baking::{Baking, bake_into};
 use crate::deadline::{Deadline, unless_stopped};
@@ -43,9 +43,10 @@ const ORBIT_FPS_PNG: f64 = 10.0;
 /// Longer side of an animated PNG, pixels.
 const ORBIT_SIDE_PNG: usize = 400;
 
-/// Training steps that take as long as what follows training: a held-out view rendered, measured and written; a frame of the
-/// film; the playback file, baked and compared with the scene. By the knight's 120 held-out views and 144 frames: 8 s where a
-/// step takes 25 ms (docs/benchmarks.md), and the same shares on a machine that hardly got any time.
+/// Training steps that take as long as what follows training: a held-out view rendered, measured and written; a frame
+/// of the film; the playback file, baked and compared with the scene. By the knight's 120 held-out views and 144
+/// frames: 8 s where a step takes 25 ms (docs/benchmarks.md), and the same shares on a machine that hardly got any
+/// time.
 const HELD_STEPS: f64 = 1.5;
 /// See [`HELD_STEPS`].
 const FILM_STEPS: f64 = 0.5;
@@ -58,7 +59,7 @@ const CUT_STEPS: f64 = 100.0;
 /// Motion models whose motion is straight, or nearly.
 const STRAIGHT: [&str; 3] = ["still", "spacetime", "native4d"];
 
-/// See [`HELD_STEPS`]: an image with a mask of labels or an image of features, drawn and taken back once.
+/// See [`HELD_STEPS`]: an image with a mask of labels or an image of features, rendered and taken back once.
 const LABEL_STEPS: f64 = 1.0;
 
 /// The time of what follows training, in training steps at full size: `--minutes` leaves room for it.
@@ -137,8 +138,8 @@ pub fn all(
     write_report(run, console)
 }
 
-/// What is left of the minutes of a run that was resumed: the time of earlier commands until the end of training counts once,
-/// and time between commands does not count.
+/// What is left of the minutes of a run that was resumed: the time of earlier commands until the end of training counts
+/// once, and time between commands does not count.
 pub fn rest_of(run: &Run, clock: Stopwatch) -> Deadline {
     let budget = &run.info["budget"];
     let left = || Some(60.0 * budget["minutes"].as_f64()? - budget["before"].as_f64()? - run.number("seconds")?);
@@ -237,8 +238,8 @@ pub fn playback_by(run: &Path, deadline: &Deadline, console: &dyn Listener) -> R
     }
 }
 
-/// Measures a run on its held-out views again: renders and scores them, and writes `results.json`, `per_view.json`, the images and
-/// the report.
+/// Measures a run on its held-out views again: renders and scores them, and writes `results.json`, `per_view.json`, the
+/// images and the report.
 ///
 /// Errors: no scene yet; the capture has moved; another command writes the run; `stop` was raised.
 ///
@@ -335,7 +336,7 @@ pub fn scores_on(
     Ok(())
 }
 
-/// Backgrounds with their names; where none are asked for, the capture's own.
+/// Backgrounds with their names; where none are requested, the capture's own.
 pub(crate) fn on_backgrounds<'a>(
     own: Option<[f32; 3]>,
     asked: &[(&'a str, [f32; 3])],
@@ -429,7 +430,7 @@ impl Measuring<'_> {
     }
 }
 
-/// Bins of the histogram of lives.
+/// Bins of the histogram of lifespans.
 const LIFE_BINS: usize = 10;
 
 /// How many Gaussians can be seen for how much of the clip: in tenths, those that are never seen left out.
@@ -503,7 +504,7 @@ fn tracks(run: &Path, scene: &Scene<f32>, capture: &Capture, console: &dyn Liste
     amend(run, [("point_tracks".into(), entry)])
 }
 
-/// Measures drawn flow where the capture brings some along.
+/// Measures rendered flow where the capture brings some along.
 fn flow(run: &Path, scene: &Scene<f32>, capture: &Capture, recipe: &Recipe, console: &dyn Listener) -> Result<()> {
     if capture.kind != CaptureKind::Own {
         return Ok(());

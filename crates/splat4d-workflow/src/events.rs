@@ -27,7 +27,7 @@ pub enum Event<'a> {
     Result(&'a str),
     /// A result, for machines.
     Record(&'a Value),
-    /// A detail, a sentence for people who asked for more.
+    /// A detail, a sentence for people who requested more.
     Detail(&'a str),
     /// A warning, a sentence.
     Warning(&'a str),
@@ -46,8 +46,8 @@ pub enum Event<'a> {
     Training(&'a Training),
     /// From here on the workflow polls its stop flag; the sentence states what it does when the flag is raised.
     StopPolled(&'a str),
-    /// From here on the workflow does not poll its stop flag. Ending the process loses nothing, because files are renamed into
-    /// place; the sentence states what is kept and how to continue.
+    /// From here on the workflow does not poll its stop flag. Ending the process loses nothing, because files are
+    /// renamed into place; the sentence states what is kept and how to continue.
     StopNotPolled(&'a str),
 }
 
@@ -56,7 +56,8 @@ pub trait Listener {
     /// Takes an event.
     fn on_event(&self, event: &Event<'_>);
 
-    /// How often it wants the scene during training ([`Training::Snapshot`]); none: never. Asked after [`Event::Begun`].
+    /// How often it wants the scene during training ([`Training::Snapshot`]); none: never. Asked after
+    /// [`Event::Begun`].
     fn snapshots(&self) -> Option<Duration> {
         None
     }

@@ -1,6 +1,6 @@
-//! What the `splat4d` command does beyond parsing and printing, as functions for Rust and Python: import, inspect, train, open runs
-//! and scenes, render their channels, bake, convert, export, localise, evaluate, compress, label, predict, edit and report. Functions take typed options, report
-//! [`events::Event`]s and print nothing.
+//! What the `splat4d` command does beyond parsing and printing, as functions for Rust and Python: import, inspect,
+//! train, open runs and scenes, render their channels, bake, convert, export, localise, evaluate, compress, label,
+//! predict, edit and report. Functions take typed options, report [`events::Event`]s and print nothing.
 //!
 //! ```no_run
 //! use splat4d_workflow::baking::{self, Baking};
@@ -36,7 +36,7 @@
 //! | `playable.rs`, `growing.rs` | anything that plays as a playback file; that of a long capture, which grows during training |
 //! | `converting.rs`, `exporting.rs` | formats of other programs; .ply files, a page, tracks |
 //! | `localising.rs` | pose and time of images |
-//! | `comparing.rs`, `report/`, `comparison.rs` | scores of several runs; `report.html`, drawn without a library; tables |
+//! | `comparing.rs`, `report/`, `comparison.rs` | scores of several runs; `report.html`, rendered without a library; tables |
 //! | `evaluating.rs`, `foreign.rs`, `still_baseline.rs` | what follows training: scores, playback file, film, report; scores of any scene; of a static one |
 //! | `labelling.rs`, `chunked.rs`, `compressing.rs` | labels, long captures in chunks, compression with a guard |
 //! | `training.rs` | a capture becomes a run, which is measured, filmed and reported |

@@ -1,5 +1,5 @@
-//! How a scene plays on this machine's CPU: who is alive, how many bytes, frames a second drawn from the capture's own
-//! cameras over its clip. What is compared is measured in turns, image by image, so that a machine that is busy
+//! How a scene plays on this machine's CPU: who is alive, how many bytes, frames per second rendered from the capture's
+//! own cameras over its clip. What is compared is measured in turns, image by image, so that a machine that is busy
 //! for a while slows all of them.
 
 use crate::draw::color_into;
@@ -26,9 +26,9 @@ pub const SIZE: [usize; 2] = [800, 800];
 const LOOKS: usize = 24;
 /// Rounds of which the best of every image counts, after one that makes room.
 const ROUNDS: usize = 5;
-/// Times that the first image is drawn from bytes; the best counts.
+/// Times that the first image is rendered from bytes; the best counts.
 const DECODES: usize = 3;
-/// Most times at which Gaussians are counted: ten seconds at 30 frames a second.
+/// Most times at which Gaussians are counted: ten seconds at 30 frames per second.
 const COUNTED: usize = 300;
 
 /// One side of a comparison. Its JSON is part of `compress.json` and of what `bench --playback` prints.
@@ -41,7 +41,7 @@ pub struct Side {
     pub active_max: usize,
     /// Of the file: a playback file, or the scene file with its 32-bit floats.
     pub bytes: u64,
-    /// `bytes` over the clip's length, 10⁶ bits a second; `None` for a clip without length.
+    /// `bytes` over the clip's length, 10⁶ bits per second; `None` for a clip without length.
     pub mbit_per_s: Option<f64>,
     /// Four bytes for every number of every table.
     pub float_bytes: u64,
@@ -56,7 +56,7 @@ pub struct Side {
     pub psnr_train: Option<f64>,
     /// Images a second of the blend stage alone.
     pub raster_fps: f64,
-    /// Images a second end to end: who is alive, motion, drawing, 8-bit colours.
+    /// Images a second end to end: who is alive, motion, rendering, 8-bit colours.
     pub fps: f64,
     /// From bytes in memory to the first image, milliseconds.
     pub decode_ms: f64,
@@ -93,7 +93,7 @@ pub enum What<'a> {
     File(Arc<[u8]>),
 }
 
-/// Scene or file that is measured, and how it must be drawn.
+/// Scene or file that is measured, and how it must be rendered.
 #[derive(Clone, Debug)]
 pub struct Subject<'a> {
     pub what: What<'a>,
@@ -187,7 +187,7 @@ pub fn in_turns(
 struct Seat<'a> {
     side: Side,
     player: Player<'a>,
-    /// Stored bytes that a first image is drawn from.
+    /// Stored bytes that a first image is rendered from.
     stored: Arc<[u8]>,
     background: [f32; 3],
     renderer: Renderer<f32>,
@@ -224,7 +224,7 @@ impl<'a> Seat<'a> {
         })
     }
 
-    /// Draws one image; seconds of the blend stage and of all.
+    /// Renders one image; seconds of the blend stage and of all.
     fn draw(&mut self, look: &MeasuredView) -> Result<[f64; 2]> {
         let clock = Instant::now();
         let splats = self.player.at(look.time)?;

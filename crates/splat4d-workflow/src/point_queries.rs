@@ -1,4 +1,4 @@
-//! Points that users ask for: a file of pixels or places, followed through a scene, and who sees them.
+//! Points that users request: a file of pixels or places, followed through a scene, and who sees them.
 
 use crate::paths::View;
 use splat4d::flow::query::{Followed, Place, PointView, Query, follow, sights};
@@ -35,8 +35,8 @@ fn remedy() -> String {
 
 /// Reads points. `views` are the cameras that the scene's file knows.
 ///
-/// Errors, with the line's number: columns that are unknown, missing or twice, a number that is none, a camera that is not
-/// there, a pixel outside of its image, a time outside of the clip.
+/// Errors, with the line's number: columns that are unknown, missing or twice, a number that is none, a camera that is
+/// not there, a pixel outside of its image, a time outside of the clip.
 pub fn read(text: &str, views: &[View], clip: [f64; 2]) -> Result<Vec<PointQuery>> {
     let mut lines = text.lines().enumerate().map(|(i, l)| (i + 1, l.trim())).filter(|(_, l)| !l.is_empty());
     let (_, header) = lines.next().ok_or_else(|| Error::input("the file of points is empty").remedy(remedy()))?;
@@ -174,7 +174,7 @@ impl QueryResult {
         self.followed.starts.iter().filter(|s| s.is_none()).count()
     }
 
-    /// Points that were asked for.
+    /// Points that were requested.
     pub fn len(&self) -> usize {
         self.asked.len()
     }
@@ -205,8 +205,10 @@ impl QueryResult {
         String::from_utf8(out.into_inner().expect("memory takes every row")).expect("all of it is text")
     }
 
-    /// As JSON: `{"version": 1, "times": [s], "points": [{"start": [x, y, z], "camera": name, "path": [[x, y, z] or null],
-    /// "pixels": [[u, v] or null], "visible": [bool]}]}`; the last two only of points with a camera.
+    /// As JSON:
+    /// `{"version": 1,
+    /// "times": [s], "points": [{"start": [x, y, z], "camera": name, "path": [[x, y, z] or null], "pixels": [[u, v] or
+    /// null], "visible": [bool]}]}`; the last two only of points with a camera.
     pub fn to_json(&self) -> String {
         let times = self.followed.times.len();
         let points: Vec<serde_json::Value> = (0..self.asked.len())

@@ -30,16 +30,17 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
-/// Shares of the observed ticks from which forecasts are tried to choose a model by, and how far these go. Models are fitted to
-/// what is before the first of them: one start can fall where a wrong model is right by chance, say on a swing's turning point.
+/// Shares of the observed ticks from which forecasts are tried to choose a model by, and how far these go. Models are
+/// fitted to what is before the first of them: one start can fall where a wrong model is right by chance, say on a
+/// swing's turning point.
 const STARTS: [f64; 3] = [0.6, 0.7, 0.8];
 const AHEAD: f64 = 0.2;
 /// Where the work goes, in the run.
 const FOLDER: &str = "predict";
 
-/// Nodes on dynamic regions unless others are asked for.
+/// Nodes on dynamic regions unless others are requested.
 pub const NODES: usize = 48;
-/// Steps of training unless others are asked for.
+/// Steps of training unless others are requested.
 pub const STEPS: usize = 1500;
 
 /// Options of [`predict`].
@@ -88,11 +89,11 @@ impl PredictOptions {
     }
 }
 
-/// Forecasts a scene and compares with the part of its capture that was kept from training. Returns the folder of the report,
-/// the forecasts and the predicted scene.
+/// Forecasts a scene and compares with the part of its capture that was kept from training. Returns the folder of the
+/// report, the forecasts and the predicted scene.
 ///
-/// Errors: a run that is unfinished or was trained on its whole clip; too few observed frames; actions that are too short; nothing
-/// moves; another command writes the run; `stop` was raised, which is checked between models and images.
+/// Errors: a run that is unfinished or was trained on its whole clip; too few observed frames; actions that are too
+/// short; nothing moves; another command writes the run; `stop` was raised, which is checked between models and images.
 ///
 /// ```no_run
 /// use splat4d_workflow::events::ignore;
@@ -142,8 +143,8 @@ struct Forecast {
 impl Work {
     /// Opens the run and finds its nodes.
     ///
-    /// Errors: a run that is unfinished or saw all of its take, too few observed frames, actions that are too short, nothing
-    /// that moves.
+    /// Errors: a run that is unfinished or saw all of its take, too few observed frames, actions that are too short,
+    /// nothing that moves.
     fn open(order: PredictOptions, console: &dyn Listener) -> Result<Self> {
         let run = Run::open(&order.run)?;
         let place = order.run.display().to_string();
@@ -189,7 +190,7 @@ impl Work {
             self.horizon
         ));
         let (views, oracle) = (Views::new(self)?, self.oracle()?);
-        // Freeze and constant velocity are what all others are compared with, asked for or not.
+        // Freeze and constant velocity are what all others are compared with, requested or not.
         let mut models = vec![Model::Freeze, Model::Velocity];
         models.extend(self.order.models.iter().filter(|m| !models.contains(m)).copied().collect::<Vec<_>>());
         let mut forecasts: Vec<Forecast> = Vec::new();
@@ -263,7 +264,7 @@ impl Work {
         self.observed.moving.iter().flatten().filter(|m| **m).count()
     }
 
-    /// Fits a model and lets it go on.
+    /// Fits a model and lets it continue.
     fn forecast(&self, model: Model) -> Result<Forecast> {
         let (paths, actions) = (&self.observed.paths, self.order.actions.as_ref());
         let started = Instant::now();
@@ -352,7 +353,8 @@ impl Work {
         Ok(Some(scene))
     }
 
-    /// The model whose scene is written: the only one that was asked for, else the best at forecasting what was observed.
+    /// The model whose scene is written: the only one that was asked for, else the best at forecasting what was
+    /// observed.
     fn chosen<'a>(&self, forecasts: &'a [Forecast]) -> &'a Forecast {
         let asked = |f: &&Forecast| self.order.models.contains(&f.model);
         let error = |f: &Forecast| f.backtest.unwrap_or(f64::INFINITY);

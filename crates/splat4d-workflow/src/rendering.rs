@@ -162,7 +162,7 @@ fn stem(prefix: &Path) -> OsString {
     if ending { prefix.with_extension("").into_os_string() } else { prefix.as_os_str().to_owned() }
 }
 
-/// A painter of the channel that is asked for, on the device that is.
+/// A painter of the channel that is requested, on the device that is.
 fn channel<'a>(
     painter: Painter<'a>,
     args: &RenderOptions,
@@ -180,7 +180,8 @@ fn channel<'a>(
 
 /// Many images along a path.
 ///
-/// Errors: a scene, path or time range that does not fit; views of several sizes in a film; an output that cannot be written.
+/// Errors: a scene, path or time range that does not fit; views of several sizes in a film; an output that cannot be
+/// written.
 ///
 /// ```no_run
 /// use splat4d_workflow::draw::Channel;

@@ -1,4 +1,4 @@
-//! Numbered files, one a frame: finding them, naming them, and the times they stand for.
+//! Numbered files, one per frame: finding them, naming them, and the times they stand for.
 
 use crate::files::{cannot_read, either};
 use crate::run_folder::Run;
@@ -14,8 +14,8 @@ use std::path::{Path, PathBuf};
 const MAX_FILES: f64 = 100_000.0;
 /// Most digits of a padded number in a pattern.
 const MAX_DIGITS: usize = 9;
-/// Programs save their Gaussians every so many steps (or a multiple of it; some count from 0): Brush every 5,000, 3DGS after 7,000
-/// and 30,000, OpenSplat and gsplat as documented. No film has so few of its frames.
+/// Programs save their Gaussians every so many steps (or a multiple of it; some count from 0): Brush every 5,000, 3DGS
+/// after 7,000 and 30,000, OpenSplat and gsplat as documented. No film has so few of its frames.
 const SNAPSHOTS: u64 = 500;
 /// Gaps of a sequence that are named.
 const NAMED_GAPS: usize = 8;
@@ -99,7 +99,8 @@ impl Pattern {
     }
 }
 
-/// Bytes `from..to` of a name, where these are characters of ours or the name's ends. `None`: the system has no such part.
+/// Bytes `from..to` of a name, where these are characters of ours or the name's ends. `None`: the system has no such
+/// part.
 fn part(name: &OsStr, from: usize, to: usize) -> Option<OsString> {
     #[cfg(unix)]
     {
@@ -110,7 +111,8 @@ fn part(name: &OsStr, from: usize, to: usize) -> Option<OsString> {
     Some(name.to_str()?.get(from..to)?.into())
 }
 
-/// What is read of a command that writes frames: none of it may be the folder of the frames. Renders may be in their run.
+/// What is read of a command that writes frames: none of it may be the folder of the frames. Renders may be in their
+/// run.
 pub struct Read<'a> {
     /// The scene.
     pub path: &'a Path,
@@ -120,7 +122,8 @@ pub struct Read<'a> {
 
 /// Takes a folder for the first `count` frames of these patterns.
 ///
-/// Errors: another process has it; it is what is read; it holds frames of another sequence, or such as splat4d has no record of.
+/// Errors: another process has it; it is what is read; it holds frames of another sequence, or such as splat4d has no
+/// record of.
 pub fn take(patterns: &[&Pattern], count: usize, read: &Read<'_>, command: &str, force: bool) -> Result<OutputFolder> {
     let origin = read.run.map(Run::origin).unwrap_or_default();
     let mut inputs: Vec<Input<'_>> = origin.inputs().collect();

@@ -46,7 +46,7 @@ pub enum Route {
     Test,
     /// The training views, one frame each.
     Train,
-    /// One camera of the data set is static while time goes on.
+    /// One camera of the data set is static while time continues.
     Camera(String),
     /// Key frames from a JSON file.
     Keys(PathBuf),
@@ -86,7 +86,7 @@ pub struct Clock {
 
 /// Shortest film of an orbit, seconds: faster turns are hard to follow.
 const ORBIT_SECONDS: f64 = 6.0;
-/// Longest film of an orbit unless slow motion is asked for, seconds.
+/// Longest film of an orbit unless slow motion is requested, seconds.
 const ORBIT_SECONDS_MAX: f64 = 20.0;
 /// Seconds of an orbit's film of a clip that plays for so long.
 pub fn orbit_seconds(playing: f64) -> f64 {
@@ -195,7 +195,7 @@ pub fn shots(
     }
 }
 
-/// Frames a second that a key frame file asks for.
+/// Frames a second that a key frame file requests.
 pub fn fps_of(file: &Path) -> Result<Option<f64>> {
     Ok(keys::Track::read(file, [0.0, 1.0, 0.0])?.fps)
 }

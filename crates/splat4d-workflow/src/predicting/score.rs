@@ -116,7 +116,7 @@ impl Views {
         self.views.iter().map(|v| v.horizon).collect::<BTreeSet<_>>().len()
     }
 
-    /// Draws a scene from where images were taken, and compares.
+    /// Renders a scene from where images were taken, and compares.
     pub(super) fn cases(&self, work: &Work, scene: &Scene<f32>, stop: &AtomicBool) -> Result<Vec<Case>> {
         let mut painter = Painter::new(scene, scene.background, work.antialias, false);
         let mut out = Vec::new();
@@ -157,7 +157,7 @@ impl Views {
         Some(moments.iter().enumerate().map_while(error).collect())
     }
 
-    /// Films of truth (left) and prediction (right), one a camera of the first two.
+    /// Films of truth (left) and prediction (right), one per camera of the first two.
     pub(super) fn films(
         &self,
         work: &Work,
