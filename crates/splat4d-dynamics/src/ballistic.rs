@@ -14,7 +14,7 @@ pub(crate) fn freeze(paths: &Paths, horizon: usize) -> Vec<Moment> {
     vec![paths.last().clone(); horizon]
 }
 
-/// The last time goes on with the velocities and turns of the last frames, and with accelerations that fade by
+/// The last time continues with the velocities and turns of the last frames, and with accelerations that fade by
 /// `damping` a frame; without `damping` with none.
 pub(crate) fn ballistic(paths: &Paths, horizon: usize, damping: Option<f64>) -> Vec<Moment> {
     let rates: Vec<Rates> = (0..paths.nodes()).map(|k| Rates::of(paths, k, damping.is_some())).collect();

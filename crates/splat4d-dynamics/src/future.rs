@@ -17,7 +17,7 @@ use std::sync::Arc;
 /// Nodes that carry a Gaussian.
 const CARRIERS: usize = 4;
 
-/// When the observed part ends and how fast time goes on.
+/// When the observed part ends and how fast time continues.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Clock {
     /// The last observed time, seconds.
@@ -38,7 +38,7 @@ impl Clock {
     }
 }
 
-/// The scene that goes on as predicted: `moments` are the frames after the last observed one.
+/// The scene that continues as predicted: `moments` are the frames after the last observed one.
 ///
 /// Its layers are the scene's, which end at the last observed time, and for each of them up to two that begin there:
 /// what is static ([`PREDICTED`] and the layer's name), and what moves, as a `control` layer whose nodes have given

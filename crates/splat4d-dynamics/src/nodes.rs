@@ -1,8 +1,8 @@
 //! Nodes with identity on whatever moves in a scene, whichever motion model moves it.
 //!
 //! A node is tied to the Gaussians around it. From the last observed time it is followed tick by tick: its pose is the
-//! rigid motion that fits its members best. Where members fade (models whose Gaussians live for a moment), others around
-//! the node take over at the tick before, so that the node goes on although no Gaussian does.
+//! rigid motion that fits its members best. Where members fade (models whose Gaussians live for a moment), others
+//! around the node take over at the tick before, so that the node continues although no Gaussian does.
 
 use crate::learnt::LEAST_TICKS;
 use crate::paths::{Moment, Paths, Pose};
@@ -70,7 +70,7 @@ fn look(scene: &Scene<f32>, t: f64) -> Snapshot {
     Snapshot { x, alpha }
 }
 
-/// At most `count` nodes on dynamic regions over the `ticks` (seconds, ascending, one a frame), of which the last is
+/// At most `count` nodes on dynamic regions over the `ticks` (seconds, ascending, one per frame), of which the last is
 /// the last observed one. Nothing is asked of the scene at any other time.
 ///
 /// Errors: too few ticks, no nodes or more than [`MAX_NODES`], nothing that moves.

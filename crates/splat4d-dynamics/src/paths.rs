@@ -26,7 +26,7 @@ impl Pose {
 /// All nodes at one time.
 pub type Moment = Vec<Pose>;
 
-/// Paths of nodes at even ticks, one a frame.
+/// Paths of nodes at even ticks, one per frame.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Paths {
     /// \[ticks]\[nodes]; every tick has as many nodes.
@@ -123,8 +123,8 @@ impl Neighbours {
         Self(nearest(rest, FRAME_NEIGHBOURS))
     }
 
-    /// Turns every node as its neighbours have moved about it since `rest`: the nearest rotation, and along what they leave
-    /// open as before.
+    /// Turns every node as its neighbours have moved about it since `rest`: the nearest rotation, and along what they
+    /// leave open as before.
     pub fn turn(&self, rest: &Moment, now: &mut Moment) {
         let before: Vec<[[f64; 3]; 3]> = now.iter().map(|p| quat::to_rotation(p.q)).collect();
         for (k, near) in self.0.iter().enumerate() {

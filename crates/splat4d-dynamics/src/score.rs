@@ -6,7 +6,7 @@ use splat4d::math::se3::{norm, sub};
 /// A forecast that leaves this multiple of the scene's size has diverged.
 const DIVERGED: f64 = 2.0;
 
-/// Mean distance of nodes from the truth, scene units, a number a frame as far as there is truth.
+/// Mean distance of nodes from the truth, scene units, a number per frame as far as there is truth.
 pub fn node_errors(found: &[Moment], truth: &[Moment]) -> Vec<f64> {
     let mean = |(a, b): (&Moment, &Moment)| {
         a.iter().zip(b).map(|(a, b)| norm(sub(a.x, b.x))).sum::<f64>() / a.len().max(1) as f64
@@ -14,8 +14,8 @@ pub fn node_errors(found: &[Moment], truth: &[Moment]) -> Vec<f64> {
     found.iter().zip(truth).map(mean).collect()
 }
 
-/// 1 − error/baseline of mean squared errors: 1 is perfect, 0 no better than the baseline, which is 0 exactly. Where the
-/// baseline makes no error, 0 for none and −∞ for any.
+/// 1 − error/baseline of mean squared errors: 1 is perfect, 0 no better than the baseline, which is 0 exactly. Where
+/// the baseline makes no error, 0 for none and −∞ for any.
 pub fn skill(error: f64, baseline: f64) -> f64 {
     if error == baseline { 0.0 } else { 1.0 - error / baseline }
 }

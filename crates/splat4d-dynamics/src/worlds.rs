@@ -13,7 +13,7 @@ pub const FPS: f64 = 30.0;
 pub const FRAMES: usize = 150;
 /// Names of all worlds.
 pub const NAMES: [&str; 7] = ["pendulum", "circle", "pushed-block", "bounce", "rolling", "collision", "cloth"];
-/// Scene units a second squared.
+/// Scene units per second squared.
 const GRAVITY: f64 = 9.81;
 /// Steps of integration a frame.
 const SUBSTEPS: usize = 40;
@@ -204,7 +204,7 @@ fn bounce() -> (Vec<Body>, Poses) {
 fn rolling() -> (Vec<Body>, Poses) {
     const RADIUS: f64 = 0.4;
     const SPEED: f64 = 1.1;
-    const SLOWS: f64 = 0.18; // scene units a second squared
+    const SLOWS: f64 = 0.18; // scene units per second squared
     let pose = |t: usize| {
         let s = (t as f64 / FPS).min(SPEED / SLOWS);
         let way = SPEED * s - 0.5 * SLOWS * s * s;
