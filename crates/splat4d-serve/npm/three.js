@@ -1,8 +1,9 @@
 // A moving scene of Gaussians as an object of three.js (WebGLRenderer): `scene.add(new Splat4D('knight.s4d'))`.
 //
-// Gaussians are drawn after opaque meshes, the farthest first, each tested against the depth that meshes left: at its centre,
-// so that a mesh cuts through the scene between Gaussians. They write no depth. Colours are blended as they were learnt, in
-// display values, which is what three.js writes to the canvas; into a linear render target they come out too bright.
+// Gaussians are drawn after opaque meshes, the farthest first, each tested against the depth that meshes left: at its
+// centre, so that a mesh cuts through the scene between Gaussians. They write no depth. Colours are blended as they
+// were learnt, in display values, which is what three.js writes to the canvas; into a linear render target they come
+// out too bright.
 
 import * as THREE from 'three';
 import { NEAR } from './player/camera.js';
@@ -111,8 +112,8 @@ export class Splat4D extends THREE.Mesh {
 
   /// `source`: an address, File, Blob or ArrayBuffer. `onchange()` is called when a better image can be drawn: pages
   /// came,
-  /// or a new order; pages that render on demand render then. `budget`: bytes of Gaussians that stay in memory. `up`: the object's
-  /// axis ('x', 'y', 'z') that points up as the file's up does; null keeps the file's axes.
+  /// or a new order; pages that render on demand render then. `budget`: bytes of Gaussians that stay in memory. `up`:
+  /// the object's axis ('x', 'y', 'z') that points up as the file's up does; null keeps the file's axes.
   constructor(source, { onchange = () => {}, budget, up = 'y' } = {}) {
     const geometry = new THREE.InstancedBufferGeometry();
     geometry.setIndex(new THREE.BufferAttribute(corners(), 1));
@@ -204,7 +205,7 @@ export class Splat4D extends THREE.Mesh {
     this.#speed = Math.min(Math.max(+x || 1, SPEED_RANGE[0]), SPEED_RANGE[1]);
   }
 
-  /// The playing clock goes on from what is shown: images that were requested ahead are not rendered.
+  /// The playing clock continues from what is shown: images that were requested ahead are not rendered.
   #anchor() {
     if (!this.#playing) return;
     const { shown } = this.#schedule;

@@ -41,7 +41,7 @@ struct Range {
 }
 
 @group(0) @binding(0) var<uniform> frame: Frame;
-@group(0) @binding(1) var<storage, read> words: array<vec4<u32>>;        // two a Gaussian
+@group(0) @binding(1) var<storage, read> words: array<vec4<u32>>;        // two per Gaussian
 @group(0) @binding(2) var<storage, read> blocks: array<BlockHeader>;     // one a resident block
 @group(0) @binding(3) var<storage, read> block_list: array<u32>;         // the blocks of the pages at this time
 @group(0) @binding(4) var<storage, read> palette: array<u32>;            // a word a coefficient: bytes r, g, b
@@ -79,7 +79,7 @@ fn block_hidden(header: array<vec4<f32>, 6>, span: f32) -> bool {
     if (t < header[2].x || t > header[2].y) {
         return true;
     }
-    // Within a life a mean strays by the shift; outside its centre's range, by the span at most.
+    // Within a lifespan a mean strays by the shift; outside its centre's range, by the span at most.
     let late = max(abs(t - header[1].z), abs(t - header[1].w));
     let stray = header[3].x * max(LIFE_REACHES, 2.0 * late / max(span, LEAST_SECONDS));
     let low = header[0].xyz;

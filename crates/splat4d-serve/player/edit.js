@@ -1,5 +1,5 @@
-// Editing: a panel over the player, and what it asks of the program that serves the page. The list of edits is the page's;
-// the program replays it, and only it knows how a scene is changed: nothing here touches a Gaussian.
+// Editing: a panel over the player, and what it asks of the program that serves the page. The list of edits is the
+// page's; the program replays it, and only it knows how a scene is changed: nothing here touches a Gaussian.
 
 import { History, boxOf, combined, easedKey, factorAt, fadedTo, keyed, keysOf, movedTo, nameOf, placeAt, pulledAt, pulledTo, quatOf,
   ready, round, shiftedKey, turnOf, withBox, withKey, withoutKey } from './edit-steps.js';
@@ -125,7 +125,7 @@ export class Editing {
     }
   }
 
-  /** Whether nothing is asked for, and the scene is that of the list. */
+  /** Whether nothing is requested, and the scene is that of the list. */
   get idle() { return !this.#busy && !this.#standing && !this.overlay.shows; }
   get time() { return this.player.time; }
   get steps() { return this.history.steps; }
@@ -668,7 +668,7 @@ export class Editing {
     return round(GRIP * Math.sqrt(places.reduce((s, p) => s + p.reduce((q, x, k) => q + (x - middle[k]) ** 2, 0), 0) / places.length));
   }
 
-  /** Asks for the image of what is pulled; while one is on its way, only for the newest. */
+  /** Requests the image of what is pulled; while one is on its way, only for the newest. */
   async #pulling() {
     const bent = this.#bent, o = this.overlay;
     if (!bent) return;

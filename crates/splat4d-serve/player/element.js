@@ -130,7 +130,8 @@ export class Splat4D extends HTMLElement {
     const src = this.getAttribute('src');
     const source = this.#scene ?? (src ? new URL(src, document.baseURI).href : null);
     if (!source) {
-      // A page that sets the scene later must not flash a notice; an element whose markup is still being read is not empty either.
+      // A page that sets the scene later must not flash a notice; an element whose markup is still being read is not
+      // empty either.
       if (LOCAL.includes(location.hostname) && !this.hasAttribute('page')) ui.showNote('No scene: set the attribute src or the property scene.');
       return;
     }
@@ -189,7 +190,7 @@ export class Splat4D extends HTMLElement {
   /** The deep link's part behind '#'. */
   get link() { return this.#player?.link(); }
 
-  /** Asks for a file, where there is nothing to show. */
+  /** Requests a file, where there is nothing to show. */
   invite() { this.#ui.showEmpty(); }
 
   /** Follows a training run: {events, src, metrics} addresses; `version` of the scene that is there already. */

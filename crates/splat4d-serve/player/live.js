@@ -123,7 +123,7 @@ export class Training {
       snapshot: show,
       state: state => {
         this.#show(state);
-        // A page that joins late or was disconnected asks for what it missed.
+        // A page that joins late or was disconnected requests what it missed.
         if (state === 'live') past();
       },
       other: data => {
@@ -169,7 +169,7 @@ export class Training {
     if (!this.last && !over) this.figures.replaceChildren(h('small', { class: 'wait' }, FIRST));
   }
 
-  /** The server may end with the run: the page keeps the scene, and asks for nothing more. */
+  /** The server may end with the run: the page keeps the scene, and requests nothing more. */
   async #finish() {
     if (this.over) return;
     this.over = true;

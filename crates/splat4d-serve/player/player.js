@@ -144,7 +144,7 @@ export class Player extends EventTarget {
   /** Whether the image of a jump of the clock is still to come. */
   get seeking() { return !!this.backend?.shown && this.backend.shown.epoch !== this.#epoch; }
 
-  /** Where the image is or will be next: what a step or a slider goes on from. */
+  /** Where the image is or will be next: what a step or a slider continues from. */
   get target() { return this.seeking ? this.clock : this.time; }
 
   /** Renders again, as something that moves; `what` CONTENT: as it is. */
@@ -260,7 +260,7 @@ export class Player extends EventTarget {
 
   #pageFailed(error) {
     if (error.name === 'AbortError') return;
-    // What is resident goes on playing; only a scene of which nothing can be shown becomes an error page.
+    // What is resident continues playing; only a scene of which nothing can be shown becomes an error page.
     if (this.state === 'ready') this.emit('trouble', { error });
     else this.fail(error);
   }
@@ -383,7 +383,7 @@ export class Player extends EventTarget {
     this.emit('pause');
   }
 
-  /** The clock goes on from what is shown, if it goes on: images that were requested ahead are not rendered. */
+  /** The clock continues from what is shown, if it continues: images that were requested ahead are not rendered. */
   #stop() {
     if (!this.playing && !this.film) return;
     if (!this.seeking) this.clock = this.time;
@@ -709,7 +709,7 @@ export class Player extends EventTarget {
     this.buffered = out;
   }
 
-  // What others ask for.
+  // What others request.
 
   /** A PNG of the image, as shown but always at full resolution; its `time` is the second that it shows. */
   async screenshot() {

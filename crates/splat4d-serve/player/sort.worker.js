@@ -26,8 +26,8 @@ const REACH_TAILS = 3;
 const signed10 = (word, bit) => (((word >>> bit) & 1023) - 511) / 511;
 const lerp = (a, b, u) => a + (b - a) * u;
 
-/// Motion and life of Gaussian `i` of a page whose span is `span` long, into `out`: mean at the life's centre (3), that
-/// centre, velocity (3), half-width, softness, opacity, reach.
+/// Motion and lifespan of Gaussian `i` of a page whose span is `span` long, into `out`: mean at the lifespan's centre
+/// (3), that centre, velocity (3), half-width, softness, opacity, reach.
 function path(words, headers, i, span, out) {
   const w = WORDS * i,
     f = HEADER * Math.floor(i / BLOCK),

@@ -8,7 +8,7 @@ import { painted } from './labels.js';
 const BUDGET = 512 << 20,
   SMALL_BUDGET = 128 << 20,
   SMALL_MEMORY = 4;
-/// Bytes a Gaussian (docs/format.md: 8 words).
+/// Bytes per Gaussian (docs/format.md: 8 words).
 const GAUSSIAN = 32;
 /// Bytes that a page and its key masks take.
 const cost = (page) => page.count * GAUSSIAN + (page.maskBytes ?? 0);
@@ -134,8 +134,8 @@ export class Stream {
     return all ? there / all : 1;
   }
 
-  /// Whether an image of `time` would be whole: of every span the coarsest tier is resident, or it was given up, or the budget
-  /// has no room for it.
+  /// Whether an image of `time` would be whole: of every span the coarsest tier is resident, or it was given up, or the
+  /// budget has no room for it.
   playable(time) {
     return this.#pagesOf(time).every(({ id }) => {
       if (!this.#coarse.has(id) || this.#resident.has(id) || this.#leftOut.has(id)) return true;
@@ -254,7 +254,7 @@ export class Stream {
     this.#wake();
   }
 
-  /// The page, unless it is there, and its mask, which is asked for at the same time: both lie together in the file.
+  /// The page, unless it is there, and its mask, which is requested at the same time: both lie together in the file.
   /// Until the mask is there, the page is drawn without it.
   async #load(entry) {
     const stop = new AbortController(),

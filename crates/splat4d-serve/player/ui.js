@@ -385,7 +385,7 @@ export class Interface {
     this.root.classList.add('idle');
   }
 
-  // What people ask for.
+  // What people request.
 
   setLoop(on) {
     this.player.loop = on;
@@ -469,7 +469,7 @@ export class Interface {
     else this.toast('A path needs two keys: move the camera and press K');
   }
 
-  /** Cameras of the capture; fetched when first asked for. */
+  /** Cameras of the capture; fetched when first requested. */
   async #rigged() {
     const { Rig } = await import('./rig.js');
     return this.rig ??= new Rig(this, this.capture ?? {});

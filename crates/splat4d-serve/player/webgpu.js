@@ -1,5 +1,5 @@
 // Draws a moving scene with WebGPU: pages stay on the GPU as the file's own words, and everything that depends on the
-// time or the view happens there (cull.wgsl, sort.wgsl, draw.wgsl). The CPU writes 160 bytes a frame, and the list of
+// time or the view happens there (cull.wgsl, sort.wgsl, draw.wgsl). The CPU writes 160 bytes per frame, and the list of
 // blocks, with the bits of their key masks, where the set of pages or the key times around this time change.
 
 import { NEAR } from './camera.js';
@@ -88,8 +88,8 @@ const SOFTWARE = /swiftshader|llvmpipe|lavapipe|software|basic render/i;
 export class WebGPUBackend {
   name = 'webgpu';
   stats = { resident: 0, active: 0, drawn: 0, sortMs: 0, drawMs: 0 };
-  /// What the newest image shows: {time, epoch}; null before the first one of the scene. Culling and sorting run on the GPU in
-  /// the frame that they are for, so that this is what `draw` was given.
+  /// What the newest image shows: {time, epoch}; null before the first one of the scene. Culling and sorting run on the
+  /// GPU in the frame that they are for, so that this is what `draw` was given.
   shown = null;
   /// Images that the graphics processor still works on.
   flight = new Flight();

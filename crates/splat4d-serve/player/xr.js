@@ -1,7 +1,7 @@
 // Immersive viewing, with the WebGL2 backend, which draws each eye straight into the headset's image. Tested: that no
-// button shows where no headset is offered, the mathematics of an eye's view, and a session of a simulated headset. Never
-// tested for want of a device: a real headset, its frame rate, and how the order by depth, which WebGL2 computed for the head
-// of some frames ago, looks while the head turns. Both eyes show the time of one order.
+// button shows where no headset is offered, the mathematics of an eye's view, and a session of a simulated headset.
+// Never tested for lack of a device: a real headset, its frame rate, and how the order by depth, which WebGL2 computed
+// for the head of some frames ago, looks while the head turns. Both eyes show the time of one order.
 
 import { add, bounds, quatMul, quatNormal, quatRows, quatTurn } from './camera.js';
 

@@ -1,4 +1,4 @@
-//! The body of an answer: bytes at hand, or a bounded channel that a task fills.
+//! The body of an answer: bytes available, or a bounded channel that a task fills.
 
 use http_body::{Frame, SizeHint};
 use hyper::body::Bytes;

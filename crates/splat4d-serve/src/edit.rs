@@ -1,8 +1,8 @@
 //! The one thing that a page may send: what it wants of a list of edits, where the program was started to edit.
 //!
-//! A page of any origin in the user's browser can send a form to loopback. This asks for more than a form can bring: a
-//! token that only the address which the program printed holds, JSON (for which a browser asks leave first, and gets none),
-//! and our own origin. What is done with it is the program's business; it may answer with another scene.
+//! A page of any origin in the user's browser can send a form to loopback. This requests more than a form can bring: a
+//! token that only the address which the program printed holds, JSON (for which a browser asks leave first, and gets
+//! none), and our own origin. What is done with it is the program's business; it may answer with another scene.
 
 use crate::body::Body;
 use crate::reply::{text, whole};
@@ -31,7 +31,7 @@ const TOKEN: &str = "x-splat4d-token";
 const MAX_BODY: usize = 1 << 20;
 /// A body must be complete in this time.
 const BODY_TIME: Duration = Duration::from_secs(10);
-/// Questions that are worked on at a time: one that takes long, and one that looks meanwhile.
+/// Queries that are worked on at a time: one that takes long, and one that looks meanwhile.
 const AT_ONCE: usize = 2;
 /// Least length of a token: shorter ones could be guessed.
 const LEAST_TOKEN: usize = 16;
@@ -45,7 +45,7 @@ pub struct EditAnswer {
     pub scene: Option<Arc<[u8]>>,
 }
 
-/// Does what a page asks for.
+/// Does what a page requests.
 type Answer = dyn Fn(Value) -> Result<EditAnswer> + Send + Sync;
 
 /// Leave for pages that bring a token to ask a program for edits.

@@ -1,7 +1,8 @@
 //! News of a live run, for pages that come, go and come back.
 //!
 //! There is no queue per client: news are in one bounded log, and a client is a place in it. So publishing never waits,
-//! a slow reader costs nothing but its socket, and one that joins late or returns gets what it missed from the same log.
+//! a slow reader costs nothing but its socket, and one that joins late or returns gets what it missed from the same
+//! log.
 
 use crate::body::Body;
 use crate::write_timeout::{Either, either};
@@ -12,8 +13,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, UNIX_EPOCH};
 use tokio::sync::watch;
 
-/// Steps kept. When they are full every second one goes, and from then on every second one comes: a loss curve keeps its
-/// shape and its whole length, equally dense everywhere.
+/// Steps kept. When they are full every second one goes, and from then on every second one comes: a loss curve keeps
+/// its shape and its whole length, equally dense everywhere.
 const MAX_STEPS: usize = 2000;
 /// Notes kept, newest ones.
 const MAX_NOTES: usize = 100;
@@ -32,14 +33,14 @@ const CLOSED: u64 = u64::MAX;
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub enum News {
-    /// `kind: "step"`: training went on: `iteration`, `iterations`, `loss`, `psnr`, `gaussians`, `seconds`,
+    /// `kind: "step"`: training continued: `iteration`, `iterations`, `loss`, `psnr`, `gaussians`, `seconds`,
     /// `seconds_left`, `stage`.
     Step(Value),
     /// `kind: "note"`: an event to be sent: `message`.
     Note(Value),
     /// `kind: "control"`: the run was paused, continued or stopped: `state`.
     Control(Value),
-    /// `kind: "done"`: the run is over; the server goes on serving.
+    /// `kind: "done"`: the run is over; the server continues serving.
     Done(Value),
 }
 

@@ -398,7 +398,7 @@ fn a_thousand_connections_do_not_slow_the_publisher() {
     const NEWS: usize = 2000;
     let server = start(Config { live: true, background: true, ..Config::default() });
     server.set_scene(bytes(4 << 20).into(), &json!({}));
-    // A quarter each: idle, half a request, listening without reading, asking for much without reading.
+    // A quarter each: idle, half a request, listening without reading, requesting much without reading.
     let requests: [&[u8]; 4] = [
         b"",
         b"GET / HTTP/1.1\r\nhost: loc",

@@ -16,7 +16,7 @@ class Machine {
   playing = true;
   epoch = 0;
   view = VIEW;
-  /// Times that were asked for, and [now, time] of what was rendered.
+  /// Times that were requested, and [now, time] of what was rendered.
   asked = [];
   rendered = [];
   order = {

@@ -1,4 +1,4 @@
-// What the stream asks for and lets go of, with a recorded file and backend.
+// What the stream requests and lets go of, with a recorded file and backend.
 
 import assert from 'node:assert/strict';
 import test from 'node:test';

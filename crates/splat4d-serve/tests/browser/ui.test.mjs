@@ -9,7 +9,7 @@ import { launch } from './browser.mjs';
 import { Cost, Flight, Pace } from '../../player/pace.js';
 import { Site } from './ui-harness.mjs';
 
-/** Seconds on the mock's clock: its clip begins at 1 and lasts 4, 25 frames a second. */
+/** Seconds on the mock's clock: its clip begins at 1 and lasts 4, 25 frames per second. */
 const FIRST = 1, LAST = 5, FRAME = 1 / 25;
 const browser = await launch();
 const options = { skip: browser ? false : 'no browser', timeout: 60000 };
@@ -61,7 +61,7 @@ test('the page names every module it will need, so that they come all at once', 
 });
 
 test('the picture shrinks as far as it must and helps, and grows again', () => {
-  /** Plays `seconds` on a synthetic machine where a frame takes fixed + pixels·scale² ms, at most 60 frames a second. */
+  /** Plays `seconds` on a synthetic machine where a frame takes fixed + pixels·scale² ms, at most 60 frames per second. */
   const play = (pace, fixed, pixels, seconds = 20) => {
     const scales = [];
     for (let now = 0; now < 1000 * seconds;) {
@@ -192,7 +192,8 @@ test('the time slider scrubs by mouse and keys, and shows what is buffered', opt
   const rail = await ask(e => e.shadowRoot.querySelector('.rail').getBoundingClientRect().toJSON());
   await page.mouse.move(rail.left + rail.width / 2, rail.top + 1);
   await page.mouse.down();
-  // The slider is where the pointer is; the clock reads what is shown, which is the old image until pages of the new time came.
+  // The slider is where the pointer is; the clock reads what is shown, which is the old image until pages of the new
+  // time came.
   const read = () => ask(e => [e.player.target, e.currentTime, e.player.seeking, e.shadowRoot.querySelector('.time b').textContent]);
   const [target, shown, seeking, clock] = await read();
   near(target, 3, 0.02);
@@ -485,7 +486,7 @@ test('a path is made, played, exported and read again; bullet time holds the clo
   }
   await page.keyboard.press('Escape');
   await page.keyboard.press('p');
-  // Both are read in one breath: the path lasts half a second, and may be over before a second question.
+  // Both are read in one breath: the path lasts half a second, and may be over before a second query.
   const moment = await page.waitForFunction(() => {
     const e = document.querySelector('splat-4d');
     return e.currentTime > 1.2 && e.currentTime < 1.5 && [e.currentTime, e.camera.position[0]];
@@ -552,7 +553,7 @@ test('training is followed: late join, new snapshots, lost connections', options
   await card.getByText('Training finished').waitFor();
   await card.getByRole('button', { name: 'Save the scene' }).waitFor();
   assert.equal(await ask(e => e.player.file.name), 'bytes', 'the page has the scene itself');
-  // The server may end now: the page asks for nothing more.
+  // The server may end now: the page requests nothing more.
   const [last, answered] = [site.joined, []];
   page.on('request', r => answered.push(r.url()));
   site.cut();
