@@ -1,5 +1,6 @@
-//! What the user sees while work goes on: a progress bar on a terminal, plain lines elsewhere, JSON lines for machines.
-//! Results go to stdout; progress, warnings and errors go to stderr (with `--json`, all of them are lines on stdout).
+//! What the user sees while work continues: a progress bar on a terminal, plain lines elsewhere, JSON lines for
+//! machines. Results go to stdout; progress, warnings and errors go to stderr (with `--json`, all of them are lines on
+//! stdout).
 
 use crate::interrupt;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
@@ -307,7 +308,7 @@ impl Console {
         });
     }
 
-    /// Whether an object is printed: at the start and the end of a phase, and once a second between them.
+    /// Whether an object is printed: at the start and the end of a phase, and once per second between them.
     fn is_due(&self, name: &str, done: usize, total: usize) -> bool {
         let mut state = self.state.borrow_mut();
         let ends = total > 0 && done >= total;
@@ -390,7 +391,8 @@ fn bar(total: usize) -> ProgressBar {
     bar
 }
 
-/// JSON in one line, in which no character acts on a terminal: outside strings JSON has none, and inside they are escaped.
+/// JSON in one line, in which no character acts on a terminal: outside strings JSON has none, and inside they are
+/// escaped.
 fn one_json_line(value: &Value) -> String {
     let line = value.to_string();
     if !line.contains(text::acts) {

@@ -1,7 +1,7 @@
 //! Ctrl-C: the first asks to stop (training saves a checkpoint), the second ends the program at once.
 //!
-//! Work that does not ask whether it should stop (`ends`) is ended after a moment: all files are written under temporary names,
-//! and locks of dead processes are taken over, so that the same command goes on.
+//! Work that does not ask whether it should stop (`ends`) is ended after a moment: all files are written under
+//! temporary names, and locks of dead processes are taken over, so that the same command continues.
 
 use std::borrow::Cow;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -78,14 +78,14 @@ pub fn flag(first: &'static str) -> Arc<AtomicBool> {
     flag
 }
 
-/// From now on the work asks for the flag, and does what `first` says.
+/// From now on the work requests the flag, and does what `first` says.
 pub(crate) fn stop_polled(first: impl Into<Cow<'static, str>>) {
     let mut state = state();
     (state.first, state.last) = (first.into(), None);
 }
 
-/// From now on a Ctrl-C ends the program after a moment, also where the work does not ask; `last` says what is kept and how to go
-/// on. A Ctrl-C that came before, and that nothing has followed, ends it now.
+/// From now on a Ctrl-C ends the program after a moment, also where the work does not ask; `last` says what is kept and
+/// how to go on. A Ctrl-C that came before, and that nothing has followed, ends it now.
 pub(crate) fn stop_not_polled(last: impl Into<String>) {
     let last = last.into();
     let mut state = state();

@@ -20,7 +20,8 @@ use std::time::{Duration, Instant};
 
 /// How often a waiting program looks whether Ctrl-C was pressed.
 const LOOK: Duration = Duration::from_millis(50);
-/// A new image of the scene in training about so often: shorter than a user waits before reloading, longer than a page needs to update.
+/// A new image of the scene in training about so often: shorter than a user waits before reloading, longer than a page
+/// needs to update.
 const SNAPSHOT_INTERVAL: Duration = Duration::from_secs(3);
 /// Time for the last news to reach pages before the server ends.
 const FAREWELL: Duration = Duration::from_millis(250);
@@ -111,7 +112,7 @@ fn open_browser(url: &str) -> bool {
     }
 }
 
-/// Pause and stop of a run, as its page asks for them.
+/// Pause and stop of a run, as its page requests them.
 ///
 /// A pause blocks the trainer between two steps, so that the result stays the same to the bit.
 #[derive(Debug)]
@@ -153,7 +154,7 @@ impl Control {
         *self.waited.lock().unwrap_or_else(PoisonError::into_inner) += began.elapsed();
     }
 
-    /// Does what a page asks for.
+    /// Does what a page requests.
     fn answer(&self, asked: &Value) -> Result<EditAnswer> {
         let state = match asked["do"].as_str() {
             Some("pause") => "pausing",
@@ -169,7 +170,8 @@ impl Control {
     }
 }
 
-/// A listener that passes events to the console and, with `--view`, to a page. What fails with the page never costs the run.
+/// A listener that passes events to the console and, with `--view`, to a page. What fails with the page never costs the
+/// run.
 pub(crate) struct Watched<'a> {
     console: &'a Console,
     place: Option<&'a Place>,
@@ -202,8 +204,8 @@ impl<'a> Watched<'a> {
         Self { console, place, control: control.clone(), running: OnceCell::new(), held_out: Cell::new(None) }
     }
 
-    /// Starts to serve a run that is about to train; a server that cannot be started is a warning. The capture's cameras and images
-    /// are shown next to the render, where it can be opened.
+    /// Starts to serve a run that is about to train; a server that cannot be started is a warning. The capture's
+    /// cameras and images are shown next to the render, where it can be opened.
     fn begin(&self, title: &str, run: &Path, capture: Option<&Arc<Capture>>) {
         let Some(place) = self.place else { return };
         let of_run = || Some(Arc::new(Run::open(run).ok()?.open_capture().ok()?.0));

@@ -633,7 +633,7 @@ fn a_playback_file_is_described_exported_and_refused_when_damaged() {
     let out = work.path().join("now.ply");
     splat4d(&["export", str(&file), "-o", str(&out), "--time", "0.3"]).run().ok();
     let (params, _) = ply::read(&std::fs::read(&out).unwrap()).unwrap();
-    // It moves at 2 units a second and was at x = 1 at 0.25 s.
+    // It moves at 2 units per second and was at x = 1 at 0.25 s.
     assert_eq!(params.len(), 2);
     assert!((params[GEOMETRY].get(1, 0) - 1.1).abs() < 1e-3, "{}", params[GEOMETRY].get(1, 0));
 

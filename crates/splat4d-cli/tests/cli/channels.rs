@@ -1,4 +1,4 @@
-//! What goes out next to colours: channels as images and numbers, points that are asked for, labels.
+//! What goes out next to colours: channels as images and numbers, points that are requested, labels.
 
 use crate::convert::moving;
 use crate::sample::{Capture, splat4d};

@@ -78,7 +78,7 @@ fn parts_by_number_and_one_command_make_the_same_scene_and_file() {
     assert!(said.contains("finished, 3 parts joined") && !said.contains(" of 20"), "{said}");
     assert!(json_of(&one.join("run.json"))["seams"]["inside"].is_f64());
     assert!(std::fs::read_to_string(one.join("report.html")).unwrap().contains("Flicker at chunk boundaries"));
-    // A run like any other: all of it is done, and it is measured and drawn.
+    // A run like any other: all of it is done, and it is measured and rendered.
     splat4d(&["train", "--resume", str(&one), "--no-eval"]).run().ok();
     splat4d(&["eval", str(&parts)]).run().ok();
     splat4d(&["export", str(&parts.join("chunks/00")), "-o", str(&work.path().join("now.ply")), "--time=0"]).run().ok();

@@ -80,7 +80,7 @@ fn a_folder_in_use_is_refused_and_read() {
     let said = splat4d(&["convert", str(&file), str(&run.join("scene.safetensors"))]).run().failed();
     assert!(said.contains(&told) && !run.join("scene.safetensors").exists(), "{said}");
     drop(owner);
-    // What a kill right after the start leaves: `--resume` begins again, as the command asked for it.
+    // What a kill right after the start leaves: `--resume` begins again, as the command requested it.
     splat4d(&["train", str(&capture), "-o", str(&run), "--no-eval"]).args(&TINY).run().ok();
     let wanted = std::fs::read(run.join("scene.safetensors")).unwrap();
     assert!(!run.join(".splat4d/asked").exists(), "what is done is not continued");

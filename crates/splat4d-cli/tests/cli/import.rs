@@ -67,7 +67,7 @@ fn images_alone_become_a_capture_with_clocks_and_poses() {
     }
 }
 
-/// Samples of sound a second, and the films' frames a second: slow, so that a second of images is long enough to
+/// Samples of sound a second, and the films' frames per second: slow, so that a second of images is long enough to
 /// listen.
 const SOUND_RATE: u32 = 16_000;
 const SLOW: usize = 10;
@@ -243,7 +243,7 @@ fn a_calibration_places_cameras_and_clocks_are_found() {
     assert!(refused(&at("missing.toml")).contains("missing.toml"));
 }
 
-/// A program that notes how it is called and, as the mapper, copies a model to where it is asked for.
+/// A program that notes how it is called and, as the mapper, copies a model to where it is requested.
 #[cfg(unix)]
 fn stand_in(folder: &Path, ends: &str) {
     use std::os::unix::fs::PermissionsExt;
