@@ -35,8 +35,8 @@ struct Samples {
     kind: ExtendedColorType,
 }
 
-/// Writes the capture. Errors, which leave nothing behind: shapes that do not fit each other, numbers that are none, a folder
-/// that holds a capture already.
+/// Writes the capture. Errors, which leave nothing behind: shapes that do not fit each other, numbers that are none, a
+/// folder that holds a capture already.
 pub(crate) fn write(py: Python<'_>, arrays: &Arrays<'_, '_>, folder: &Path) -> PyResult<()> {
     let mut written = Vec::new();
     let done = write_all(py, arrays, folder, &mut written);
@@ -111,7 +111,7 @@ struct Filmed<'a, 'py> {
 }
 
 impl Filmed<'_, '_> {
-    /// Its places: one, or one a frame.
+    /// Its places: one, or one per frame.
     fn views(&self) -> PyResult<Vec<Camera>> {
         if let Ok(fixed) = self.cameras.extract::<Camera>() {
             return Ok(vec![fixed]);

@@ -1,5 +1,5 @@
-//! Motion models written in Python (`splat4d.Motion`): the library asks one for the Gaussians at a time, and hands it the
-//! gradient to them. Its tables are the library's: density control copies and removes their rows, Adam moves them,
+//! Motion models written in Python (`splat4d.Motion`): the library asks one for the Gaussians at a time, and hands it
+//! the gradient to them. Its tables are the library's: density control copies and removes their rows, Adam moves them,
 //! checkpoints and scenes hold them.
 
 use crate::arrays::{numbers, rows, shaped};
@@ -33,7 +33,7 @@ const TAKEN: [&str; 13] = [
     "features",
     "labels",
 ];
-/// Bytes that a question leaves for its backward, a Gaussian: raw and activated rows here and in Python.
+/// Bytes that a query leaves for its backward, a Gaussian: raw and activated rows here and in Python.
 const SCRATCH: u64 = 256;
 /// Opacities are kept this far from 0 and 1, where logits are infinite.
 const OPACITY_MARGIN: f32 = 1e-6;
@@ -42,7 +42,7 @@ const OPACITY_MARGIN: f32 = 1e-6;
 pub(crate) struct Hook {
     object: Py<PyAny>,
     name: String,
-    /// Tables with a row a Gaussian: name and width.
+    /// Tables with a row per Gaussian: name and width.
     per_gaussian: Vec<(&'static str, usize)>,
     /// Arrays that all Gaussians share: name, shape, first values.
     shared: Vec<(String, Vec<usize>, Vec<f32>)>,
@@ -138,7 +138,7 @@ struct PyMotion {
     rests: bool,
 }
 
-/// What an answer leaves for its backward.
+/// What a result leaves for its backward.
 #[derive(Default)]
 struct Answer {
     tape: Option<Py<PyAny>>,
@@ -163,7 +163,7 @@ impl PyMotion {
         self.hook.colors && !self.rests
     }
 
-    /// The arguments of a question: raw parameters of the asked rows, and the shared arrays.
+    /// The arguments of a query: raw parameters of the requested rows, and the shared arrays.
     fn arguments<'py>(&self, py: Python<'py>, q: &At<'_>) -> PyResult<Bound<'py, PyDict>> {
         let (n, geometry) = (q.len(), &q.p[GEOMETRY]);
         let ids = || (0..n).map(|j| q.rows.id(j));
@@ -239,7 +239,7 @@ impl PyMotion {
         Ok(Answer { tape: Some(tape.clone().unbind()), raw, colors: table })
     }
 
-    /// Hands Python the gradient to an answer, and adds what comes back to the tables'. Returns dL/dt.
+    /// Hands Python the gradient to a result, and adds what comes back to the tables'. Returns dL/dt.
     fn hand_back(
         &self,
         py: Python<'_>,
