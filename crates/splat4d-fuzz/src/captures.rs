@@ -80,7 +80,7 @@ const WIDTH: u32 = 8;
 const HEIGHT: u32 = 6;
 
 thread_local! {
-    /// A folder for each layout, made when it is first asked for.
+    /// A folder for each layout, made when it is first requested.
     static FOLDERS: RefCell<BTreeMap<&'static str, TempDir>> = const { RefCell::new(BTreeMap::new()) };
 }
 
