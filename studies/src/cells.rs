@@ -51,7 +51,7 @@ impl Score {
     /// combine, and 4DGS-1K's own choice.
     pub(crate) fn all() -> Vec<(String, Self)> {
         let mut out = vec![("change, instant abs".to_owned(), DEFAULT)];
-        // Those of other systems' pruning can be asked for; here they would add a run each.
+        // Those of other systems' pruning can be requested; here they would add a run each.
         let spatial = [Spatial::Share, Spatial::Both].iter();
         out.extend(spatial.map(|s| (format!("{s}, instant abs"), Self { spatial: *s, ..DEFAULT })));
         let temporal = Temporal::ALL.iter().filter(|t| **t != DEFAULT.temporal);

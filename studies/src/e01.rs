@@ -15,7 +15,8 @@ Examples:
 
 Tables are printed and written to DIR/e01.md, the drift to DIR/e01-drift.svg, all numbers to DIR/e01.json.";
 
-/// Speeds of the sphere (units a frame) and of the cube (degrees a frame) that are compared; the first is the main one.
+/// Speeds of the sphere (units per frame) and of the cube (degrees a frame) that are compared; the first is the main
+/// one.
 const MOTIONS: [(f64, f64); 4] = [(0.08, 4.0), (0.1, 5.0), (0.05, 4.0), (0.1, 3.0)];
 
 /// Follow lifted optical flow, and see how it drifts

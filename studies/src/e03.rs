@@ -81,7 +81,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     for trial in &trials {
         let grid = &trial.grid;
         let cells = grid.cells();
-        // A retrained run must not go on from what another scene has left.
+        // A retrained run must not continue from what another scene has left.
         let work = args.output.join("work").join(format!("{}-{}", trial.name, trial.print));
         let others: Vec<_> = study.runs.iter().filter(|f| f.run != trial.path).cloned().collect();
         let progress = |cell: &Cell, Place { number, of, left }: Place| {
@@ -110,7 +110,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     report_findings(&study, &trials, &args.output, console)
 }
 
-/// Tables and images of the runs that were asked for.
+/// Tables and images of the runs that were requested.
 fn report_findings(study: &Study, trials: &[Trial], folder: &Path, console: &Console) -> anyhow::Result<()> {
     let mut page = String::from("# Pruning and the temporal filter\n");
     for trial in trials {

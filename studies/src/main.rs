@@ -65,7 +65,7 @@ enum Study {
     Models(models::Args),
     Suite(suite::Args),
     Bench(Box<bench::Args>),
-    /// Draw a synthetic capture that is hard for one reason
+    /// Render a synthetic capture that is hard for one reason
     Make(made::Args),
     /// `splat4d train`, for `models`: a cell is a process, so that its peak of memory is its own.
     #[command(hide = true)]

@@ -145,7 +145,7 @@ fn parted(page: &str) -> splat4d::Result<[&str; 2]> {
     })
 }
 
-/// The models that are asked for, in the library's order.
+/// The models that are requested, in the library's order.
 fn models(only: &[String]) -> splat4d::Result<Vec<&'static str>> {
     let all = MODELS.iter().copied();
     if let Some(unknown) = only.iter().find(|m| !all.clone().any(|a| a == m.as_str())) {

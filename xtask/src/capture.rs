@@ -61,7 +61,7 @@ struct View {
     tracks_seen: Vec<u8>,
 }
 
-/// Draws the capture; `maps`: with depth, flow and labels of every image.
+/// Renders the capture; `maps`: with depth, flow and labels of every image.
 pub(crate) fn write(home: &Path, folder: &Path, maps: bool) -> Result<()> {
     let start = std::time::Instant::now();
     let stage = Stage::load(&home.join("characters"))?;
@@ -106,7 +106,7 @@ pub(crate) fn write(home: &Path, folder: &Path, maps: bool) -> Result<()> {
     Ok(())
 }
 
-/// Draws the given (camera, frame) pairs again and compares them with the files in `folder`.
+/// Renders the given (camera, frame) pairs again and compares them with the files in `folder`.
 pub(crate) fn check(folder: &Path, picks: &[(usize, usize)]) -> Result<()> {
     let stage = Stage::load(&folder.join("characters"))?;
     let cameras = rig();

@@ -36,7 +36,7 @@ const SIZES: std::ops::RangeInclusive<usize> = 16..=4096;
 /// See [`SIZES`].
 const VIEWS: std::ops::RangeInclusive<usize> = 2..=10_000;
 
-/// Settings of the capture that is drawn.
+/// Settings of the capture that is rendered.
 #[derive(Debug, PartialEq)]
 struct Wish {
     character: PathBuf,

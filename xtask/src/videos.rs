@@ -1,5 +1,5 @@
-//! `capture --videos FOLDER`: the bundled scene as eight people would film it: no common clock, no calibration, each with an
-//! exposure of its own, and with sound. Motion JPEG in AVI with 16-bit PCM, which needs no encoder.
+//! `capture --videos FOLDER`: the bundled scene as eight people would film it: no common clock, no calibration, each
+//! with an exposure of its own, and with sound. Motion JPEG in AVI with 16-bit PCM, which needs no encoder.
 
 use crate::camera::Camera;
 use crate::files::write_file;
@@ -57,7 +57,7 @@ const SOUNDS: [(f64, V3, f64, f64); 14] = [
 /// Loudness of each microphone's own noise.
 const NOISE: f64 = 0.004;
 
-/// Draws the videos and `truth.json`.
+/// Renders the videos and `truth.json`.
 pub(crate) fn command(folder: &Path) -> Result<()> {
     let stage = Stage::load(&crate::capture::bundled_folder().join("characters"))?;
     let cameras = rig();
@@ -174,7 +174,7 @@ fn avi(pictures: &[Vec<u8>], sound: &[i16]) -> Vec<u8> {
         out.extend((height as u16).to_le_bytes());
         chunk(b"strh", &out)
     };
-    // Flags, priority, initial frames, scale, rate, start, length, buffer, quality, bytes a sample.
+    // Flags, priority, initial frames, scale, rate, start, length, buffer, quality, bytes per sample.
     let film = header(b"vids", b"MJPG", [0, 0, 0, 1, rate, 0, count, largest, u32::MAX, 0]);
     let mut bitmap = words(&[40, width, height]);
     bitmap.extend([1, 0, 24, 0]);

@@ -1,5 +1,5 @@
-//! How a training step's cost grows: with Gaussians, with pixels, with frames of the capture; and where memory is with a
-//! million Gaussians.
+//! How a training step's cost grows: with Gaussians, with pixels, with frames of the capture; and where memory is with
+//! a million Gaussians.
 //!
 //! The image stays the same. More Gaussians are those of the trained scene split, fewer are every so many-th of them
 //! widened, so that together they cover what they covered before: a Gaussian of n children of one parent has √(1/n) of
@@ -263,7 +263,7 @@ fn memory(base: &Pinned, count: usize, degree: usize, side: usize, way: Way) -> 
     ])
 }
 
-/// Bytes of a renderer that drew every view and went back.
+/// Bytes of a renderer that rendered every view and went back.
 fn renderer_bytes(pinned: &Pinned, way: Way) -> u64 {
     let mut renderer = Renderer::new(RenderConfig { simd: way.simd, ..RenderConfig::default() });
     let (mut image, mut d) = (Image::default(), RenderGrads::default());

@@ -68,7 +68,7 @@ impl Opened {
     }
 }
 
-/// An array, a row a line.
+/// An array, a row per line.
 pub(super) fn json(rows: &[Played]) -> String {
     let lines: Vec<String> = rows.iter().map(|r| serde_json::to_string(r).expect("rows are plain data")).collect();
     format!("[\n{}\n]", lines.join(",\n"))

@@ -59,7 +59,7 @@ impl Row {
     }
 }
 
-/// An array, a row a line.
+/// An array, a row per line.
 pub(super) fn json(rows: &[Row]) -> String {
     let lines: Vec<String> =
         rows.iter().map(|r| serde_json::to_string(r).expect("a row is plain data with names")).collect();

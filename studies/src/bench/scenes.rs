@@ -193,7 +193,7 @@ fn of_the_capture(source: &Source, path: &Path, size: usize) -> Result<Vec<View>
 }
 
 /// The pages of a playback file as the one layer that they were before they were baked. Layers that differ in their
-/// motion, their life or their span stay apart.
+/// motion, their lifespan or their span stay apart.
 fn in_one_layer(mut scene: Scene<f32>) -> Scene<f32> {
     let [first, rest @ ..] = &scene.layers[..] else { return scene };
     let widths = |l: &Layer| l.params.keys().map(|k| l.params[k].width()).collect::<Vec<_>>();

@@ -18,7 +18,7 @@ use splat4d_workflow::files;
 use std::path::Path;
 use world::{Pinhole, V3};
 
-/// The generator's version: drawings of another are drawn again.
+/// The generator's version: drawings of another are rendered again.
 pub(crate) const VERSION: usize = 2;
 /// Codes of depth a world unit, in images of 16 bits: depths to 16 units.
 const DEPTH_CODES: f64 = 4096.0;
@@ -36,7 +36,7 @@ const SEEN: f64 = 0.01;
 /// Error of a point along each axis, pixels at its distance, at most: what good structure from motion has.
 const NOISE: f64 = 0.5;
 
-/// Draws a synthetic capture into a folder. `capture.json` is written last: where it is, all is.
+/// Renders a synthetic capture into a folder. `capture.json` is written last: where it is, all is.
 ///
 /// Errors: there is none of this name; files that cannot be written.
 pub(crate) fn write(name: &str, folder: &Path) -> anyhow::Result<()> {
@@ -245,7 +245,7 @@ mod tests {
         assert!(write("two-walls", Path::new("nowhere")).unwrap_err().to_string().contains("one-wall"));
     }
 
-    /// What every name is made of, without drawing it whole: a small image, the points and the description.
+    /// What every name is made of, without rendering it whole: a small image, the points and the description.
     fn print_of(name: &str) -> String {
         let scene = scene(name).unwrap();
         let (viewer, moment) = (&scene.viewers[scene.viewers.len() - 1], scene.moments / 2);
@@ -259,7 +259,7 @@ mod tests {
     #[test]
     fn the_same_bytes_come_out_everywhere() {
         let all: Vec<String> = NAMES.iter().map(|(name, _)| format!("{name} {}", print_of(name))).collect();
-        // A change of what is drawn must also change `VERSION`, so that old drawings are not taken for new ones.
+        // A change of what is rendered must also change `VERSION`, so that old drawings are not taken for new ones.
         assert_eq!((VERSION, all.join("\n")), (2, PRINTS.trim().to_owned()));
     }
 
@@ -307,8 +307,8 @@ hand-held-60 36359dac295000bb
                 }
             }
         }
-        // A pixel is the mean over its own square, which matters at the textures' edges. The colours of places that have
-        // nothing to do with each other differ by 0.3.
+        // A pixel is the mean over its own square, which matters at the textures' edges. The colours of places that
+        // have nothing to do with each other differ by 0.3.
         let mean = off / f64::from(compared);
         assert!(mean < 0.04, "{mean}");
         assert!(compared > 200, "{compared} places are seen by both");

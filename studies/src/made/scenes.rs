@@ -54,7 +54,7 @@ impl Viewer {
     }
 }
 
-/// A capture before it is drawn.
+/// A capture before it is rendered.
 #[derive(Clone, Debug)]
 pub(crate) struct Scene {
     pub world: World,

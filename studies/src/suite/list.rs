@@ -1,5 +1,5 @@
-//! The captures of the suite: a declared list (`studies/suite.toml`, or a file of the user's), found, drawn or copied
-//! before they are trained on.
+//! The captures of the suite: a declared list (`studies/suite.toml`, or a file of the user's), found, rendered or
+//! copied before they are trained on.
 
 use crate::made;
 use serde::Deserialize;
@@ -125,7 +125,7 @@ impl List {
         }
     }
 
-    /// The entries that are asked for, in the list's order. Errors: a name that is not in it.
+    /// The entries that are requested, in the list's order. Errors: a name that is not in it.
     pub(crate) fn only(&self, names: &[String]) -> Result<Vec<&Entry>> {
         if let Some(unknown) = names.iter().find(|n| !self.captures.iter().any(|e| e.name == **n)) {
             let all: Vec<&str> = self.captures.iter().map(|e| e.name.as_str()).collect();
@@ -164,7 +164,7 @@ impl Entry {
         !self.points
     }
 
-    /// The capture's folder: found in `data`, or drawn or copied below `work`. `None`: it is nowhere.
+    /// The capture's folder: found in `data`, or rendered or copied below `work`. `None`: it is nowhere.
     pub(crate) fn folder(&self, data: &[PathBuf], work: &Path) -> anyhow::Result<Option<PathBuf>> {
         let origin = if let Some(folder) = &self.data {
             data.iter().map(|d| d.join(folder)).find(|p| p.is_dir())
