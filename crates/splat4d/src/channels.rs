@@ -130,7 +130,7 @@ pub struct Witness<'a> {
 /// The standard deviation of each Gaussian's place that its images leave open, scene units, by layer and row:
 /// √(tr (Σ_views H/σ² + I/ρ²)⁻¹ / 3), H the mean's 3x3 block of the Fisher information of an image
 /// ([`Sensitivity::fisher`](crate::render::Sensitivity::fisher)), σ `PIXEL_NOISE` and ρ `reach`, how far a Gaussian may
-/// be from where it is when no image shows it. Each witness stands for `share` images. Other Gaussians are taken for
+/// be from where it is when no image shows it. Each witness represents `share` images. Other Gaussians are taken for
 /// known,
 /// so that it states too little where several could explain a pixel.
 ///

@@ -85,7 +85,7 @@ pub trait Kernel {
 }
 
 /// Work that writes to two things that the caller lends. They are arguments of the compiled function itself, since only
-/// then does LLVM know that they do not overlap with what is read: plain loops over slices that stand inside a
+/// then does LLVM know that they do not overlap with what is read: plain loops over slices that are inside a
 /// [`Kernel`] stay scalar (measured on the loss: five times slower). `run` must be `#[inline(always)]`.
 pub trait Pass {
     /// Working memory.

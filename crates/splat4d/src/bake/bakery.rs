@@ -1,4 +1,4 @@
-//! [`Bakery`]: a scene that is sampled once and cut into segments as often as is wanted.
+//! [`Bakery`]: a scene that is sampled once and cut into segments as often as is needed.
 
 use super::fit::{Fitter, Piece, Subject, seen};
 use super::life::Lives;

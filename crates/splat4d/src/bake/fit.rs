@@ -241,7 +241,8 @@ impl Fitter<'_> {
 /// An envelope about the strongest look that falls as the looks do: σ = exp(−½y²), y = (x − h)/s beyond h, is a line
 /// through √(−2 ln(α/α_max)).
 fn tail(looks: &[FrameSample]) -> Option<(Envelope, f64)> {
-    /// Looks at which next to nothing has fallen yet, or next to nothing is left, say little of the slope.
+    /// Looks at which next to nothing has fallen yet, or next to nothing is left, carry little information about the
+    /// slope.
     const TELLING: std::ops::Range<f64> = 0.02..0.98;
     let peak = looks.iter().max_by(|a, b| a.alpha.total_cmp(&b.alpha))?;
     let share = |l: &FrameSample| l.alpha / peak.alpha;

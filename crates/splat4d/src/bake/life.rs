@@ -4,12 +4,12 @@ use crate::layers::Layer;
 use crate::scene::life::{CENTER, LOG_SOFTNESS, LOG_WIDTH};
 use crate::scene::{LIFE, LifeKind, Table};
 
-/// A half-width or softness above this is for ever, seconds: three years, as intervals that stand for it have thirty.
+/// A half-width or softness above this is forever, seconds: three years, as intervals that represent it have thirty.
 const FOR_EVER: f64 = 1e8;
 /// A softness below this is an edge, seconds.
 const SHARP: f64 = 1e-9;
 
-/// σ(t) = exp(−½(max(0, |t − centre| − half)/softness)²); 1 for ever where `half` is infinite.
+/// σ(t) = exp(−½(max(0, |t − centre| − half)/softness)²); 1 forever where `half` is infinite.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Envelope {
     /// Seconds.

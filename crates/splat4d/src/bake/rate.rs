@@ -1,10 +1,10 @@
 //! Rate and distortion: how many segments a Gaussian needs for how small an error of the images.
 //!
-//! Every node of the tree of time spans has the error that one segment leaves there: closed forms of running sums, so that
-//! a node costs the same however many looks it holds. For a price λ of a segment the best cut of the tree is known from its
-//! leaves upwards (a node is cut where its halves and their price cost less). Cuts at all prices of a ladder at once give the
-//! curve of the whole scene, on which a budget of segments or a wanted error is a price. (Optimal tree pruning: Chou,
-//! Lookabaugh, Gray 1989.)
+//! Every node of the tree of time spans has the error that one segment leaves there: closed forms of running sums, so
+//! that a node costs the same however many looks it holds. For a price λ of a segment the best cut of the tree is known
+//! from its leaves upwards (a node is cut where its halves and their price cost less). Cuts at all prices of a ladder
+//! at once give the curve of the whole scene, on which a budget of segments or a requested error is a price. (Optimal
+//! tree pruning: Chou, Lookabaugh, Gray 1989.)
 
 use super::fit::{Place, narrow};
 use super::life::Envelope;
@@ -19,8 +19,8 @@ pub(super) const PRICES: usize = 32;
 /// could see of a million segments to more than one Gaussian can weigh.
 const LOWEST: f64 = 1e-14;
 const FACTOR: f64 = 2.5;
-/// Share of a Gaussian's energy by which a relative change of its covariance by 1 (Frobenius) changes images: (tr² + 2‖·‖²)/16
-/// of a bell, between the values of a change along the axes and of a shear.
+/// Share of a Gaussian's energy by which a relative change of its covariance by 1 (Frobenius) changes images: (tr² +
+/// 2‖·‖²)/16 of a bell, between the values of a change along the axes and of a shear.
 const SHAPE: f64 = 0.125;
 /// Axes whose relative difference of squares is below this cannot be distinguished: a shear between them is no turn.
 const ROUND: f64 = 0.05;
@@ -97,7 +97,8 @@ pub(super) struct Sums<'a> {
 }
 
 impl<'a> Sums<'a> {
-    /// Sums over the looks at `row`. `weigh` gives the weight of its errors from its clearest look. None: no look is finite.
+    /// Sums over the looks at `row`. `weigh` gives the weight of its errors from its clearest look. None: no look is
+    /// finite.
     pub(super) fn new(
         tree: &'a Tree,
         samples: &Samples,
@@ -163,7 +164,8 @@ impl<'a> Sums<'a> {
         Some(Self { tree, row, weight, turns, peak, colors, width, sums })
     }
 
-    /// What one segment over a span leaves, summed over its looks; those at its ends, which its neighbours share, count half.
+    /// What one segment over a span leaves, summed over its looks; those at its ends, which its neighbours share, count
+    /// half.
     pub(super) fn error(&self, span: Span) -> f64 {
         let [first, last] = self.row.frames;
         let (a, b) = (first.max(span[0]), last.min(span[1]));

@@ -1,4 +1,5 @@
-//! A clip played many times over: the static background for ever is kept once, all else once per round.
+//! A clip played many times over: the static background is stored once with an infinite lifespan, all else once per
+//! round.
 
 use super::fit::LEVEL_PIXELS;
 use super::sampling::Lookout;
@@ -52,7 +53,7 @@ impl Rounds {
         out
     }
 
-    /// The primitive as one that stands for ever, where that stays within the tolerance.
+    /// The primitive as one with an infinite lifespan, where that stays within the tolerance.
     fn still(&self, p: &Primitive, sampling: &Lookout, tolerance: f64) -> Option<Primitive> {
         let ends = [self.first, self.first + self.length];
         let middle = 0.5 * (ends[0] + ends[1]);

@@ -4,7 +4,7 @@ use crate::math::median;
 use crate::math::se3::{norm, sub};
 use crate::scene::Camera;
 
-/// Most cameras asked: more of a rig say nothing new.
+/// Most cameras that are used: more of a rig add no information.
 const MAX_CAMERAS: usize = 32;
 /// A camera counts as no nearer than this share of the median distance to the middle: what drifts before a lens must
 /// not be followed to the hundredth of its own width.

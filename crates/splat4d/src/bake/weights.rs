@@ -1,10 +1,10 @@
 //! How strongly images react to an error of each Gaussian, measured on renders of the model.
 //!
-//! A Gaussian behind a wall, or one of its neighbours' colour, may err by pixels without a trace; the edge of a sign may not.
-//! [`Importance::sensitivities`] gives the exact second moment of the image's gradient for each Gaussian alone. Some
-//! cameras at some times stand for all. Of a camera that moves, each time has its own pose: a Gaussian counts when that
-//! camera sees it. What no render sees keeps a share of what its size and opacity would weigh alone, so that it is not
-//! lost for other views.
+//! A Gaussian behind a wall, or one of its neighbours' colour, may err by pixels without a trace; the edge of a sign
+//! may not. [`Importance::sensitivities`] gives the exact second moment of the image's gradient for each Gaussian
+//! alone. Some cameras at some times represent all. Of a camera that moves, each time has its own pose: a Gaussian
+//! counts when that camera sees it. What no render sees keeps a share of what its size and opacity would weigh alone,
+//! so that it is not lost for other views.
 
 use super::sample::GEOMETRY;
 use super::sampling::Lookout;
@@ -23,8 +23,8 @@ pub(super) const PATH_RENDERS: usize = 32;
 const SIDE: usize = 480;
 /// Share of an error that counts in every direction, also along a line of sight that no render looked across.
 const ISOTROPIC: f64 = 0.1;
-/// Share of the weight by size and opacity alone that is kept where no render sees the Gaussian, and of its greatest weight
-/// at times at which the moving camera does not.
+/// Share of the weight by size and opacity alone that is kept where no render sees the Gaussian, and of its greatest
+/// weight at times at which the moving camera does not.
 const UNSEEN: f64 = 0.02;
 /// Squared contrast to what is around it that is assumed where none is known, each channel.
 const CONTRAST: f64 = 0.05;
@@ -64,7 +64,8 @@ pub(super) struct Weights {
     pixels: f64,
 }
 
-/// The weight of one Gaussian's errors: mean squared error of images for errors of size 1, at the time at which it weighs most.
+/// The weight of one Gaussian's errors: mean squared error of images for errors of size 1, at the time at which it
+/// weighs most.
 #[derive(Clone, Debug)]
 pub(super) struct Weight {
     /// Lower triangle L of its quadratic form of the mean, L Lᵀ, per unit².
@@ -89,8 +90,8 @@ impl Weight {
 }
 
 impl Weights {
-    /// Renders the model as `cameras` see it at all times and as a moving camera does at its own (rising), each at most `most`
-    /// times, and measures.
+    /// Renders the model as `cameras` see it at all times and as a moving camera does at its own (rising), each at most
+    /// `most` times, and measures.
     pub(super) fn measure(
         scene: &Scene<f32>,
         cameras: &[Camera],

@@ -49,7 +49,7 @@ struct Looks(Vec<LayerLooks>);
 /// A time, the rows that are examined then, and which of its looks it is for each.
 type Query<'a> = (Time, &'a (Vec<u32>, Vec<u8>));
 
-/// By layer and row: bit i stands for time i of the row.
+/// By layer and row: bit i represents time i of the row.
 type Bits = Vec<Vec<u8>>;
 
 impl Looks {

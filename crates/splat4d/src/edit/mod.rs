@@ -79,7 +79,7 @@ pub struct Place {
     pub turn: Option<[f64; 4]>,
     /// How many times as large.
     pub scale: Option<f64>,
-    /// The fixed point of turning and scaling, scene units; the origin unless said.
+    /// The fixed point of turning and scaling, scene units; the origin unless stated.
     pub about: Option<[f64; 3]>,
 }
 
@@ -191,10 +191,10 @@ pub enum Step {
     Retime {
         /// Factor of speed, not zero.
         rate: f64,
-        /// Seconds; the clip's start unless said.
+        /// Seconds; the clip's start unless stated.
         #[serde(default)]
         from: Option<f64>,
-        /// Seconds; the clip's end unless said.
+        /// Seconds; the clip's end unless stated.
         #[serde(default)]
         to: Option<f64>,
     },
@@ -204,10 +204,10 @@ pub enum Step {
         scene: String,
         /// Its layers' names begin with this and a slash.
         name: String,
-        /// The second at which its clip starts here; that of its own clock unless said.
+        /// The second at which its clip starts here; that of its own clock unless stated.
         #[serde(default)]
         at: Option<f64>,
-        /// Where it stands.
+        /// Its placement.
         #[serde(default)]
         to: Place,
     },
@@ -281,7 +281,7 @@ pub struct Mask {
     pub white: Vec<bool>,
 }
 
-/// What edits name and a scene does not hold. The methods of the trait itself have nothing: they are errors that say so.
+/// What edits name and a scene does not hold. The methods of the trait itself have nothing: they return errors.
 pub trait Context {
     /// The camera of that name.
     fn camera(&self, name: &str) -> Result<Camera> {
@@ -313,7 +313,8 @@ pub trait Context {
         Err(missing("training view", "Give the run folder of a capture that is still there"))
     }
 
-    /// Where nodes that are at `start` at `times[first]` are at all `times`, `[times][nodes]`: carried by the Gaussians `among`.
+    /// Where nodes that are at `start` at `times[first]` are at all `times`, `[times][nodes]`: carried by the Gaussians
+    /// `among`.
     fn follow(
         &self,
         scene: &Scene<f32>,
@@ -339,10 +340,11 @@ pub struct Done {
     pub gaussians: usize,
 }
 
-/// Runs the steps on a scene, in order. The scene is what is left of it; on an error it is lost, so that callers keep theirs.
+/// Runs the steps on a scene, in order. The scene is what is left of it; on an error it is lost, so that callers keep
+/// theirs.
 ///
-/// Errors: a step's, with its number and name: selections that cannot be read or select nothing, names that there are not,
-/// numbers out of range, numbers that overflow, more Gaussians than memory holds, what a pixel head cannot show.
+/// Errors: a step's, with its number and name: selections that cannot be read or select nothing, names that there are
+/// not, numbers out of range, numbers that overflow, more Gaussians than memory holds, what a pixel head cannot show.
 pub fn replay(
     steps: &[Step],
     scene: Scene<f32>,

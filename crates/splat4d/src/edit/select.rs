@@ -156,7 +156,7 @@ impl Expr {
         }
     }
 
-    /// Reads a selection. Errors: the first place that cannot be read, and what may stand there.
+    /// Reads a selection. Errors: the first place that cannot be read, and what may be there.
     pub fn parse(text: &str) -> Result<Self> {
         let mut parser = Parser { text, tokens: tokens(text)?, at: 0, depth: 0 };
         let expr = parser.either()?;

@@ -137,7 +137,7 @@ fn counted(text: &str, scene: &Scene<f32>) -> usize {
     count(&Expr::parse(text).unwrap(), scene, &[], &Bench::empty()).unwrap().0
 }
 
-/// One Gaussian that goes from x = −1 at 0 s to x = 1 at 1 s, and one that stands at x = 2.
+/// One Gaussian that goes from x = −1 at 0 s to x = 1 at 1 s, and one that is at x = 2.
 fn walker() -> Scene<f32> {
     let spec = Spec::Spacetime(SpacetimeSpec { order: 1, rotation: false, detach: true, origin: 0.5, features: None });
     let mut params = Params::new(2, 1, &[]);

@@ -69,7 +69,7 @@ pub(super) fn scale_of_log(log: f32) -> f32 {
     log.exp().min(f32::MAX)
 }
 
-/// The logit of an opacity of `byte`/255. The ends stand for half an interval, whose middle is taken: their own logits
+/// The logit of an opacity of `byte`/255. The ends represent half an interval, whose middle is taken: their own logits
 /// are infinite.
 #[inline]
 pub(super) fn logit_of_byte(byte: u8) -> f32 {

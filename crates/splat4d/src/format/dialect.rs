@@ -63,7 +63,7 @@ pub struct WriteOptions {
     pub cameras: Vec<Camera>,
     /// Refuse Gaussians whose fade in time the dialect cannot say exactly, in place of fitting one.
     pub exact: bool,
-    /// Which way is up, for dialects whose files say so; `Dialect::write` takes it from the scene.
+    /// Which way is up, for dialects whose files specify it; `Dialect::write` takes it from the scene.
     pub up: [f64; 3],
     /// The scene's offset; `Dialect::write` sets it.
     pub offset: [f64; 3],
@@ -90,7 +90,8 @@ pub struct PlyInfo {
     pub mended: Mended,
     /// Whether base colours are RGB (`red green blue`), not coefficients.
     pub rgb: bool,
-    /// What was subtracted from positions in double precision that are far from the origin, or what the file states was.
+    /// What was subtracted from positions in double precision that are far from the origin, or what the file states
+    /// was.
     pub offset: [f64; 3],
     /// Whether the numbers were quantised (PlayCanvas' compressed layout).
     pub compressed: bool,
@@ -160,8 +161,8 @@ impl Dialect {
         (self.read)(bytes).map(|opened| self.finish(opened))
     }
 
-    /// What [`open`](Self::open) does after reading: states which way is up and mends values at the edge. For files that are
-    /// read with others next to them ([`gltf::read_text`](super::gltf::read_text)).
+    /// What [`open`](Self::open) does after reading: states which way is up and mends values at the edge. For files
+    /// that are read with others next to them ([`gltf::read_text`](super::gltf::read_text)).
     pub fn finish(&self, mut opened: Opened) -> Opened {
         opened.scene.up = opened.up.unwrap_or(self.up);
         let (of, mut mended) = (opened.scene.len(), opened.ply.as_ref().map(|p| p.mended).unwrap_or_default());
@@ -187,7 +188,8 @@ impl Dialect {
     /// Writes a scene, whose axes are taken as they are; of a scene that moves, a dialect that does not gets the clip's
     /// first time. Says what was left out.
     ///
-    /// Errors: it is only read; it cannot hold the scene, or what it should of it; a number is NaN or infinite; the sink's.
+    /// Errors: it is only read; it cannot hold the scene, or what it should of it; a number is NaN or infinite; the
+    /// sink's.
     pub fn write(&self, scene: &Scene<f32>, options: &WriteOptions, out: &mut dyn Write) -> Result<Warnings> {
         scene.check_finite()?;
         let options = WriteOptions { up: scene.up, offset: scene.offset, ..options.clone() };

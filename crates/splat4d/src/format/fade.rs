@@ -220,7 +220,7 @@ mod tests {
 
     #[test]
     fn pieces_of_one_path_give_way_to_each_other() {
-        // One Gaussian for ever, cut into four pieces: together they must stay near 0.6.
+        // One Gaussian with an infinite lifespan, cut into four pieces: together they must stay near 0.6.
         let pieces: Vec<Fade> = (0..4)
             .map(|i| {
                 let span = [0.5 * f64::from(i), 0.5 * f64::from(i + 1)];

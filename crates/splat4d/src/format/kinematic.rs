@@ -13,7 +13,7 @@ use crate::scene::{GEOMETRY, LIFE, LifeKind, Params, SH};
 use crate::{Error, ErrorKind, Result};
 use std::sync::Arc;
 
-/// Width, in clips, of a fade that stands for "lives for ever": over the clip it dims by 1e-8.
+/// Width, in clips, of a fade that represents an infinite lifespan: over the clip it dims by 1e-8.
 pub(super) const FOREVER: f64 = 1e4;
 /// Least logit of an opacity that was fitted: nothing is seen of it.
 const LEAST_LOGIT: f64 = -20.0;

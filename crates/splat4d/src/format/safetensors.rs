@@ -5,7 +5,7 @@
 //!
 //! Why not the `safetensors` crate (0.8.0, Apache-2.0, bounds-checked and sound when read): it keeps metadata in a
 //! `HashMap`, so that the same scene gives files of different bytes (15 kinds in 20 writes of four keys), while our
-//! runs must repeat byte for byte; it takes a name that stands twice without a word; and its errors do not name the
+//! runs must repeat byte for byte; it takes a name that occurs twice without a word; and its errors do not name the
 //! array.
 
 use crate::{Error, ErrorKind, Result};
@@ -20,8 +20,8 @@ use std::io::Write;
 const MAX_HEADER: usize = 100_000_000;
 /// The header's key for free text.
 const METADATA: &str = "__metadata__";
-/// The metadata's key for checksums: JSON, a CRC-32 in hexadecimal for the bytes of every array, and under the empty name for
-/// all other metadata. Other readers pass over it.
+/// The metadata's key for checksums: JSON, a CRC-32 in hexadecimal for the bytes of every array, and under the empty
+/// name for all other metadata. Other readers pass over it.
 const CHECKSUMS: &str = "splat4d-crc32";
 /// The header is padded with spaces to a multiple of this, so that the first array is aligned.
 const ALIGN: usize = 8;
@@ -167,8 +167,8 @@ impl<'a> SafeTensors<'a> {
     /// Reads a file; the arrays borrow its bytes.
     ///
     /// Errors: a header that is too long, not JSON or names an array twice; an unknown type; a shape that does not
-    /// match its bytes; arrays that overlap, leave holes, or do not end where the file ends; an array or metadata that is not
-    /// what a checksum was made of.
+    /// match its bytes; arrays that overlap, leave holes, or do not end where the file ends; an array or metadata that
+    /// is not what a checksum was made of.
     pub fn read(bytes: &'a [u8]) -> Result<Self> {
         let Some((length, rest)) = bytes.split_first_chunk::<8>() else {
             return Err(broken("the file is shorter than its header's length"));
@@ -339,7 +339,7 @@ pub(crate) fn header<'a>(
     [&(header.len() as u64).to_le_bytes(), header.as_bytes()].concat()
 }
 
-/// The header as it stands in the file; a list, so that a name that stands twice is seen.
+/// The header as it is in the file; a list, so that a name that occurs twice is seen.
 #[derive(Default)]
 struct Header {
     metadata: BTreeMap<String, String>,

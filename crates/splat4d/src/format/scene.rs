@@ -280,7 +280,7 @@ fn head(meta: &Value) -> Result<Head> {
     })
 }
 
-/// The scene's labels; none where nothing is said.
+/// The scene's labels; none where the file has none.
 fn label_names(meta: &Value) -> Result<Vec<String>> {
     if meta["labels"].is_null() {
         return Ok(Vec::new());
@@ -353,7 +353,7 @@ fn read_masks(file: &SafeTensors<'_>, meta: &Value, prefix: &str, rows: usize) -
     Ok(Some(Arc::new(masks)))
 }
 
-/// When the layer is seen; a side that is null is open, and so are both where nothing is said.
+/// When the layer is seen; a side that is null is open, and so are both where the file states nothing.
 fn span(meta: &Value) -> Result<[f64; 2]> {
     if meta["span"].is_null() {
         return Ok(ALWAYS);
@@ -367,7 +367,7 @@ fn span(meta: &Value) -> Result<[f64; 2]> {
     Ok(out)
 }
 
-/// The similarity from the layer's axes to the world's; the identity where nothing is said.
+/// The similarity from the layer's axes to the world's; the identity where the file states nothing.
 fn frame(meta: &Value) -> Result<Sim3> {
     let frame = &meta["frame"];
     if frame.is_null() {
@@ -585,7 +585,7 @@ mod tests {
             let error = with(head, vec![layer]).unwrap_err().to_string();
             assert!(error.contains(head.name()), "{error}");
         }
-        // Scenes without a head say nothing of features: older versions read them.
+        // Scenes without a head carry no information about features: older versions read them.
         let mut bytes = Vec::new();
         write(&scene(), &mut bytes).unwrap();
         assert!(!String::from_utf8_lossy(&bytes).contains("features"));

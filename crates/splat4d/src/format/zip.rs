@@ -125,7 +125,7 @@ impl<'a> Archive<'a> {
     }
 }
 
-/// Where the packed bytes of the file lie whose local header stands at `offset`.
+/// Where the packed bytes of the file lie whose local header is at `offset`.
 fn body(bytes: &[u8], offset: usize, packed: usize) -> Result<Range<usize>> {
     let mut c = Cursor::new(bytes.get(offset..).unwrap_or_default(), "zip file");
     if c.take(4)? != MAGIC {

@@ -7,7 +7,7 @@
 // to the background. Eight storage buffers.
 //
 // Of a record: 0 v, 1 v dx, 2 v dx^2, 3 v dy, 4 v dx dy, 5 v dy^2, 6 to 9 gradient to red, green, blue and depth, 10
-// and 11 absolute gradients to the centre, where they are wanted; v = dL/d ln alpha.
+// and 11 absolute gradients to the centre, where they are needed; v = dL/d ln alpha.
 
 const TILE: u32 = 16u;
 // Pixels across and down a quadrant, and the split of an owner (tiles.wgsl).
@@ -16,7 +16,7 @@ const OWNER_SHIFT: u32 = 28u;
 const OWNER_SPLAT: u32 = 0x0fffffffu;
 const LOG2_E: f32 = 1.4426950408889634;
 const NUMBERS: u32 = 12u;
-// Bits of blend.flags: there is a gradient to alpha, to depth; absolute gradients are wanted.
+// Bits of blend.flags: there is a gradient to alpha, to depth; absolute gradients are needed.
 const BACK_ALPHA: u32 = 1u;
 const BACK_DEPTH: u32 = 2u;
 const BACK_ABS: u32 = 4u;

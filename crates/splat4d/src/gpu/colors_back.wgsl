@@ -1,5 +1,5 @@
 // From the gradient to a splat's colour to those of its SH coefficients and, through the direction, of its mean; and
-// what densification wants to know of it. Twin of the VJP in render/shade.rs and of Stats::observe in splat4d-train's
+// what densification needs to know of it. Twin of the VJP in render/shade.rs and of Stats::observe in splat4d-train's
 // learner.rs; render/project.wgsl, render/shade.wgsl and learnt.wgsl are put in front of this file.
 //
 // Bindings, group 0: 0 view; 1 ask; 2 counts ([3]: stopped); 3 geometry as answer.wgsl wrote it, 4 params: here the SH

@@ -31,7 +31,7 @@ pub struct Gpu {
     pub(super) queue: wgpu::Queue,
     /// Of the kernels that are compiled for it.
     pub(super) tuning: Tuning,
-    /// Buffers for which there is no memory, where tests say so.
+    /// Buffers for which there is no memory, as tests request.
     pub(super) refused: Option<&'static str>,
     info: wgpu::AdapterInfo,
     trouble: Trouble,

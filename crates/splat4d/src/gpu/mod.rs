@@ -109,7 +109,7 @@ pub struct GpuRenderer {
     resident: Option<Box<KeptTables>>,
     flights: Flights,
     /// Steps that may be under way, rows of tiles of a band in them, and rows of a page of their tables, where tests
-    /// say so.
+    /// request it.
     ahead: usize,
     band_rows: usize,
     page_rows: Option<usize>,

@@ -1,5 +1,5 @@
-// The way back through a tile on devices with subgroups: the records of rasterize_back.wgsl, added up in registers and by exchanges
-// between threads. subgroup_sums.wgsl, where the rest is said, is put in front of this file.
+// The way back through a tile on devices with subgroups: the records of rasterize_back.wgsl, added up in registers and
+// by exchanges between threads. subgroup_sums.wgsl, where the rest is reported, is put in front of this file.
 
 @compute @workgroup_size(64)
 fn rasterize_back(

@@ -3,7 +3,7 @@
 //
 // Three entries of one workgroup each: view_sums after each view, cameras and record after the step's last.
 // Bindings, group 0: 0 rule; 1 counts ([1]: visible splats, [2]: pairs, [3]: where steps stopped, [4]: pairs that were
-// wanted then); 2 partials of loss.wgsl; 3 status: eight words of the step, eight a view, then those of the other
+// requested then); 2 partials of loss.wgsl; 3 status: eight words of the step, eight a view, then those of the other
 // kernels; 4 responses: of every camera the twelve numbers that loss.wgsl reads, then in the same order their
 // gradients, first moments, second moments, and behind them all a step count a camera and 1 for each that is held about
 // the mean; 5 corrections of adam.wgsl. Five storage buffers.

@@ -19,7 +19,7 @@ struct ScanPass {
     count_index: u32,
     total_index: u32,
     arguments_at: u32,
-    capacity: u32, // more things than this are not dispatched at all: the total says that they were too many
+    capacity: u32, // more things than this are not dispatched at all: the total states that they were too many
     view: u32,     // 1 + the view of a step that stops then, as all that follow it; 0: of no step
     unused_0: u32,
     unused_1: u32,

@@ -1,8 +1,9 @@
-// From the gradients of a layer's splats to those of its Gaussians of space and time. Twin of Motion::backward for `native4d`
-// (slice_backward in motion/native4d/slice.rs); learnt.wgsl, put.wgsl, numbers.wgsl and slice.wgsl are put in front of this file.
+// From the gradients of a layer's splats to those of its Gaussians of space and time. Twin of Motion::backward for
+// `native4d` (slice_backward in motion/native4d/slice.rs); learnt.wgsl, put.wgsl, numbers.wgsl and slice.wgsl are put
+// in front of this file.
 //
-// Bindings, group 0: 0 ask; 1 counts ([3]: stopped); 2 params; 3 back as colors_back.wgsl left it; 4 weights: the gradients that it
-// left there; out: 5 d_params, as answer_back.wgsl writes it. Five storage buffers.
+// Bindings, group 0: 0 ask; 1 counts ([3]: stopped); 2 params; 3 back as colors_back.wgsl left it; 4 weights: the
+// gradients that it left there; out: 5 d_params, as answer_back.wgsl writes it. Five storage buffers.
 // A thread owns one row.
 
 const TAU: f32 = 6.283185307179586;
@@ -37,7 +38,8 @@ fn answer_back(@builtin(global_invocation_id) id: vec3<u32>) {
     // h w, zero where the exponent has stopped.
     let fade = select(0.0, d0.w * opacity * life, s.near);
     let d_tau = s.inverse * (dot(d_mean, s.v) - fade * s.tau);
-    // Where c is free, the terms of dL/dc join those of dL/dv: K stands in L's place, and -tau dtau/c is left along its row.
+    // Where c is free, the terms of dL/dc join those of dL/dv: K is in L's place, and -tau dtau/c is left along its
+    // row.
     let free = s.c > ask.floor;
     let side = s.inverse * (d_mean * s.tau - 2.0 * (m * s.v));
     let along = select(0.0, -s.tau * s.inverse * d_tau, free);

@@ -1,5 +1,5 @@
-//! Constants of the kernels that decide how fast they are, and of what they compute nothing but, where it states so, last bits: what
-//! a sweep on a card varies.
+//! Constants of the kernels that decide how fast they are, and of what they compute nothing but, where it states so,
+//! last bits: what a sweep on a card varies.
 
 use super::limits::THREADS;
 
@@ -37,7 +37,8 @@ impl Default for Tuning {
     }
 }
 
-/// What a sweep tries. More splats a batch or a round need more than the 16 KiB of workgroup memory that every device has.
+/// What a sweep tries. More splats a batch or a round need more than the 16 KiB of workgroup memory that every device
+/// has.
 const ROW_THREADS: [usize; 2] = [64, 128];
 const ROUNDS: [usize; 3] = [2, 4, 16];
 const BATCHES: [usize; 3] = [32, 64, 128];
@@ -89,7 +90,7 @@ impl Tuning {
         THREADS * self.rounds
     }
 
-    /// A shader's text with these constants in place of those that stand there.
+    /// A shader's text with these constants in place of its own.
     pub(super) fn text(&self, shader: &str) -> String {
         let constants = [
             ("ROW_THREADS", self.row_threads),

@@ -1,6 +1,6 @@
 //! [`Evaluation`]: the scene at these times, forth and back.
 //!
-//! A motion model wants all queries of a step at once (`prepare`), then answers them one by one (`at`); in the
+//! A motion model needs all queries of a step at once (`prepare`), then answers them one by one (`at`); in the
 //! backward pass it
 //! takes a gradient a query (`backward`) and hears when that was the last one (`finish`). That order is written here,
 //! once, for training, playback, freezing, flow and baking.

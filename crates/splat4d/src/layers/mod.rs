@@ -61,7 +61,7 @@ pub struct Layer<F: Real = f32> {
     pub cross_fade: [f64; 2],
     /// Visibility masks of the rows over time; none: all rows alive are rendered.
     pub masks: Option<Arc<KeyMasks>>,
-    /// Where the layer stands: `world_from_layer`, applied to Gaussians after motion and lifespan. Tables, the motion
+    /// The layer's frame: `world_from_layer`, applied to Gaussians after motion and lifespan. Tables, the motion
     /// model and nodes keep the layer's own axes and unit of length.
     pub frame: Sim3,
 }

@@ -13,7 +13,7 @@ const SWEEPS: usize = 12;
 
 /// Solves a x = b by Cramer's rule; `None` where a is nearly singular, whatever its unit.
 pub fn solve(a: [[f64; 3]; 3], b: [f64; 3]) -> Option<[f64; 3]> {
-    /// Of the product of the rows' lengths, which the determinant reaches where rows stand at right angles.
+    /// Of the product of the rows' lengths, which the determinant reaches where rows are at right angles.
     const SINGULAR: f64 = 1e-12;
     let columns = transpose(&a);
     let det = dot(columns[0], cross(columns[1], columns[2]));

@@ -7,7 +7,7 @@
 //! `sg` stops the gradient: the network's input is detached from the mean, so that dL/dx = dL/dx_t (with a screw:
 //! turned by it). The network sees γ(x̂) and γ(t̂), t̂'s perhaps through a small network of its own, or hash grids over
 //! (x, y, z) and (x, y, t), (y, z, t), (x, z, t). What depends on t̂ alone enters as a shift of biases, which is the
-//! same as standing in every row.
+//! same as repeating it in every row.
 //! At the start the last map is zero: the result is then the canonical cloud bit for bit, as in `still`.
 //! Source: Yang et al. 2024 (Deformable 3D Gaussians) §3; heads that start at zero as in SC-GS (Huang et al. 2024);
 //! hash grids after Müller et al. 2022 and Grid4D (Xu et al. 2024).
@@ -43,7 +43,7 @@ pub struct DeformSpec {
     pub width: usize,
     /// Hidden layers of the trunk; 0: features are mapped linearly.
     pub layers: usize,
-    /// The input stands again behind what this hidden layer (from 0) gives.
+    /// The input is appended again to the output of this hidden layer (from 0).
     pub skip: Option<usize>,
     /// Whether positions move by a screw motion instead of an offset.
     pub rigid: bool,

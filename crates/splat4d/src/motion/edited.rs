@@ -139,7 +139,7 @@ fn capabilities(inner: Capabilities, change: &Change) -> Capabilities {
     let backwards = matches!(change, Change::Clock { rate, .. } if *rate < 0.0);
     let turns = matches!(change, Change::Path { .. } | Change::Drag(_)) && change.moves();
     Capabilities {
-        // What does not move is taken from its tables, which say nothing of a change.
+        // What does not move is taken from its tables, which carry no information about a change.
         moves: inner.moves || !matches!(change, Change::Clock { .. }),
         rotates: inner.rotates || turns,
         causal: inner.causal && !backwards,
@@ -545,7 +545,7 @@ impl<F: Real> Motion<F> for Edited<F> {
                 if let Some(a) = placed.of(q.rows.id(j)) {
                     let g = [row[0], row[1], row[2]];
                     let mean: [F; 3] = std::array::from_fn(|i| (0..3).map(|k| a.m[k][i] * g[k]).sum());
-                    // An off-diagonal's gradient stands for both of its places.
+                    // An off-diagonal's gradient represents both of its places.
                     let h = F::HALF;
                     let [xx, xy, xz, yy, yz, zz]: [F; 6] = std::array::from_fn(|k| row[COV + k]);
                     let back = congruence(&transposed(&a.q), [xx, h * xy, h * xz, yy, h * yz, zz]);

@@ -229,7 +229,7 @@ impl<F: Real> Filtered<F> {
     /// Fuses all rows of a query at one time into `out`.
     fn fuse(&self, q: &At<'_, F>, [seen, last, before]: [&Table<F>; 3], out: &mut Table<F>) {
         let [trust, _] = self.trust(q.t.0);
-        // Opacities, and observations that stand as they are, stay so to the last bit.
+        // Opacities, and unchanged observations, stay so to the last bit.
         out.data_mut().copy_from_slice(seen.data());
         par_split([out.view_mut()], &|[mut view]| {
             for j in view.first..view.first + view.rows {

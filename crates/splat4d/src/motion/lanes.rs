@@ -36,7 +36,7 @@ impl Span {
     }
 
     fn of(rows: [u32; BLOCK]) -> Self {
-        // Increasing numbers that end 15 above their start leave none out, unless the last one stands there repeatedly.
+        // Increasing numbers that end 15 above their start leave none out, unless the last one is there repeatedly.
         let [first, last] = [rows[0], rows[BLOCK - 1]];
         let dense = last - first == BLOCK as u32 - 1 && rows[BLOCK - 2] < last;
         let lie = match (dense, first as usize % BLOCK) {

@@ -30,7 +30,7 @@ pub struct Capabilities {
     pub rotates: bool,
     /// Birth and death are the model's own ([`Motion::life`]), and the layer needs no lifespan table.
     pub own_life: bool,
-    /// State runs forward in time: a result at t depends on no number that stands for a later time, so that what
+    /// State runs forward in time: a result at t depends on no number that represents a later time, so that what
     /// follows can be learnt or cut off without a change of what was.
     pub causal: bool,
     /// Fixed cameras that must see every time for the model to be learnt.

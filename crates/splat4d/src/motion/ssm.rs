@@ -222,14 +222,14 @@ impl Field {
         Ok(Self { spec: spec.clone(), net, embeddings, context })
     }
 
-    /// Where t stands among the ticks.
+    /// Where t is among the ticks.
     fn knots<F: Real>(&self, t: Time) -> Knots<F> {
         let [first, last] = self.spec.clip;
         let per_second = (self.spec.ticks - 1) as f64 / (last - first);
         Knots::new((t.0 - first) * per_second, per_second, self.last_tick())
     }
 
-    /// The last tick there is: the clip's, or as many again to forecast; later times see it for ever.
+    /// The last tick there is: the clip's, or as many again to forecast; later times use it.
     fn last_tick(&self) -> usize {
         match self.spec.mode {
             Mode::Bidirectional => self.spec.ticks - 1,

@@ -44,7 +44,7 @@ pub struct TrackedSpec {
     /// Seconds of every frame that has been tracked, strictly increasing. Frame 0 is the geometry, the others have
     /// pages.
     pub times: Vec<f64>,
-    /// Whether Gaussians have a [`FOREGROUND`] logit: what masks say of them. No image depends on it.
+    /// Whether Gaussians have a [`FOREGROUND`] logit: what masks show about them. No image depends on it.
     pub foreground: bool,
 }
 
@@ -72,7 +72,7 @@ pub struct Tracked {
 }
 
 impl Tracked {
-    /// Pages that are not loaded start where frame 0 stands. Errors: times that do not increase; pages that are missing
+    /// Pages that are not loaded start as frame 0. Errors: times that do not increase; pages that are missing
     /// or have another shape.
     pub fn new<F: Real>(spec: &TrackedSpec, p: &mut Params<F>) -> Result<Self> {
         let times = &spec.times;

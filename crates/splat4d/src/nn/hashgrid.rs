@@ -150,7 +150,7 @@ impl HashGrid {
     }
 
     /// The VJP of [`forward`](Self::forward): adds to the entries' gradients in `d`, and to d_points [n, stride] if
-    /// wanted.
+    /// requested.
     pub fn backward<F: Real>(
         &self,
         p: &Params<F>,

@@ -26,15 +26,15 @@ pub(crate) const MAX_WEIGHTS: usize = 1 << 24;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MlpShape {
-    /// Numbers that go in.
+    /// Number of inputs.
     pub inputs: usize,
     /// Numbers in a hidden layer; not read where there is none.
     pub width: usize,
     /// Hidden layers.
     pub layers: usize,
-    /// The input stands again behind what this hidden layer (counted from 0) gives.
+    /// The input is appended again to the output of this hidden layer (counted from 0).
     pub skip: Option<usize>,
-    /// Numbers that come out.
+    /// Number of outputs.
     pub outputs: usize,
 }
 
@@ -127,7 +127,7 @@ impl<'a, F> Passed<'a, F> {
 /// The gradient to a network's input, [n, inputs].
 #[derive(Debug)]
 pub enum InputGrad<'a, F> {
-    /// Not wanted.
+    /// Not requested.
     Skip,
     /// Written.
     Overwrite(&'a mut [F]),
@@ -196,7 +196,7 @@ impl Mlp {
     }
 
     /// As [`forward_keeping`](Self::forward_keeping), where `shifts[i]`, unless absent or empty, is added to the bias
-    /// of map i: what all rows share (a time's features) need not stand in every row.
+    /// of map i: what all rows share (a time's features) need not be repeated in every row.
     pub(crate) fn forward_shifted<F: Real>(
         &self,
         p: &Params<F>,

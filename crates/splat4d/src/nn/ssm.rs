@@ -132,7 +132,7 @@ struct Hold {
 impl Hold {
     fn new(log_decay: f64, frequency: f64, log_step: f64, gap: f64) -> Self {
         let step = log_step.min(LONGEST_LOG_STEP).exp();
-        // ωΔ above π aliases: such a mode stands at the fastest that ticks can show.
+        // ωΔ above π aliases: such a mode gets the fastest frequency that ticks can show.
         let turn = (frequency * step).clamp(-std::f64::consts::PI, std::f64::consts::PI);
         let decay = (log_decay.exp() * step).min(STRONGEST_DECAY / gap.max(1.0));
         Self {
@@ -295,7 +295,7 @@ impl<F: Real> Discrete<F> {
         out
     }
 
-    /// The scan. Shapes: u, y \[rows, ticks\]; `state` \[rows,N\] is what stood before the first tick and becomes what
+    /// The scan. Shapes: u, y \[rows, ticks\]; `state` \[rows,N\] is what was before the first tick and becomes what
     /// stands after the last; `marks` gets the states at the start of every chunk, \[rows, chunks, N\].
     pub(crate) fn scan(
         &self,
@@ -318,7 +318,7 @@ impl<F: Real> Discrete<F> {
     }
 
     /// The VJP of [`scan`](Self::scan): adds to `d_u` and to the gradient `d`; `d_state` \[rows,N\] is the gradient to
-    /// what stood after the last tick and becomes that to what stood before the first.
+    /// what stood after the last tick and becomes that to what was before the first.
     #[expect(
         clippy::too_many_arguments,
         reason = "a scan's backward has all that its forward has, and their gradients"
@@ -532,7 +532,7 @@ impl<F: Real> Kernel for &mut Reverse<'_, '_, F> {
 }
 
 impl<F: Real> Reverse<'_, '_, F> {
-    /// Adds the sums over lanes to the gradient, for the gap whose first state stands at `place`.
+    /// Adds the sums over lanes to the gradient, for the gap whose first state is at `place`.
     fn flush(&mut self, place: usize) {
         for (i, [d_a, d_b, d_c]) in self.sums.iter_mut().enumerate() {
             for k in 0..2 {

@@ -424,7 +424,7 @@ pub(super) struct Backward<'a, F> {
     /// The image's width and height.
     pub size: [usize; 2],
     pub limits: Limits<F>,
-    /// Whether absolute gradients are wanted.
+    /// Whether absolute gradients are needed.
     pub abs: bool,
     /// One a record; those that no pixel meets are not written.
     pub out: &'a mut [Pair<F>],

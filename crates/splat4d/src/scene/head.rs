@@ -1,6 +1,6 @@
 //! The feature head: a tiny network that turns nine blended channels of a pixel into its colour.
 //!
-//! Here are its weights and their shapes; what it computes, and how that is rendered, stands in `render/head.rs`.
+//! Here are its weights and their shapes; what it computes, and how that is rendered, is in `render/head.rs`.
 //! Source: Li et al. 2024 (Spacetime Gaussians) §4.1 and its released code.
 
 use super::{Key, Params};

@@ -7,7 +7,7 @@ use crate::math::Real;
 /// The shape of the envelope σ(t) of a layer's Gaussians. Centres and widths are in seconds, widths as logarithms.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LifeKind {
-    /// σ = 1 for ever; no columns.
+    /// σ = 1 forever; no columns.
     Infinite,
     /// σ = exp(−½u²), u = (t − centre)/width: FreeTimeGS (Wang et al. 2025) and native 4D Gaussians.
     GaussHalf,

@@ -258,7 +258,7 @@ impl<F: Real> Params<F> {
         &mut self.infos[key.0 as usize]
     }
 
-    /// Several tables to write at once. Panics: a key stands twice.
+    /// Several tables to write at once. Panics: a key occurs twice.
     pub fn get_mut<const N: usize>(&mut self, keys: [Key; N]) -> [&mut Table<F>; N] {
         self.tables.get_disjoint_mut(keys.map(|k| k.0 as usize)).expect("keys of one layer must be distinct")
     }
@@ -367,7 +367,7 @@ impl<F: Real> Grads<F> {
         }
     }
 
-    /// Several tables to add to at once; marks them touched. Panics: a key stands twice.
+    /// Several tables to add to at once; marks them touched. Panics: a key occurs twice.
     pub fn of<const N: usize>(&mut self, keys: [Key; N]) -> [&mut Table<F>; N] {
         for k in keys.map(|k| k.0 as usize) {
             self.touched[k] = true;
@@ -378,7 +378,7 @@ impl<F: Real> Grads<F> {
         self.tables.get_disjoint_mut(keys.map(|k| k.0 as usize)).expect("keys of one layer must be distinct")
     }
 
-    /// As [`of`](Self::of) for a number of keys that only the model's sizes give. Panics: a key stands twice.
+    /// As [`of`](Self::of) for a number of keys that only the model's sizes give. Panics: a key occurs twice.
     pub fn many(&mut self, keys: &[Key]) -> Vec<&mut Table<F>> {
         let mut found: Vec<Option<&mut Table<F>>> = keys.iter().map(|_| None).collect();
         for (i, table) in self.tables.iter_mut().enumerate() {

@@ -17,8 +17,8 @@ use std::collections::BTreeMap;
 const DEEPEST: usize = 64;
 /// Relative difference of the scales of a node's axes that count as one.
 const UNIFORM: f64 = 1e-4;
-/// Gaussians that nodes may place in any case; more only with a byte of the file for each. A file may show one mesh often,
-/// but 1 MB must not become 100 GB.
+/// Gaussians that nodes may place in any case; more only with a byte of the file for each. A file may show one mesh
+/// often, but 1 MB must not become 100 GB.
 const ALWAYS: usize = 1 << 16;
 
 /// Reads a .gltf with the files that [`buffers_of`] names. Errors: damaged, a file is missing, no Gaussians.
@@ -232,7 +232,7 @@ fn warnings_once(warnings: &mut Warnings, text: Option<String>) {
     warnings.append(one);
 }
 
-/// Where a node stands in the one above. Errors: axes of different scale, mirrors.
+/// Where a node is in the one above. Errors: axes of different scale, mirrors.
 fn placement(node: &Value) -> Result<Sim3> {
     let numbers = |key: &str, count: usize| -> Option<Vec<f64>> {
         let list = node[key].as_array().filter(|l| l.len() == count)?;

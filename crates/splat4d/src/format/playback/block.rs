@@ -29,7 +29,7 @@ pub(super) struct Columns {
     pub mean: [Column; 3],
     /// Seconds.
     pub center: Column,
-    /// Logarithm of the half-width (s): −∞ for zero, +∞ for ever.
+    /// Logarithm of the half-width (s): −∞ for zero, +∞ forever.
     pub log_width: Column,
     /// Logarithm of the softness (s).
     pub log_softness: Column,

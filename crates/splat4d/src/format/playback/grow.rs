@@ -109,7 +109,7 @@ impl<F: Read + Write + Seek> Growing<F> {
     }
 }
 
-/// Writes a file that grew as a finished one: an index in front, then sections in the order in which a player wants
+/// Writes a file that grew as a finished one: an index in front, then sections in the order in which a player needs
 /// them, whatever the order in which they were added. `gaussians` of `meta` is counted; `poster` as in
 /// [`write()`](super::write()). Returns the file's length, bytes.
 ///

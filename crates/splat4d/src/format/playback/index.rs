@@ -133,7 +133,7 @@ pub struct Index {
     pub file_len: u64,
     /// The JSON.
     pub meta: Meta,
-    /// All sections in the order in which a player wants them.
+    /// All sections in the order in which a player needs them.
     pub sections: Vec<Entry>,
 }
 
@@ -148,7 +148,7 @@ struct Header {
 }
 
 impl Index {
-    /// Bytes from the start that [`parse`](Self::parse) wants: 64 as long as `prefix` is shorter, then the exact
+    /// Bytes from the start that [`parse`](Self::parse) needs: 64 as long as `prefix` is shorter, then the exact
     /// number. Of a file that grows that is nearly all of it: a reader with random access uses its
     /// [`place`](Self::place).
     ///

@@ -36,7 +36,7 @@ const FASTEST: f64 = 1e15;
 struct Constants {
     /// By code of the opacity: its logit.
     logits: [f32; 1 << FULL8],
-    /// Logarithms of the half-widths zero and for ever.
+    /// Logarithms of the half-widths zero and infinity.
     instant: f64,
     for_ever: f64,
     /// Logarithms of what the encoder compares with.

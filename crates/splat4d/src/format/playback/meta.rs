@@ -146,7 +146,7 @@ impl NamedCamera {
         Self { name, world_from_camera: std::array::from_fn(cell), width, height, fx, fy, cx, cy, near }
     }
 
-    /// As the renderer wants it; none where the numbers are no camera.
+    /// For the renderer; none where the numbers are no camera.
     pub fn camera(&self) -> Option<Camera> {
         let m = &self.world_from_camera;
         let world = Se3 {

@@ -21,7 +21,7 @@ pub(super) const WIDTH_LEVELS: u32 = 253;
 pub(super) const FOR_EVER: u32 = 255;
 /// Standard deviations of its tails that a lifespan's reach holds (docs/format.md).
 const REACH: f64 = 3.0;
-/// Logarithms of a header are within ± this (docs/format.md), so that squares of what they stand for fit an f32.
+/// Logarithms of a header are within ± this (docs/format.md), so that squares of what they represent fit an f32.
 pub(super) const MAX_LOG: f64 = 40.0;
 /// A scale below this share of the Gaussian's largest is raised to it: 1/1000 of what is seen is never seen, and the
 /// block's range of scales would pay for it.
@@ -62,7 +62,7 @@ pub(crate) struct Record {
     pub mean: [f64; 3],
     /// Middle of its lifespan, seconds.
     pub center: f64,
-    /// Seconds for which it is fully there before and after; infinite: for ever.
+    /// Seconds for which it is fully there before and after; infinite: always.
     pub half_width: f64,
     /// Standard deviation of the tails of its lifespan, seconds.
     pub softness: f64,

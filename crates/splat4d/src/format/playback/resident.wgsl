@@ -4,7 +4,7 @@
 // No bindings and no entry point: plain functions, put in front of whatever shader calls them, here and in the player.
 // A thread owns one Gaussian.
 
-// Header of a block as 32 numbers, 128 bytes: the file's 24, then what the page says once for all of its blocks.
+// Header of a block as 32 numbers, 128 bytes: the file's 24, then what the page states once for all of its blocks.
 struct BlockHeader {
     f: array<vec4<f32>, 6>, // header numbers 0-3, 4-7, ... of docs/format.md
     span: f32,              // to - from of the page, s
@@ -15,7 +15,7 @@ struct BlockHeader {
     entries: u32,           // entries of the palette, at least 1
 }
 
-// What the words say about time.
+// What the words contain about time.
 struct Life {
     delta: f32,    // t - c, s
     reach: f32,    // R, s: what shift and turn are measured over

@@ -2,7 +2,8 @@
 //! ([`freetime`](crate::format::freetime)).
 //!
 //! To the properties of a plain file come time, log_duration (clips) and velocity_0..2 (units per clip), all f32;
-//! comments state `ftgs_version`, `n_frames`, `use_velocity`. Our files say clip and frame rate in a further comment.
+//! comments state `ftgs_version`, `n_frames`, `use_velocity`. Our files specify clip and frame rate in a further
+//! comment.
 //! Source: OpsiClear-4DGS/FreeTimeGsVanilla, README and player.
 
 use super::header::{Element, Header};

@@ -64,7 +64,7 @@ impl<'a> Rows<'a> {
 }
 
 /// Walks through the body and returns the rows of the `wanted` elements (in that order; `None` where the file has no
-/// such element). Stops after the last wanted one: what follows is ignored.
+/// such element). Stops after the last requested one: what follows is ignored.
 pub(super) fn find<'a, const N: usize>(
     header: &Header,
     bytes: &'a [u8],

@@ -3,7 +3,7 @@
 //! x y z, trbf_center, trbf_scale (log of s), nx ny nz, motion_0..8 (units per clip, clip², clip³), f_dc_0..2 (**plain
 //! RGB**, not SH coefficients), opacity (logit), scale_0..2 (log), rot_0..3 (wxyz), omega_0..3. The fade is
 //! exp(−((t − centre)/s)²), no ½; t runs from 0 to 1, and 1 is one frame behind the last. The full model's f_t_* feed
-//! a network that is not in the file. Our files say clip and frame rate in a comment.
+//! a network that is not in the file. Our files specify clip and frame rate in a comment.
 //! Source: oppo-us-research/SpacetimeGaussians (MIT), splaTV's importer.
 
 use super::header::{Element, Header, broken};
@@ -128,7 +128,8 @@ fn unpack(x: &[f64; WIDTH]) -> Moving {
     }
 }
 
-/// Writes a moving scene. Errors: it moves in a way that the format cannot say, or lives so and may not be fitted; the sink's.
+/// Writes a moving scene. Errors: it moves in a way that the format cannot say, or lives so and may not be fitted; the
+/// sink's.
 pub fn write_stg(scene: &Scene<f32>, options: &WriteOptions, out: &mut impl Write) -> Result<Warnings> {
     let mut warnings = Warnings::default();
     let fps = if scene.fps > 0.0 { scene.fps } else { crate::scene::time::DEFAULT_FPS };

@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 const DEEPEST: usize = 64;
 /// Time codes a second where the file does not say it (USD's fallback).
 const CODES_PER_SECOND: f64 = 24.0;
-/// Words that may stand before the type of a property.
+/// Words that may be before the type of a property.
 const QUALIFIERS: [&str; 7] = ["custom", "uniform", "varying", "config", "prepend", "append", "add"];
 
 /// An attribute.
@@ -34,7 +34,7 @@ pub(super) struct Prim {
     pub(super) attributes: BTreeMap<String, Attribute>,
 }
 
-/// A layer. Parents stand before their children.
+/// A layer. Parents are before their children.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Stage {
     pub(super) z_up: bool,

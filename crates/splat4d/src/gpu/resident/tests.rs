@@ -1,4 +1,4 @@
-//! The kernels of Gaussians of space and time against the motion model, in f64, at the edges of what numbers can stand
+//! The kernels of Gaussians of space and time against the motion model, in f64, at the edges of the number range
 //! too.
 
 use super::*;
@@ -243,7 +243,7 @@ fn steps_under_way_room_bands_and_pages_change_no_bit() {
     let [first, then, last] = far_and_near();
     let steps: Vec<(&[Camera], f64)> =
         [&first, &first, &then, &first, &last, &then, &first].iter().map(|c| (&c[..], 0.01)).collect();
-    // One after the other, with all the room they want.
+    // One after the other, with all the room they need.
     r.ahead = 0;
     stepped(&mut r, &steps);
     let (again, pairs) = (r.flights.again, r.pair_capacity());

@@ -259,7 +259,7 @@ fn sums_are_exclusive_and_stop_at_the_top() {
     }
 }
 
-/// `count` and `emit` may disagree by a rounding: here every splat is said to have a tile more than `emit` finds.
+/// `count` and `emit` may disagree by a rounding: here every splat claims one tile more than `emit` finds.
 #[test]
 fn a_pair_without_a_tile_is_in_no_list() {
     let Some(mut r) = renderer() else { return };

@@ -85,7 +85,7 @@ fn geodesic_fusion_returns_its_ends_exactly_and_rejects_jumps() {
     assert_near(&at(0.0).cov, &predicted.cov, 1e-10);
     let same = Fused::new(Fusion::Geodesic, &seen, &seen, 0.3, 1.0, 0.0).point;
     assert_eq!(same.cov, seen.cov, "where both agree nothing changes");
-    // A jump: the innovation is beyond what chance explains, and the observation stands.
+    // A jump: the innovation is beyond what chance explains, and the observation counts.
     let far = Normal { mean: predicted.mean.map(|x| x + 40.0), ..seen };
     for fusion in [Fusion::Geodesic, Fusion::Literal] {
         let state = Fused::new(fusion, &far, &predicted, 0.3, 1.0, GATE);

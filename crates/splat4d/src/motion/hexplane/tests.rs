@@ -135,7 +135,7 @@ fn more_rows_than_are_kept_are_the_same_rows() {
     let (all, some) = (splats(&p, &model, 3.3), splats(&tail, &model, 3.3));
     for j in 0..80 {
         let (a, b) = (all.read::<10>(ROWS - 10 + j, 0), some.read::<10>(j, 0));
-        // Matrix products round a row by where it stands in its chunk.
+        // Matrix products round a row by where it is in its chunk.
         assert!((0..10).all(|c| (a[c] - b[c]).abs() <= 1e-5 * a[c].abs().max(1.0)), "{a:?} {b:?}");
     }
     let (all, some) = (gradient(&p, &model, 3.3), gradient(&tail, &model, 3.3));

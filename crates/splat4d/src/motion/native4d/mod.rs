@@ -36,7 +36,7 @@ pub(crate) const COLUMNS: [(&str, usize); 3] = [("time_means", 1), ("log_time_sc
 pub const TABLE: &str = "native4d";
 /// The parts of a split live shorter by this factor: Kerbl et al. 2023 divide scales by 1.6, Yang et al. 2024 all four.
 const SPLIT_SHRINK: f64 = 1.6;
-/// The shortest life that numbers can stand, seconds.
+/// The shortest lifespan within the number range, seconds.
 pub(crate) const SHORTEST: f64 = 1e-6;
 /// The longest: a day.
 pub(crate) const LONGEST: f64 = 86_400.0;

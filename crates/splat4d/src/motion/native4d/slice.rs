@@ -259,7 +259,7 @@ pub(super) fn slice_backward<F: Real>(
     // h·w, zero where the exponent has stopped.
     let fade = select(p.near, d[SPLAT_OPACITY] * o * life, F::ZERO);
     let d_tau = p.inverse * (dot(d_mean, p.v) - fade * p.tau);
-    // Where c is free, the terms of dL/dc join those of dL/dv: K stands in L's place, and −τ·dτ/c is left along ℓ.
+    // Where c is free, the terms of dL/dc join those of dL/dv: K is in L's place, and −τ·dτ/c is left along ℓ.
     let free = p.c > frame.floor;
     let side: [F; 3] = each(|i| p.inverse * (d_mean[i] * p.tau - two * dot(m[i], p.v)));
     let along = select(free, -p.tau * p.inverse * d_tau, F::ZERO);

@@ -1,4 +1,4 @@
-//! Equivariance and its negative controls, permutations, baked ticks, hostile specs; the fit stands in `study`.
+//! Equivariance and its negative controls, permutations, baked ticks, hostile specs; the fit is in `study`.
 
 mod study;
 

@@ -155,7 +155,7 @@ fn any_number_of_threads_and_kept_activations_give_the_same_bits() {
 
 #[test]
 fn a_shift_is_an_input_that_all_rows_share() {
-    // The same network with the shared input standing in every row.
+    // The same network with the shared input repeated in every row.
     let shape = MlpShape { inputs: 3, width: 6, layers: 2, skip: Some(0), outputs: 2 };
     let (p, mlp) = made::<f64>(shape);
     let x = numbers::<f64>(5 * 3, 1);

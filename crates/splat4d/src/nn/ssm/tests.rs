@@ -200,7 +200,7 @@ fn uneven_ticks_sample_the_same_response_to_first_order() {
         let other = Discrete::<f64>::new(shape, &w, &moved);
         let a = scan(&steady, Direction::Forward, &even, &steady.rest()).0;
         let b = scan(&other, Direction::Forward, &uneven, &other.rest()).0;
-        // Every second tick stands at the same moment.
+        // Every second tick is at the same moment.
         (1..ticks).step_by(2).map(|t| (a[t][0] - b[t][0]).abs()).fold(0.0, f64::max)
     };
     let (coarse, fine) = (error(80), error(160));
@@ -209,8 +209,8 @@ fn uneven_ticks_sample_the_same_response_to_first_order() {
 
 #[test]
 fn missing_gradients_of_chunks_and_ticks_equal_zero_gradients() {
-    // Marks and chunks give the same gradient as one chunk would: a scan shorter than a chunk, and the same as a part of
-    // a longer one whose rest has no gradient.
+    // Marks and chunks give the same gradient as one chunk would: a scan shorter than a chunk, and the same as a part
+    // of a longer one whose rest has no gradient.
     let of = Discrete::new(SHAPE, &weights_of(SHAPE, 15), &[1.0]);
     let long = 3 * CHUNK + 5;
     let u = random(3 * long, 16);

@@ -21,7 +21,7 @@ impl Headed {
         let numbers =
             |k: u64, count: usize| -> Vec<f64> { (0..count).map(|i| 0.7 * rng.fork(k).normal(i as u64)).collect() };
         let mut first: Vec<f64> = numbers(2, HIDDEN * INPUTS);
-        // The camera stands far down z: every hidden number is above zero somewhere.
+        // The camera is far down z: every hidden number is above zero somewhere.
         first.iter_mut().skip(FURTHER + 2).step_by(INPUTS).for_each(|w| *w = -1.0);
         Self { scene, first, second: numbers(3, 3 * HIDDEN) }
     }

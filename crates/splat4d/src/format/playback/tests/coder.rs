@@ -12,7 +12,7 @@ fn pages(n: usize, degree: usize, seed: u64) -> Pages {
 }
 
 /// Pages that have been trained for a while: every number of every table has moved a little, quaternions are no longer
-/// unit, and some Gaussians die that lived for ever.
+/// unit, and some Gaussians with infinite lifespans get finite ones.
 fn trained(n: usize, degree: usize, seed: u64) -> Pages {
     let mut pages = pages(n, degree, seed);
     for (l, layer) in pages.layers.iter_mut().enumerate() {
@@ -125,7 +125,7 @@ fn pages_as_they_are_come_back_almost_unchanged() {
                 (moved, total) = (moved + usize::from((x - y).abs() > 1e-5 * (1.0 + x.abs())), total + 1);
             }
         }
-        // A lifespan that as decoded spans all of its page becomes one for ever, and moves its centre.
+        // A lifespan that as decoded spans all of its page becomes infinite, and moves its centre.
         assert!(1000 * moved < total, "{moved} of {total} numbers moved");
     }
 }
