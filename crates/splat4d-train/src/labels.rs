@@ -25,7 +25,7 @@ pub const ROUNDS: usize = 4;
 pub const MOST_PICTURES: usize = 240;
 /// Weight in pixels of the even vote that every Gaussian has: what no image shows keeps no label.
 const PRIOR: f64 = 1e-3;
-/// Probabilities are kept this far from 0: a wrong mask must not forbid a label for ever.
+/// Probabilities are kept this far from 0: a wrong mask must not forbid a label forever.
 const LEAST: f64 = 1e-6;
 
 /// How well labels are learnt.

@@ -1,5 +1,5 @@
-//! A motion model from outside the library trains and plays: the one of `splat4d`'s example `own_motion`, with a program of
-//! its own. Its mathematics and this file are all that know it.
+//! A motion model from outside the library trains and plays: the one of `splat4d`'s example `own_motion`, with a
+//! program of its own. Its mathematics and this file are all that know it.
 
 use splat4d::Result;
 use splat4d::bake::{Options, bake};
@@ -121,7 +121,7 @@ fn a_model_from_outside_trains_and_its_file_plays() {
         fixed_cameras: CAMERAS,
         ..recipe.plan()
     };
-    // The grass as it stands at rest, grey.
+    // The grass as it is at rest, grey.
     let mut seeds = Seeds::default();
     let rest = &truth.layers[0].params;
     for row in 0..rest.len() {

@@ -139,7 +139,7 @@ fn a_turned_world_needs_no_new_training() {
         println!("{motion}: {before:.3} dB, by its frame in the turned world {after:.3}");
         assert!((after - before).abs() < ROUNDING, "{motion}: {before} and {after} dB");
         assert!(psnr(&scene, &larger, &recipe) < before - LOST, "{motion}: nothing was turned");
-        // Gaussians and nodes stand in the turned world, and the model is asked there. What nodes know of their
+        // Gaussians and nodes are in the turned world, and the model is asked there. What nodes know of their
         // surroundings is taken again, as it is wherever nodes are moved: also in the world that was not turned, since
         // nodes learn.
         let ask = |g: &Sim3, capture: &Path| {

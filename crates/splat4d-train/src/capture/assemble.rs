@@ -1,4 +1,4 @@
-//! From what the files say to a checked capture: poses, sizes, files, duplicates, split, clock.
+//! From what the files specify to a checked capture: poses, sizes, files, duplicates, split, clock.
 
 use super::account::Severity;
 use super::account::{Aspect, Remark, first_names};
@@ -139,7 +139,7 @@ const BEFORE_POINTS: f64 = 0.5;
 /// Some distance there must be, of the extent: the projection divides by it.
 const SMALLEST_NEAR: f64 = 1e-3;
 
-/// Of the wanted share, where no points say how near things come.
+/// Of the requested share, where no points indicate how near things come.
 const UNKNOWN_DEPTH: f64 = 0.25;
 
 /// How near splats are rendered, scene units: this share of the extent, or half way to the nearest of the capture's
@@ -224,7 +224,7 @@ fn check_frame(frame: &mut RawFrame, camera: &str, options: &CaptureOptions) -> 
 }
 
 /// Cameras without frames would be rows without meaning everywhere else. `listed` are those that had some before
-/// missing images were skipped, which was said.
+/// missing images were skipped, which was reported.
 fn drop_unused_cameras(take: &mut RawCapture, listed: &BTreeSet<usize>) {
     let used: BTreeSet<usize> = take.frames.iter().map(|f| f.camera).collect();
     let unused: Vec<&str> =
@@ -291,7 +291,7 @@ fn warn_of_shared(shared: usize, warnings: &mut Vec<String>) {
     }
 }
 
-/// One camera takes one image at a time. Where the data set names none, one "camera" may stand for several, so that
+/// One camera takes one image at a time. Where the data set names none, one "camera" may represent several, so that
 /// the pose counts too.
 fn check_duplicates(take: &mut RawCapture, cameras: &[Rig]) -> Result<()> {
     let mut groups: BTreeMap<(usize, u64), Vec<usize>> = BTreeMap::new();
@@ -428,12 +428,12 @@ fn fits(size: (usize, usize), camera: &Camera) -> bool {
 /// Compares the sizes of the images with their intrinsics, and scales those where images were resized; returns
 /// whether any image has an alpha channel, for each whether its EXIF orientation is applied, and those of which
 /// sizes do
-/// not say so.
+/// not specify it.
 fn fit_pictures(take: &mut RawCapture, options: &CaptureOptions) -> Result<(bool, Vec<bool>, Vec<usize>)> {
     let mut alpha = false;
     let mut resized = Vec::new();
     let mut upright = Vec::with_capacity(take.frames.len());
-    // Turned images whose sizes say which pixels are described, and those whose sizes do not.
+    // Turned images whose sizes specify which pixels are described, and those whose sizes do not.
     let (mut by_size, mut unsure) = ([0; 2], Vec::new());
     // COLMAP reads pixels as they are stored, and so do the scripts that write these layouts.
     let of_colmap = matches!(take.kind, CaptureKind::Colmap | CaptureKind::N3dv | CaptureKind::Llff);
@@ -515,7 +515,7 @@ fn report_orientation(take: &mut RawCapture, as_stored: usize, by_size: [usize; 
     say(by_size[1], "It is applied: only the upright images have the size of their intrinsics.");
 }
 
-/// Decides by points and features whether EXIF orientations are applied where sizes do not say so, and states it.
+/// Decides by points and features whether EXIF orientations are applied where sizes do not specify it, and states it.
 fn settle_orientation(capture: &mut Capture, unsure: &[usize]) {
     if unsure.is_empty() {
         return;

@@ -1,5 +1,5 @@
-//! What the numbers of a pose mean: direction, camera axes, order of rows and of quaternions; and poses that are written in
-//! another convention than their layout states (`capture.poses`).
+//! What the numbers of a pose mean: direction, camera axes, order of rows and of quaternions; and poses that are
+//! written in another convention than their layout states (`capture.poses`).
 
 use crate::settings::Value;
 use splat4d::math::se3::transpose;
@@ -23,8 +23,8 @@ impl Convention {
     pub(crate) const COLMAP: Self = Self { world_to_camera: true, opengl: false, quaternions: true };
     /// World to camera, OpenCV axes, matrices.
     pub const OPENCV: Self = Self { quaternions: false, ..Self::COLMAP };
-    /// Nerfies: the rotation of world to camera and the camera's position, OpenCV axes: what is mistaken there is the rotation's
-    /// direction, as with camera to world.
+    /// Nerfies: the rotation of world to camera and the camera's position, OpenCV axes: what is mistaken there is the
+    /// rotation's direction, as with camera to world.
     pub(crate) const NERFIES: Self = Self { world_to_camera: false, opengl: false, quaternions: false };
     /// NeRF's files: camera to world, OpenGL axes.
     pub(crate) const NERF: Self = Self { world_to_camera: false, opengl: true, quaternions: false };
@@ -54,7 +54,7 @@ impl Convention {
         pose
     }
 
-    /// `cam_from_world` in OpenCV axes of a pose that is written as `poses` say.
+    /// `cam_from_world` in OpenCV axes of a pose that is written as `poses` specify.
     pub(super) fn read_as(self, mut pose: Se3, poses: Poses) -> Result<Se3> {
         if poses.xyzw {
             if !self.quaternions {
@@ -74,13 +74,13 @@ impl Convention {
         Ok(Self { opengl: poses.opengl.unwrap_or(self.opengl), ..self }.read(pose))
     }
 
-    /// What a pose that was read as this convention would be, had it been written as `poses` say.
+    /// What a pose that was read as this convention would be, had it been written as `poses` specify.
     /// Errors: quaternions in a layout that has none.
     pub(crate) fn reread(self, cam_from_world: &Se3, poses: Poses) -> Result<Se3> {
         self.read_as(self.write(cam_from_world), poses)
     }
 
-    /// What is read of a pose that is written as `poses` say, while this convention is stated.
+    /// What is read of a pose that is written as `poses` specify, while this convention is stated.
     #[cfg(test)]
     pub(crate) fn misread(self, truth: &Se3, poses: Poses) -> Se3 {
         let mut raw = Self { opengl: poses.opengl.unwrap_or(self.opengl), ..self }.write(truth);

@@ -80,7 +80,7 @@ fn spread(pairs: &[(Se3, Se3)]) -> f64 {
 }
 
 /// The rotation that all cameras' axes agree on, then scale and translation of their places: axes are more reliable
-/// than positions where cameras stand in a row.
+/// than positions where cameras are in a row.
 fn fit(pairs: &[(Se3, Se3)]) -> Sim3 {
     let mut cov = [[0.0; 3]; 3];
     for (a, b) in pairs {

@@ -1,5 +1,6 @@
-//! Exports of capture programs and telephones: Metashape, RealityScan, Polycam, Record3D. Each is a file that states where
-//! poses and images are; what is common to them is here. They were built from public documentation and synthetic samples.
+//! Exports of capture programs and telephones: Metashape, RealityScan, Polycam, Record3D. Each is a file that states
+//! where poses and images are; what is common to them is here. They were built from public documentation and synthetic
+//! samples.
 
 mod metashape;
 mod polycam;
@@ -70,8 +71,8 @@ struct Said {
     notes: Vec<String>,
 }
 
-/// Sorted names of a folder's images, one of each name whatever its ending, and a remark about those left out. Errors: images
-/// of one name differ in size.
+/// Sorted names of a folder's images, one of each name whatever its ending, and a remark about those left out. Errors:
+/// images of one name differ in size.
 fn images_of(folder: &Path) -> Result<(Vec<String>, Option<String>)> {
     let mut twins = Twins::default();
     let kept = twins.single(rig::image_names(folder).iter().map(|name| folder.join(name)).collect())?;
@@ -84,7 +85,7 @@ fn opengl_pose(rows: &[[f64; 4]; 4]) -> Result<Se3> {
     Convention::NERF.read_as(pose::checked(Se3::from_rows(rows))?, Poses::STATED)
 }
 
-/// The capture of some shots: of one moving camera where they have times, else as their names say.
+/// The capture of some shots: of one moving camera where they have times, else as their names specify.
 fn take(root: &Path, mut shots: Vec<Shot>, said: Said, options: &CaptureOptions) -> Result<RawCapture> {
     let Said { kind, convention, fps, points, up, mut warnings, mut notes } = said;
     let fps = options.fps.or(fps).unwrap_or(DEFAULT_FPS);
@@ -124,7 +125,8 @@ fn take(root: &Path, mut shots: Vec<Shot>, said: Said, options: &CaptureOptions)
 /// How folders begin whose images are not the photos, in addition to those of masks: depth, reduced copies.
 const OTHERS: [&str; 3] = ["depth", "images_", "."];
 
-/// Images by their names without endings, however these are spelled; from a folder, and folders down to two levels below.
+/// Images by their names without endings, however these are spelled; from a folder, and folders down to two levels
+/// below.
 struct Images {
     found: BTreeMap<String, Vec<PathBuf>>,
     root: PathBuf,

@@ -21,7 +21,7 @@ const MODELS: &[&str] = &[
     colmap::WORKSPACES[2],
     colmap::WORKSPACES[3],
 ];
-/// A model's other files, which stand for it as its cameras do.
+/// A model's other files, which represent it as its cameras do.
 const MODEL_FILES: [&str; 4] = ["images.bin", "images.txt", "points3D.bin", "points3D.txt"];
 
 /// N3DV's marker, which single-camera LLFF folders have too.
@@ -110,7 +110,8 @@ fn is_model(path: &Path, marker: &str, file: &Path) -> bool {
     if marker != colmap::SPARSE {
         return colmap::is_marker(file);
     }
-    // An empty `sparse` is said to be empty, and one without images to have none; but workspaces with images go first.
+    // An empty `sparse` is reported as empty, and one without images as having none; but workspaces with images go
+    // first.
     let own_images = |workspace: &&str| {
         let model = path.join(workspace);
         colmap::is_model(&model) && model.parent().is_some_and(|above| above != path && colmap::has_images(above))

@@ -214,7 +214,7 @@ impl Lookup {
         self.chosen.clone().unwrap_or_else(|| self.root.join(name))
     }
 
-    /// The image that `name` stands for, below the first of `bases` that has it. `None`: it is missing. Errors: several
+    /// The image that `name` represents, below the first of `bases` that has it. `None`: it is missing. Errors: several
     /// files fit, or two names fit one file.
     pub(super) fn image(&self, bases: &[PathBuf], name: &str) -> Result<Option<PathBuf>> {
         let plain = name.strip_prefix("./").unwrap_or(name);

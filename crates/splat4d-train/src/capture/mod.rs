@@ -78,7 +78,7 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// A reader: the capture's folder and the marker file that was found, to what the files say.
+/// A reader: the capture's folder and the marker file that was found, to what the files specify.
 type Reader = fn(&Path, &Path, &CaptureOptions) -> Result<RawCapture>;
 
 /// The list of layouts: a reader is its file, its name in [`CaptureKind`] and an entry here. Marker files (or folders)
@@ -228,7 +228,7 @@ pub struct Capture {
     pub cameras: Vec<Rig>,
     /// Whether the data set, or the names of its images (`cam07`), separate cameras; else an entry is one camera's
     /// photo of a
-    /// time, or stands for many.
+    /// time, or represents many.
     pub named: bool,
     /// All images, or those that were requested ([`CaptureOptions::frames`]).
     pub frames: Vec<Frame>,
@@ -279,7 +279,7 @@ struct RawCapture {
     root: PathBuf,
     kind: CaptureKind,
     cameras: Vec<String>,
-    /// Whether the data set distinguishes cameras; else one entry may stand for many.
+    /// Whether the data set distinguishes cameras; else one entry may represent many.
     named: bool,
     timing: Timing,
     frames: Vec<RawFrame>,

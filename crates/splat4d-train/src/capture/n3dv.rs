@@ -124,7 +124,7 @@ pub fn rows_of(names: &[String], rows: usize) -> Option<Vec<usize>> {
     (fit && names.len() < rows).then_some(numbers)
 }
 
-/// What there is to say about the rows that cameras have.
+/// Remarks about the rows that cameras have.
 pub fn about_rows(names: &[String], which: &[usize], rows: usize) -> Vec<(Severity, String)> {
     let mut out = Vec::new();
     if which.len() < rows {
@@ -160,7 +160,7 @@ fn numbers(folders: &[Folder], account: &mut Account) -> Vec<Vec<usize>> {
     let Some(mut told) = told else { return in_order() };
     let all: BTreeSet<usize> = told.iter().flatten().copied().collect();
     let (Some(&first), Some(&last)) = (all.first(), all.last()) else { return in_order() };
-    // Cameras that number their frames apart, or share a number, say nothing of each other's time.
+    // Cameras that number their frames apart, or share a number, carry no information about each other's time.
     let apart = (0..told.len()).any(|c| {
         let others: BTreeSet<usize> =
             told.iter().enumerate().filter(|(k, _)| *k != c).flat_map(|(_, n)| n.clone()).collect();
@@ -270,7 +270,7 @@ mod tests {
         let lost = names(&["cam00", "cam01", "cam03"]);
         assert_eq!(rows_of(&lost, 4), Some(vec![0, 1, 3]));
         assert!(said(&lost, 4)[0].1.contains("1 of 4 cameras"), "{:?}", said(&lost, 4));
-        // Numbers that cannot be rows, or do not count from 0, say nothing.
+        // Numbers that cannot be rows, or do not count from 0, carry no information.
         assert_eq!(rows_of(&all, 4), None);
         assert_eq!(rows_of(&names(&["cam01", "cam02"]), 3), None);
         assert_eq!(rows_of(&names(&["left", "right"]), 3), None);

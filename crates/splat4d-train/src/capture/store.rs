@@ -357,7 +357,7 @@ impl Shared {
     }
 }
 
-/// White: stands in where an image has alpha although the capture's first images had none.
+/// White: the replacement where an image has alpha although the capture's first images had none.
 const WHITE: [f32; 3] = [1.0; 3];
 
 /// Decodes a frame's image, mask, depth and flow and brings them to the frame's view.

@@ -40,7 +40,7 @@ impl Prepared {
         if self.plan.common.appearance.antialias { Antialias::On } else { Antialias::Off }
     }
 
-    /// How the settings want Gaussians scored. Errors: names that are none.
+    /// How the settings score Gaussians. Errors: names that are none.
     pub(super) fn score_config(&self) -> Result<ScoreConfig> {
         let s = &self.settings;
         Ok(ScoreConfig {
@@ -98,7 +98,7 @@ fn fading(settings: &Compression) -> Option<Box<dyn ParamLoss<f32>>> {
     (weight > 0.0).then(|| Box::new(MeanOpacity { weight }) as Box<dyn ParamLoss<f32>>)
 }
 
-/// Scores, prunes, and makes masks where they are wanted already.
+/// Scores, prunes, and makes masks where they are needed already.
 fn pruning(prepared: Prepared, share: f64, filter: bool) -> Hook {
     Box::new(move |scene: &mut Scene<f32>, progress| {
         if share > 0.0 {

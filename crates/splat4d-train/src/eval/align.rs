@@ -1,5 +1,5 @@
-//! Alignment of views that were held out: their poses and clocks alone are fitted to a scene that stays as it is, so that a
-//! scene whose cameras were refined is not judged by where the others were said to stand.
+//! Alignment of views that were held out: their poses and clocks alone are fitted to a scene that stays as it is, so
+//! that a scene whose cameras were refined is not judged by where the others were declared to be.
 
 use crate::Result;
 use crate::capture::{Capture, ImageStore};
@@ -32,7 +32,7 @@ pub struct Align {
 }
 
 impl Align {
-    /// As a run with this recipe wants it; `None` where it refined nothing.
+    /// As in a run with this recipe; `None` where it refined nothing.
     pub fn of(capture: &Capture, recipe: &Recipe) -> Option<Self> {
         let learnt = learnable(recipe);
         let wanted = (learnt.poses || learnt.times) && learnt.align_steps > 0 && !capture.train.is_empty();

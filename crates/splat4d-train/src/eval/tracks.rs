@@ -163,7 +163,7 @@ mod tests {
     fn points_are_carried_by_the_gaussians_that_were_nearest_at_first() {
         let mut params = Params::new(3, 1, &[]);
         let times = vec![0.0, 0.1, 0.2];
-        // The last one is faint and stands in the way.
+        // The last one is faint and is in the way.
         for (r, o) in [(0, 3.0), (1, 3.0), (2, -3.0)] {
             params[GEOMETRY].write(r, 0, [r as f32, 0.0, 0.0, 1.0]);
             params[GEOMETRY].set(r, OPACITY, o);

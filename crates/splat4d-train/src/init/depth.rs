@@ -12,12 +12,13 @@ use std::f64::consts::TAU;
 
 /// Images that points are taken from and held against, at most, evenly chosen.
 const VIEWS: usize = 100;
-/// Points a wanted one that are static.
+/// Points per requested one that are static.
 const CANDIDATES: usize = 4;
 /// Pixels of an image of which is asked whether they move, at most.
 const ASKED: usize = 20_000;
-/// As a share of the wanted points, those on dynamic regions that are alive at a time: lives are as wide as that takes,
-/// within bounds in times between times. Shorter ones leave holes between times; over longer ones velocities change.
+/// As a share of the requested points, those on dynamic regions that are alive at a time: lives are as wide as that
+/// takes, within bounds in times between times. Shorter ones leave holes between times; over longer ones velocities
+/// change.
 const ALIVE_SHARE: f64 = 0.15;
 const LIFE: [f64; 2] = [0.5, 2.0];
 
@@ -27,7 +28,7 @@ struct Candidate {
     pixel: usize,
     point: [f64; 3],
     color: [f32; 3],
-    /// Whether it may stand for what is still.
+    /// Whether it may represent what is still.
     still: bool,
 }
 

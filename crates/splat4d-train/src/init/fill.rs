@@ -26,7 +26,7 @@ const RIDGE: f64 = 0.05;
 const BORDER: f64 = 0.15;
 /// Views that are covered, at most, evenly chosen.
 const VIEWS: usize = 100;
-/// Foreground in the masks moves: other points stand for it.
+/// Foreground in the masks moves: other points represent it.
 const FOREGROUND: f32 = 0.5;
 
 /// About `count` points on the surfaces that `known` suggests; none where no camera sees enough of them.

@@ -11,7 +11,7 @@ use splat4d::math::{Rng, median_by};
 use splat4d::scene::Camera;
 use std::collections::BTreeMap;
 
-/// Candidates a wanted point: the hull is a small part of the box.
+/// Candidates per requested point: the hull is a small part of the box.
 const CANDIDATES: usize = 40;
 /// Rounds of narrowing the box.
 const ROUNDS: u64 = 4;
@@ -33,10 +33,10 @@ const MOVING_CAMERAS: usize = 5;
 const MOVING_PICTURE: f64 = 0.5;
 /// A point must be seen by at least so many images.
 const MIN_VIEWS: usize = 2;
-/// One moving camera: images of so many times around stand in for other cameras.
+/// One moving camera: images of so many times around replace other cameras.
 const MONOCULAR_PICTURES: usize = 60;
 
-/// About `count` points over all `times`. For a still scene (`moving` false) masks of the first time stand for all.
+/// About `count` points over all `times`. For a still scene (`moving` false) masks of the first time represent all.
 pub(crate) fn carve(
     frames: &dyn Frames,
     volume: &Volume,

@@ -38,7 +38,7 @@ pub struct Seeds {
 }
 
 impl Seeds {
-    /// Points of a cloud, which says nothing of velocities.
+    /// Points of a cloud, which carries no information of velocities.
     pub(crate) fn of(cloud: &PointCloud) -> Self {
         let velocities = vec![[0.0; 3]; cloud.points.len()];
         let (points, colors, times) = (cloud.points.clone(), cloud.colors.clone(), cloud.times.clone());
@@ -82,7 +82,7 @@ impl Seeds {
         self.retain(|i, _| keep[i]);
     }
 
-    /// Keeps those of which the rule says so.
+    /// Keeps those that the rule selects.
     fn retain(&mut self, rule: impl Fn(usize, &Self) -> bool) {
         let old = std::mem::take(self);
         self.life = old.life;
@@ -171,7 +171,7 @@ impl Value for Source {
 
 /// A random colour would have to be unlearnt; grey is the least wrong.
 const UNKNOWN_COLOR: [f32; 3] = [0.5; 3];
-/// A lifespan this many clips wide is practically for ever: at the clip's ends σ is still above 0.96.
+/// A lifespan this many clips wide is practically forever: at the clip's ends σ is still above 0.96.
 const LONG_LIFE_CLIPS: f64 = 2.0;
 /// One keyframe of initial points about every so many frames.
 const FRAMES_PER_KEYFRAME: usize = 5;
@@ -268,7 +268,7 @@ pub(crate) fn one_moment(
     let single = InitSettings { keyframes: settings.keyframes.max(1), ..settings.clone() };
     let mut out = seeds(plan, &single, frames, points, true)?;
     if out.life.take().is_some() {
-        // Depth maps show every time: of dynamic regions only one is wanted.
+        // Depth maps show every time: of dynamic regions only one is needed.
         let middle = 0.5 * (plan.clip[0] + plan.clip[1]);
         let nearest =
             out.times.iter().flatten().copied().min_by(|a, b| (a - middle).abs().total_cmp(&(b - middle).abs()));

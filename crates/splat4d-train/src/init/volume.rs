@@ -55,7 +55,7 @@ const ASKED: usize = 100;
 /// A random point must be seen by this share of the cameras that see the best seen one: what only few see is hardly
 /// learnt, and hangs as haze in front of views that were not trained on.
 const SEEN_SHARE: f64 = 0.25;
-/// Candidates a wanted point, at most.
+/// Candidates per requested point, at most.
 const CANDIDATES: usize = 32;
 
 /// Uniform points of the box where cameras look; with `clip`, each at a random time of it. Fewer than `count` if

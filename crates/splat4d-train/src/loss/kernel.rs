@@ -223,7 +223,7 @@ impl<'a, F: Real> Tile<'a, F> {
         (self.job.first + row).checked_sub(halo).filter(|&y| y < self.job.height)
     }
 
-    /// Weights of the image row that derivative row `row` stands for.
+    /// Weights of the image row that derivative row `row` represents.
     #[inline(always)]
     fn fill_weights(&self, s: &mut Scratch<F>, row: usize) {
         let [start, end] = inside(self.job.width, self.x0, DERIVATIVE_HALO, self.columns + 2 * DERIVATIVE_HALO);
@@ -418,7 +418,7 @@ fn vertical<F: Real, const FMA: bool, const MAPS: usize, const PHASE: usize>(
     columns: [usize; 2],
     out: &mut Rows<F, MAPS, GROUP>,
 ) {
-    // Where the group stands in the ring is a constant of each copy of the loop, which then needs one pointer, not 14.
+    // Where the group is in the ring is a constant of each copy of the loop, which then needs one pointer, not 14.
     match head % RING / GROUP {
         0 => vertical_at::<F, FMA, MAPS>(taps, ring, PHASE, columns, out),
         1 => vertical_at::<F, FMA, MAPS>(taps, ring, GROUP + PHASE, columns, out),

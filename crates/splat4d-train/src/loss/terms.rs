@@ -1,5 +1,5 @@
 //! The contracts of losses that do not look at an image: on splats at several times, and on raw parameters; and of what
-//! may stand between parameters and images, a [`Codec`].
+//! may be between parameters and images, a [`Codec`].
 
 use crate::Result;
 use splat4d::layers::Scene;
@@ -20,7 +20,7 @@ pub struct StepInfo {
     pub progress: f64,
 }
 
-/// The rows and times that a loss over several times wants to see.
+/// The rows and times that a loss over several times needs to see.
 #[derive(Clone, Debug)]
 pub struct Probe {
     /// Which layer.

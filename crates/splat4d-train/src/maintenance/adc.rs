@@ -1,4 +1,4 @@
-//! Adaptive density control: clone small and split large Gaussians whose screen position still wants to move; prune the
+//! Adaptive density control: clone small and split large Gaussians whose screen position still needs to move; prune the
 //! transparent. Source: Kerbl et al. 2023 §5.2 and appendix B; the clone's opacity as revised by Bulò 2024.
 //!
 //! Gaussians with a lifespan and a path of their own that leave their own place within that life are split in time
@@ -151,7 +151,7 @@ impl AdcSettings {
         let keep: Vec<bool> = (0..rows).map(|r| !is_dead(scene, layer, r, limits.min_opacity, spans[r])).collect();
         let removed = keep.iter().filter(|k| !**k).count();
         *spare += removed;
-        // Those that want it most come first when the cap leaves no room for all.
+        // Those that need it most come first when the cap leaves no room for all.
         let mut wanting: Vec<(f32, u32)> = (0..rows)
             .filter(|&r| keep[r] && f64::from(stats.gradient(layer, r)) >= self.grad_threshold)
             .map(|r| (stats.gradient(layer, r), r as u32))

@@ -1,10 +1,10 @@
 //! Guided sampling: where images are worst and there are too few Gaussians to mend them, new ones are put along the
 //! rays
-//! of the worst patches. It finds what no initial point stood for, far backgrounds above all.
+//! of the worst patches. It finds what no initial point represented, far backgrounds above all.
 //!
-//! Source: Li et al. 2024 (STG) §4.2 and its released settings: of the views that were looked at the two worst; patches of
-//! 16 pixels of which 85 % are among the worst 40 % of the pixels, a border of 10 % left out; every second pixel; depths
-//! between 0.7 and 7.5 times the largest seen, with 5 % of jitter; opacity 0.1.
+//! Source: Li et al. 2024 (STG) §4.2 and its released settings: of the views that were looked at the two worst; patches
+//! of 16 pixels of which 85 % are among the worst 40 % of the pixels, a border of 10 % left out; every second pixel;
+//! depths between 0.7 and 7.5 times the largest seen, with 5 % of jitter; opacity 0.1.
 
 use super::{At, Change, Context, Maintenance, RunOrder, logit};
 use crate::Result;
@@ -262,7 +262,7 @@ mod tests {
         let g = &s.layers[0].params[GEOMETRY];
         for row in 200..s.len() {
             let mean = g.read::<3>(row, 0).map(f64::from);
-            // Somewhere it stands at the middle of a pixel of a frame, in that pixel's colour.
+            // Somewhere it is at the middle of a pixel of a frame, in that pixel's colour.
             let dc = s.layers[0].params[SH].read::<3>(row, 0);
             let found = (0..12).any(|i| {
                 let Some(([u, v], _)) = frames.camera(i).project(mean) else { return false };

@@ -89,7 +89,7 @@ impl Merge {
 }
 
 impl MergeSettings {
-    /// One round on one layer: changes the rows that stay, and says which do. `None`: there is no pair.
+    /// One round on one layer: changes the rows that stay, and states which do. `None`: there is no pair.
     fn edit(&self, train_state: &mut TrainState, layer: usize) -> Option<RowEdit> {
         let n = train_state.scene().layers[layer].params.len();
         let pairs = self.pairs(train_state.scene(), layer);

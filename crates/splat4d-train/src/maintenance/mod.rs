@@ -194,7 +194,7 @@ impl Context<'_> {
 pub enum RunOrder {
     /// Nodes, while statistics of the Gaussians that follow them are still there.
     Nodes,
-    /// Gaussians are put where images want them; before densification, which begins the statistics again.
+    /// Gaussians are put where images need them; before densification, which begins the statistics again.
     Place,
     /// The cloud grows.
     Grow,
@@ -202,7 +202,7 @@ pub enum RunOrder {
     Sort,
     /// Removal of what has little importance.
     Remove,
-    /// Merging of what stands in one place.
+    /// Merging of what is in one place.
     Merge,
     /// Numbers are set back.
     Reset,

@@ -1,4 +1,4 @@
-//! Periodic relocation, next to any strategy: the faintest Gaussians go where the image still wants to change, a few
+//! Periodic relocation, next to any strategy: the faintest Gaussians go where the image still needs to change, a few
 //! at a
 //! time, so that none is wasted, also after densification has ended.
 //!

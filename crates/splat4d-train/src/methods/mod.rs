@@ -352,7 +352,7 @@ pub trait Method: Send + Sync {
     /// The lifespan its Gaussians have: the recipe's. Where it leaves the choice to the model, those of a cloud that
     /// lasts ([`one_moment`](Self::one_moment)) may come and go before fixed cameras, which see that a place is empty
     /// before something comes there (docs/models.md); a camera that moves sees every place at few times, and lifespans
-    /// gain nothing. Others, and those whose future is to be predicted, are there for ever.
+    /// gain nothing. Others, and those whose future is to be predicted, are there forever.
     fn life(&self, plan: &TrainContext) -> LifeKind {
         let lasting = self.one_moment(plan) && plan.fixed_cameras > 0 && !plan.predicted;
         plan.common.life.kind.unwrap_or(if lasting { LifeKind::Interval } else { LifeKind::Infinite })

@@ -97,7 +97,7 @@ impl<F: Real> Moments<F> {
         }
     }
 
-    /// Follows a row edit of `p` (which may stand before or after its own gather): rows that are not `Kept` start
+    /// Follows a row edit of `p` (which may be before or after its own gather): rows that are not `Kept` start
     /// again.
     pub(crate) fn edit(&mut self, p: &Params<F>, edit: &RowEdit) {
         for key in p.keys().filter(|&k| p.info(k).space == edit.space) {
@@ -117,9 +117,9 @@ impl<F: Real> Moments<F> {
 
     /// One step. `rates[key]` holds a rate a column (0: frozen); a key without an entry rests.
     ///
-    /// Gradients of the tables that learn are zero afterwards; what rests is left to [`Grads::clear`]. Returns the tables
-    /// in which a number was not finite: their parameters are then not to be used, and the gradient of the rows to blame
-    /// is kept.
+    /// Gradients of the tables that learn are zero afterwards; what rests is left to [`Grads::clear`]. Returns the
+    /// tables in which a number was not finite: their parameters are then not to be used, and the gradient of the rows
+    /// to blame is kept.
     pub fn step(
         &mut self,
         p: &mut Params<F>,

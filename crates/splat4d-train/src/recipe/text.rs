@@ -166,7 +166,7 @@ impl Recipe {
         text
     }
 
-    /// The key of what stands in a table: its field, or a setting of it by its name without a table.
+    /// The key of what is in a table: its field, or a setting of it by its name without a table.
     fn inside(&self, table: &str, field: &str) -> String {
         let home = FLAT.iter().find(|(flat, key)| *flat == field && key.split('.').next() == Some(table));
         let key = format!("{table}.{field}");

@@ -18,7 +18,7 @@ const LOOKS: f64 = 32.0;
 const TOLERANCE: f64 = 0.015;
 /// Weight of what was measured since the last look in the machine's speed: one busy time is not taken for the rest.
 const NEWEST: f64 = 0.5;
-/// Steps of the schedule that a step may stand for, and steps that may stand for one of the schedule: with fewer the
+/// Steps of the schedule that a step may represent, and steps that may represent one of the schedule: with fewer the
 /// scene would be taken apart by rates and densifications meant for many.
 const MOST: usize = 8;
 /// Of the time, what is too late: more than `--minutes` promises.
@@ -26,7 +26,7 @@ const LATE: f64 = 1.1;
 /// Of the time, the most that timing steps may take before the run.
 pub(super) const PROBES: f64 = 0.06;
 
-/// The time that a run may take. It stands in run.json, so that a resumed run keeps it.
+/// The time that a run may take. It is in run.json, so that a resumed run keeps it.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Budget {
     /// From the command's start to its end.

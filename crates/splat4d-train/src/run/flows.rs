@@ -20,7 +20,7 @@ const MARK: &str = "of.txt";
 /// The next training image may be so many frames later: one between them may be held out.
 const MOST_FRAMES: usize = 2;
 
-/// The capture with flow between its training images, where it brings none and the recipe wants our own.
+/// The capture with flow between its training images, where it brings none and the recipe needs our own.
 pub(super) fn complete(
     opened: OpenCapture,
     recipe: &Recipe,

@@ -132,7 +132,7 @@ mod tests {
     use super::*;
     use crate::run::tests::{Place, recipe};
 
-    /// The tables of a run that stands at its cap, counted, are what was estimated.
+    /// The tables of a run that is at its cap, counted, are what was estimated.
     #[test]
     fn tables_are_counted_with_networks_planes_nodes_and_gains() {
         let place = Place::new();

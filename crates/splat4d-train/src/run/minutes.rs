@@ -19,7 +19,7 @@ const TIMED: usize = 37;
 const WARM_UP: f64 = 1.0 / 3.0;
 /// Steps that are timed however long they take.
 const LEAST: usize = 6;
-/// Steps between two densifications of the probe, and at most so many steps until it stands at the cap.
+/// Steps between two densifications of the probe, and at most so many steps until it is at the cap.
 const HURRIED: usize = 20;
 /// See [`HURRIED`].
 const GROWTH_STEPS: usize = 400;
@@ -85,8 +85,8 @@ impl Timing {
         let until = |part: f64| began + part * seconds;
         let start = scene.len();
         // Copies of initial Gaussians would cost far more than trained ones, which are small: the probe grows by the
-        // recipe's own strategy, in a hurry. A probe's rates do not matter, its number of Gaussians does: nothing of it is
-        // kept.
+        // recipe's own strategy, in a hurry. A probe's rates do not matter, its number of Gaussians does: nothing of it
+        // is kept.
         let mut probe = Probe { trainer: opened.trainer(&recipe, &plan, scene.clone())?, clock };
         probe.trainer.check_not_empty()?;
         let few = probe.rates(until(PARTS[0]))?;
@@ -142,7 +142,8 @@ impl Timing {
         self.step(stages, stages.len() - 1, usize::MAX, cap.max(self.stages[0].gaussians[0]))
     }
 
-    /// The recipe with as many iterations as take `seconds`, where what follows takes as long as so many steps at the end.
+    /// The recipe with as many iterations as take `seconds`, where what follows takes as long as so many steps at the
+    /// end.
     pub(super) fn fit(&self, opened: &OpenCapture, recipe: &Recipe, seconds: f64, finish: f64) -> Result<Recipe> {
         let recipe = recipe.unresolved();
         let cost = |iterations: usize| -> Result<f64> {
@@ -172,8 +173,8 @@ impl Probe<'_> {
         }
     }
 
-    /// Seconds a step [half size, full size] in the first stage and, skipping what is left of it, in the second; a run of
-    /// one stage has the first twice. It is over by `until`, if only a few steps are.
+    /// Seconds a step [half size, full size] in the first stage and, skipping what is left of it, in the second; a run
+    /// of one stage has the first twice. It is over by `until`, if only a few steps are.
     fn rates(&mut self, until: f64) -> Result<[[f64; 2]; 2]> {
         let sizes = [usize::MAX, 0];
         let all = sizes.len() * self.trainer.stages.len().min(2);

@@ -1,5 +1,5 @@
-//! [`OpenCapture`]: a capture as a recipe wants it, opened for training, and what is made of it: a plan, a first scene,
-//! a trainer.
+//! [`OpenCapture`]: a capture as a recipe specifies, opened for training, and what is made of it: a plan, a first
+//! scene, a trainer.
 
 use super::dataset::Dataset;
 use crate::capture::frames::{Frames, Picture};
@@ -22,7 +22,7 @@ use std::ops::Range;
 use std::path::Path;
 use std::sync::Arc;
 
-/// Images whose mean colour stands for all of them.
+/// Images whose mean colour represents all of them.
 const LOOKED_AT: usize = 16;
 
 /// Extent of cameras in a single place, scene units.
@@ -48,7 +48,7 @@ pub fn capture_options(recipe: &Recipe) -> Result<CaptureOptions> {
     })
 }
 
-/// Opens a capture as a recipe wants it: scale, split, and the part of the capture that is used.
+/// Opens a capture as a recipe specifies: scale, split, and the part of the capture that is used.
 pub fn open_capture(path: &Path, recipe: &Recipe) -> Result<Capture> {
     open_frames(path, recipe, Vec::new(), &Lenses::default())
 }
@@ -143,7 +143,7 @@ pub fn plan(capture: &Capture, recipe: &Recipe) -> TrainContext {
     let of_rigs = capture.train.iter().map(|&i| (capture.frames[i].camera, capture.frames[i].time.0));
     let views = |t: f64| seen.partition_point(|s| *s <= t) - seen.partition_point(|s| *s < t);
     let moments = times.iter().map(|&t| (t, views(t))).collect();
-    // Cameras that all have the same position say nothing of the scene's size.
+    // Cameras that all have the same position carry no information about the scene's size.
     let (center, radius) = capture.center_and_radius();
     TrainContext {
         extent: if radius > SINGLE_PLACE { radius } else { 1.0 },
@@ -174,8 +174,8 @@ fn mean_color(frames: &dyn Frames) -> Result<[f32; 3]> {
     Ok(sums.map(|s| (s / pixels.max(1.0)) as f32))
 }
 
-/// What of cameras a recipe lets learn. Clocks say nothing where nothing moves, and nothing can be asked between the
-/// frames of a model that is learnt frame by frame.
+/// What of cameras a recipe lets learn. Clocks carry no information where nothing moves, and nothing can be asked
+/// between the frames of a model that is learnt frame by frame.
 pub(crate) fn learnable(recipe: &Recipe) -> RefineSettings {
     let timed = !["still", "tracked"].contains(&recipe.run.motion.as_str());
     RefineSettings { times: recipe.refine.times && timed, ..recipe.refine.clone() }
@@ -265,7 +265,7 @@ impl OpenCapture {
         }
     }
 
-    /// What is to be learnt of cameras, where the recipe wants it.
+    /// What is to be learnt of cameras, where the recipe needs it.
     fn corrections(&self, recipe: &Recipe, plan: &TrainContext) -> Option<Corrections> {
         let settings = learnable(recipe);
         if !settings.poses && !settings.focal && !settings.times {

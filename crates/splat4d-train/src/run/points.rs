@@ -19,8 +19,8 @@ use std::sync::Arc;
 const FILE: &str = "points.ply";
 /// Of the initial Gaussians: with fewer points of its own, a capture's images are searched for more.
 const FEW: f64 = 0.05;
-/// A capture whose points leave out more than this share of what a camera sees (the median of its cameras) brings too few as
-/// well, however many: a sky, a far background. Of eight captures the bundled one, a kitchen, a hall and five
+/// A capture whose points leave out more than this share of what a camera sees (the median of its cameras) brings too
+/// few as well, however many: a sky, a far background. Of eight captures the bundled one, a kitchen, a hall and five
 /// synthetic rooms
 /// have 0 to 0.06, one before a far background has 0.34 (docs/suite.md).
 const BARE: f64 = 0.2;
@@ -113,7 +113,7 @@ fn uncovered(camera: &Camera, points: &[[f64; 3]]) -> f64 {
     covered.iter().filter(|c| !**c).count() as f64 / covered.len() as f64
 }
 
-/// The times at which moving points are wanted.
+/// The times at which moving points are needed.
 fn moments(recipe: &Recipe, plan: &TrainContext) -> Result<Vec<f64>> {
     let program = recipe.program()?;
     let mut settings = recipe.init.clone();

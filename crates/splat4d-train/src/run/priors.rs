@@ -1,5 +1,5 @@
-//! What files say of a capture next to its images, held against these: before training what can be checked at once,
-//! after it
+//! What files contain about a capture next to its images, held against these: before training what can be checked at
+//! once, after it
 //! what the scene made of them.
 
 use super::open::{OpenCapture, training_frames};
@@ -31,7 +31,7 @@ const VISIBLE: f64 = 0.3;
 /// Depths whose closest ratios to the points are spread by more than this either way (logarithm) are not theirs, at
 /// whatever scale: noise of a quarter of the depth does as much, and single-image networks have less.
 const FOREIGN: f64 = 0.1;
-/// Share of the points that stand before what a metric map shows, by more than [`METRIC_OFF`], from which on it is
+/// Share of the points that are before what a metric map shows, by more than [`METRIC_OFF`], from which on it is
 /// reported: what is before a point hides it, and what it is itself nothing can be before.
 const BEFORE: f64 = 0.1;
 /// A metric map is believed while the scene is within this share of it (median); others while they correlate by this.
@@ -58,7 +58,7 @@ pub(super) fn before(opened: &OpenCapture, recipe: &Recipe) -> Result<Vec<String
     Ok(warnings)
 }
 
-/// What is to be said of metric maps that show surfaces behind points that were seen before them.
+/// What is to be reported of metric maps that show surfaces behind points that were seen before them.
 fn points_before(opened: &OpenCapture) -> Result<Option<String>> {
     let looked = ratios(opened)?;
     let told = |(i, ratios): &(usize, Vec<f64>)| {
@@ -203,7 +203,7 @@ fn is_metric(capture: &Capture, frame: usize) -> bool {
 }
 
 /// The capture with its metric depth in the unit of its points, or without it where it contradicts them, and what is to
-/// be said of that: poses and points are of one unit, and images were matched to find them.
+/// be reported of that: poses and points are of one unit, and images were matched to find them.
 pub(super) fn believed(opened: OpenCapture, recipe: &Recipe) -> Result<(OpenCapture, Option<String>)> {
     if recipe.loss.depth <= 0.0 || !opened.capture.train.iter().any(|&i| is_metric(&opened.capture, i)) {
         return Ok((opened, None));
@@ -299,7 +299,7 @@ mod tests {
         wall((x as f64 + 0.5 - 16.0) / FOCAL)
     }
 
-    /// Two cameras in one place look at the wall, with points on it; maps say `told` of a column.
+    /// Two cameras in one place look at the wall, with points on it; maps report `told` for a column.
     fn opened(folder: &Path, kind: &str, told: &dyn Fn(usize) -> f64) -> OpenCapture {
         let mut cameras = Vec::new();
         for c in 0..2 {

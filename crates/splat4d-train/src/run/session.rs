@@ -38,7 +38,7 @@ pub struct TrainOptions {
     /// What the caller does after training (measuring, filming, baking) takes as long as about so many steps at the end
     /// of training; `minutes` leaves room for it.
     pub finish: f64,
-    /// Time steps before the run and say by [`Event::Predicted`] how long it will take. With `minutes` it is said
+    /// Time steps before the run and say by [`Event::Predicted`] how long it will take. With `minutes` it is reported
     /// anyhow.
     pub predict: bool,
     /// The clock of `minutes`; its zero is when the command began, or these options were made.

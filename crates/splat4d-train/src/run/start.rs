@@ -47,7 +47,7 @@ pub fn train(
     let opened = OpenCapture::new(capture, &recipe)?.on(options.device);
     check_flow(&opened.capture, &recipe)?;
     let mut listen = listen;
-    // Before the model is chosen by what maps say; again where points have to be found first.
+    // Before the model is chosen by what maps indicate; again where points have to be found first.
     let (opened, early) = priors::believed(opened, &recipe)?;
     let recipe = if recipe.run.motion.is_auto() { opened.choose(recipe, &mut listen)? } else { recipe };
     recipe.program()?.check(&opened.plan(&recipe))?;

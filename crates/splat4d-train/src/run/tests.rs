@@ -564,7 +564,7 @@ fn opaque_captures_get_their_mean_colour_as_background_and_masked_ones_their_own
         capture.train.iter().map(of).sum::<f64>() / capture.train.len() as f64
     });
     let found = shown(capture.clone());
-    // Sixteen images stand for all.
+    // Sixteen images represent all.
     assert!((0..3).all(|c| (f64::from(found[c]) - mean[c]).abs() < 0.02 && mean[c] > 0.05), "{found:?} {mean:?}");
     let told = [0.9, 0.1, 0.4];
     assert_eq!(shown(Arc::new(Capture { background: Some(told), ..Capture::clone(&capture) })), told);

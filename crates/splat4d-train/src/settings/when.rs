@@ -46,7 +46,7 @@ fn is_open(key: &str, word: &str) -> bool {
     (key, word) == ("run.motion", "auto")
 }
 
-/// Whether a value says that something is not to be: 0, false, nothing, `none` or `off`.
+/// Whether a value disables something: 0, false, nothing, `none` or `off`.
 pub(crate) fn is_off(value: &toml::Value) -> bool {
     match value {
         toml::Value::Boolean(on) => !on,

@@ -1,4 +1,4 @@
-//! [`Engine`]: takes steps on a learner. The processor's is [`CpuEngine`]; one whose tables stay on a device can stand
+//! [`Engine`]: takes steps on a learner. The processor's is [`CpuEngine`]; one whose tables stay on a device can be
 //! in its place, since a plan states all that a step is of, and a learner states what happened to it between steps.
 
 use super::chain::{Chain, ImageTerm, Losses, Step, StepInfo, StepReport, View};
@@ -191,7 +191,7 @@ pub struct CpuEngine<'a> {
     shown: Scene<f32>,
     /// Whether `shown` is to be copied from the scene again.
     stale: bool,
-    /// Whether it was said that images are compared on the CPU.
+    /// Whether it was reported that images are compared on the CPU.
     told: bool,
 }
 

@@ -15,7 +15,7 @@ pub struct ScheduleChange {
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ScheduleChanges(Vec<ScheduleChange>);
 
-/// The form of the setting, to stand behind "It must be".
+/// The form of the setting, to follow "It must be".
 const FORM: &str = "a list of [step, steps in all], steps ascending and below the steps in all, such as [[700, 4200]]";
 
 impl ScheduleChanges {

@@ -47,7 +47,7 @@ pub(crate) struct DeviceEngine<'a> {
     newest: Newest,
     /// Whether the device has failed, or has no room.
     given_up: bool,
-    /// Whether it was said that the CPU keeps the tables.
+    /// Whether it was reported that the CPU keeps the tables.
     told: bool,
     /// See [`rates_of`].
     rates: Rates,

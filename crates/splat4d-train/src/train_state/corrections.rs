@@ -2,7 +2,7 @@
 //!
 //! A correction of a pose is a twist ξ = (ρ, θ) in the camera's axes, `exp(ξ)·cam_from_world`; all frames of a fixed
 //! camera share one. A correction of a focal length is a share of it, of a camera. A correction of a clock is a shift
-//! of all times of a camera. Images say nothing of where the scene as a whole
+//! of all times of a camera. Images carry no information about where the scene as a whole
 //! stands, how large it is and when it begins: the cameras' mean motion, their mean growth and the median of their
 //! clocks stay. The median, since of a rig with one clock that is wrong the others are right.
 
@@ -307,7 +307,7 @@ impl Corrections {
         SearchDue { round, reach: reach * self.scale.frame, step: step * self.scale.frame }
     }
 
-    /// Shifts the clocks of cameras by so many seconds. What gradients said of them before holds no longer.
+    /// Shifts the clocks of cameras by so many seconds. Their earlier gradients no longer apply.
     pub(crate) fn shift(&mut self, shifts: &[(usize, f64)]) {
         let limit = (self.settings.time_limit * self.scale.frame) as f32;
         let Some(times) = &mut self.times else { return };

@@ -22,7 +22,8 @@ pub(crate) struct Track {
 const NEIGHBOURS: usize = 10;
 /// Cameras whose axes are farther apart see other sides of things, degrees.
 const WIDEST: f64 = 70.0;
-/// Depths at which two cameras should see the same, of the distance between them: they are then seen at 40 to 3 degrees.
+/// Depths at which two cameras should see the same, of the distance between them: they are then seen at 40 to 3
+/// degrees.
 const DEPTHS: [f64; 4] = [1.4, 3.0, 8.0, 19.0];
 /// Of the probed pixels at the best of these depths, the least that the other camera should hold.
 const OVERLAP: f64 = 0.3;
@@ -32,8 +33,8 @@ const OFF: f64 = 1.5;
 /// this states less than in a whole image: points that only two cameras see must have more.
 const RATIO: f64 = 0.8;
 const RATIO_OF_TWO: f64 = 0.7;
-/// Descriptors farther apart than this have nothing in common: of two bytes' descriptors the squared distance is at most
-/// 2 x 512². An eighth of it.
+/// Descriptors farther apart than this have nothing in common: of two bytes' descriptors the squared distance is at
+/// most 2 x 512². An eighth of it.
 const FAR: u32 = 65_536;
 /// Least angle between the outermost rays of a point, degrees.
 const NARROW: f64 = 1.5;
@@ -88,7 +89,8 @@ pub(crate) fn pairs(cameras: &[&Camera]) -> Vec<[usize; 2]> {
             .map(|b| (distance(b), b))
             .collect();
         others.sort_by(|x, y| x.0.total_cmp(&y.0).then(x.1.cmp(&y.1)));
-        // Near ones look most alike, far ones measure depth best: in steps that grow, because nothing is known of depth.
+        // Near ones look most alike, far ones measure depth best: in steps that grow, because nothing is known of
+        // depth.
         let mut rank = 0.0_f64;
         for _ in 0..NEIGHBOURS {
             let Some(&(_, b)) = others.get(rank as usize) else { break };
@@ -165,7 +167,7 @@ fn matches(views: &[View], [a, b]: [usize; 2], [from, to]: [&[Feature]; 2]) -> V
                 second = (d, j);
             }
         }
-        // What is alone on its line must be as good as if something quite unlike stood next to it.
+        // What is alone on its line must be as good as if something quite unlike was next to it.
         let ratio = (f64::from(first.0) / f64::from(second.0.clamp(1, FAR))).sqrt();
         forth.push((first.0 < FAR && ratio < RATIO).then_some((first.1, ratio)));
     }

@@ -1,9 +1,9 @@
 //! Points on surfaces, by plane sweep: a window of one image is laid at many depths and compared with its neighbours
 //! there (normalised cross-correlation; Collins 1996).
 //!
-//! Not every pixel: the window with the strongest texture of every cell of a lattice, so that points are spread evenly in
-//! images and the work follows from how many are wanted. The window is tilted at the best depth (floors and walls are
-//! rarely seen from in front), and neighbours must find the same depth by themselves.
+//! Not every pixel: the window with the strongest texture of every cell of a lattice, so that points are spread evenly
+//! in images and the work follows from how many are needed. The window is tilted at the best depth (floors and walls
+//! are rarely seen from in front), and neighbours must find the same depth by themselves.
 
 use super::triangulate::{Transfer, angle_at};
 use super::view::{View, spread};
@@ -38,9 +38,10 @@ const SAME_PEAK: usize = 3;
 const CONFIRMED: usize = 2;
 /// Steps in inverse depth by which two images may differ on a point.
 const AGREE: f64 = 1.5;
-/// Least and largest number of depths; between them, each moves the window by a pixel in the neighbour where it moves most.
+/// Least and largest number of depths; between them, each moves the window by a pixel in the neighbour where it moves
+/// most.
 const DEPTHS: std::ops::RangeInclusive<usize> = 16..=256;
-/// Windows that are tried a point that is wanted: about so few are found.
+/// Windows tried per requested point: about this few succeed.
 const TRIES: f64 = 3.0;
 /// Cells of the lattice are not smaller than this, pixels.
 const CELL: f64 = 3.0;

@@ -71,8 +71,8 @@ impl Capture {
         check
     }
 
-    /// Cameras that see none of the initial points where others see many, and metric depth maps in another unit than the
-    /// points. Opens a few depth maps.
+    /// Cameras that see none of the initial points where others see many, and metric depth maps in another unit than
+    /// the points. Opens a few depth maps.
     pub(super) fn check_points(&self) -> Vec<Finding> {
         let mut findings = Vec::new();
         let warn = |what: String, remedy: &str| Finding {
@@ -113,7 +113,7 @@ impl Capture {
         findings
     }
 
-    /// The verdict by these images; features are found and matched if points do not say enough.
+    /// The verdict by these images; features are found and matched if points do not suffice.
     fn judge(&self, looks: &mut [SmallImage], matches: &mut Option<Vec<pairs::Match>>) -> PoseCheck {
         let mut conventions = vec![Poses::STATED];
         conventions.extend(self.convention.others());
@@ -133,7 +133,7 @@ impl Capture {
             m.points = points::measure(self, (&spread, &spread_poses), (looks, poses));
             m.foreground = silhouettes::measure(looks, poses);
         }
-        // Points whose colours agree say enough.
+        // Points whose colours agree suffice.
         if !measures[0].points.convinces() {
             let matches = matches.get_or_insert_with(|| {
                 look::describe(looks, look::COARSE);
@@ -253,7 +253,7 @@ fn other_unit(ratio: f64, by: &str, file: &DepthFile) -> String {
     )
 }
 
-/// What masks and alpha say of themselves: white counts.
+/// What masks and alpha show about themselves: white counts.
 fn check_masks(looks: &[SmallImage], poses: &[Se3]) -> Option<Finding> {
     let percent = |x: f64| 100.0 * x;
     let (severity, aspect, what, remedy) = match silhouettes::masks(looks, poses) {
@@ -292,8 +292,8 @@ fn check_masks(looks: &[SmallImage], poses: &[Se3]) -> Option<Finding> {
     Some(Finding { severity, aspect: Some(aspect), what, remedy: remedy.into() })
 }
 
-/// Whether poses describe upright images (with their EXIF orientation applied), by colours of points and by matches between
-/// images; `None`: undetermined. `unsure` are frames whose sizes do not decide.
+/// Whether poses describe upright images (with their EXIF orientation applied), by colours of points and by matches
+/// between images; `None`: undetermined. `unsure` are frames whose sizes do not decide.
 pub(super) fn upright(capture: &Capture, unsure: &[usize]) -> Option<bool> {
     let others = (0..capture.frames.len()).filter(|i| !unsure.contains(i)).take(LOOKS[0]);
     let some: Vec<usize> = unsure.iter().copied().take(LOOKS[1] - LOOKS[0]).collect();

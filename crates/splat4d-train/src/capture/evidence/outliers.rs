@@ -1,5 +1,5 @@
-//! Single wrong poses among right ones: the identity, the pose of another image, a jump out of a path. Each is compared with
-//! matches between its image and others; nothing else raises a warning.
+//! Single wrong poses among right ones: the identity, the pose of another image, a jump out of a path. Each is compared
+//! with matches between its image and others; nothing else raises a warning.
 
 use super::super::account::Severity;
 use super::super::account::first_names;
@@ -23,11 +23,11 @@ const FEW: f64 = 0.2;
 const BESIDE: usize = 2;
 /// Matches of two images that show one place: chance makes fewer.
 const OVERLAP: usize = 20;
-/// Share of these that fit right poses at least, and wrong ones at most: what moves and repeats itself leaves right poses less than
-/// all, and a wrong pose fits what is near its lines by chance. Between them nothing is said.
+/// Share of these that fit right poses at least, and wrong ones at most: what moves and repeats itself leaves right
+/// poses less than all, and a wrong pose fits what is near its lines by chance. Between them nothing is reported.
 const FITS: [f64; 2] = [0.4, 0.15];
-/// Gain of the colours of initial points from which an image alone shows that its pose is right: exchanged images of one scene
-/// gain 0.14 (see `points`). Looking for features takes forty times as long.
+/// Gain of the colours of initial points from which an image alone shows that its pose is right: exchanged images of
+/// one scene gain 0.14 (see `points`). Looking for features takes forty times as long.
 const VOUCHED: f64 = 0.3;
 /// Gain of an image below which it does not fit the points, where the images in the middle gain so much.
 const STRANGE: (f64, f64) = (0.1, 0.35);
@@ -257,8 +257,8 @@ fn warning(wrong: &[usize], pairs: &[Pair], told: &dyn Fn(usize) -> (String, Opt
     Some(Finding { severity: Severity::Warning, aspect: Some(Aspect::Assumed), what, remedy })
 }
 
-/// One frame of every place that has a pose of its own: of a fixed camera the one that is nearest to the time of which most is
-/// seen, of moving ones all for training; ordered as they were taken.
+/// One frame of every place that has a pose of its own: of a fixed camera the one that is nearest to the time of which
+/// most is seen, of moving ones all for training; ordered as they were taken.
 fn places(capture: &Capture) -> Vec<usize> {
     let mut counts: BTreeMap<usize, usize> = BTreeMap::new();
     capture.train.iter().for_each(|&i| *counts.entry(capture.frames[i].index).or_default() += 1);

@@ -16,7 +16,8 @@ const NEAR: f64 = 1.5;
 const PARALLEL: f64 = 0.006;
 /// Of the cameras' spread: cameras nearer to one another have the same position.
 const ONE_PLACE: f64 = 1e-6;
-/// Matches that one convention fits and the other does not, at least, and how many times as many as the other way round.
+/// Matches that one convention fits and the other does not, at least, and how many times as many as the other way
+/// round.
 const MORE: (usize, usize) = (20, 4);
 /// Of its matches, how many the poses as read fit at most where another convention is right.
 const RIVAL: f64 = 0.8;
@@ -37,7 +38,7 @@ impl Match {
     }
 }
 
-/// What matches say of one convention.
+/// What matches show about one convention.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Measure {
     pub(super) matches: usize,
@@ -58,13 +59,13 @@ impl Measure {
         self.fitting >= MORE.0 && self.share() >= FITTING
     }
 
-    /// Whether matches say that the poses as read are better.
+    /// Whether matches indicate that the poses as read are better.
     pub(super) fn contradicts(&self) -> bool {
         self.lost >= MORE.0 && self.lost >= MORE.1 * self.gained
     }
 }
 
-/// Whether matches say that poses are written in this convention.
+/// Whether matches indicate that poses are written in this convention.
 pub(super) fn prefers(m: &Measure) -> bool {
     let stated = m.fitting + m.lost - m.gained;
     m.convinces() && m.gained >= MORE.0 && m.gained >= MORE.1 * m.lost && stated as f64 <= RIVAL * m.fitting as f64
@@ -136,14 +137,14 @@ pub(super) fn fitting(matches: &[Match], looks: &[SmallImage], poses: &[Se3]) ->
     matches.iter().filter(|m| fits(m, looks, poses, least)).count()
 }
 
-/// Baselines from which cameras stand in two places.
+/// Baselines from which cameras are in two places.
 fn least(centers: &[[f64; 3]]) -> f64 {
     let spread = centers.iter().map(|&c| norm(sub(c, centers[0]))).fold(0.0, f64::max);
     ONE_PLACE * (spread + norm(centers.first().copied().unwrap_or_default()))
 }
 
-/// How far every match is from its epipolar line if focal lengths are `times` as long, pixels of the small image; infinite
-/// where the rays do not meet in front of both cameras.
+/// How far every match is from its epipolar line if focal lengths are `times` as long, pixels of the small image;
+/// infinite where the rays do not meet in front of both cameras.
 pub(super) fn residuals(matches: &[Match], looks: &[SmallImage], poses: &[Se3], times: f64) -> Vec<f64> {
     let centers: Vec<[f64; 3]> = poses.iter().map(|p| p.inverse().translation).collect();
     let least = least(&centers);
@@ -196,7 +197,7 @@ fn fits(m: &Match, looks: &[SmallImage], poses: &[Se3], least: f64) -> bool {
     near && (in_one_place || meet(m, &motion))
 }
 
-/// Whether the rays of cameras in two places meet in front of both, where they say so.
+/// Whether the rays of cameras in two places meet in front of both, where that can be determined.
 fn meet(m: &Match, motion: &Se3) -> bool {
     let [p, q] = m.rays.map(|[x, y]| [x, y, 1.0]);
     let t = normalize(motion.translation);

@@ -29,7 +29,8 @@ const FEW: usize = 100;
 const SHOWN: (f64, f64) = (0.25, 4.0);
 /// The same without colours that say anything.
 const ALONE: f64 = 10.0;
-/// By how much another convention's colours fit better at least, where points in images already say so; else alone.
+/// By how much another convention's colours fit better at least, where points in images already indicate it; else
+/// alone.
 pub(super) const BETTER: f64 = 0.05;
 const COLOURS_ALONE: f64 = 0.15;
 /// Sum of the differences of three channels below which colours are one.
@@ -37,7 +38,7 @@ const ONE_COLOUR: f64 = 0.02;
 /// Colours that are compared at least.
 const ENOUGH: usize = 60;
 
-/// What points say of one convention.
+/// What points show about one convention.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Measure {
     /// Points that were asked.
@@ -185,7 +186,7 @@ fn with_depth(capture: &Capture) -> Vec<&Frame> {
     frames.iter().step_by(frames.len().div_ceil(MAPS).max(1)).copied().collect()
 }
 
-/// How many times as far away points are as metric depth maps say, and a map's file. `None`: undetermined.
+/// How many times as far away points are as metric depth maps indicate, and a map's file. `None`: undetermined.
 fn by_points(capture: &Capture) -> Option<f64> {
     let cloud = capture.points.as_ref()?;
     let mut ratios = Vec::new();
@@ -355,7 +356,7 @@ fn gain(
     let cloud = capture.points.as_ref()?;
     let apart = |a: &[f32; 3], b: &[f32; 3]| a.iter().zip(b).map(|(x, y)| f64::from((x - y).abs())).sum::<f64>();
     let (mut own, mut other, mut count) = (0.0, 0.0, 0);
-    // Points of one colour, such as those that have none, say nothing.
+    // Points of one colour, such as those that have none, carry no information.
     let first = chosen.first().map(|&p| cloud.colors[p])?;
     if chosen.iter().all(|&p| apart(&cloud.colors[p], &first) < ONE_COLOUR) {
         return None;
@@ -381,7 +382,7 @@ fn gain(
     (count >= ENOUGH && other > 1e-3 * count as f64).then(|| (1.0 - own / other, count))
 }
 
-/// Whether points say that poses are written in the convention of `m`, and not as `stated`.
+/// Whether points indicate that poses are written in the convention of `m`, and not as `stated`.
 pub(super) fn prefers(m: &Measure, stated: &Measure, pairs: &pairs::Measure) -> bool {
     if m.asked == 0 || pairs.contradicts() {
         return false;

@@ -7,7 +7,8 @@ use splat4d::math::se3::{dot, norm, normalize, sub};
 
 /// Images with a foreground that are needed.
 const ENOUGH: usize = 4;
-/// Angle between the ray to a foreground's middle and the common place, radians: things move, and are seen from other sides.
+/// Angle between the ray to a foreground's middle and the common place, radians: things move, and are seen from other
+/// sides.
 const WITHIN: f64 = 0.2;
 /// Of the cameras' spread: what is nearer is no place in front of a camera.
 const CLOSE: f64 = 0.05;
@@ -17,8 +18,8 @@ const DOUBTFUL: f64 = 0.35;
 
 /// Masks that show at least this share of the pixels along the edges of images hide something inside them.
 const EDGE: f64 = 0.9;
-/// Part of the images whose hidden part is at one place, from which masks are inverted: foregrounds of good captures are at one
-/// place in 70 % and more.
+/// Part of the images whose hidden part is at one place, from which masks are inverted: foregrounds of good captures
+/// are at one place in 70 % and more.
 const INVERTED: f64 = 0.8;
 /// Angle between a camera's axis and what it was pointed at, radians: in the middle half of usual fields of view.
 const AIMED: f64 = 0.35;
@@ -30,11 +31,12 @@ pub(super) fn measure(looks: &[SmallImage], poses: &[Se3]) -> Option<f64> {
     at_one_place(looks, poses, |look| look.foreground).map(|(share, _)| share)
 }
 
-/// What masks say of themselves: white counts.
+/// What masks show about themselves: white counts.
 pub(super) enum Masks {
     /// There are none, or foregrounds are at one place.
     Fine,
-    /// What they hide is at the place that cameras look at: part of the images, share of what is shown, and of the edges.
+    /// What they hide is at the place that cameras look at: part of the images, share of what is shown, and of the
+    /// edges.
     Inverted(f64, f64, f64),
     /// Neither: images with masks that were examined, and the share of what is shown.
     Unsure(usize, f64),
@@ -62,8 +64,8 @@ pub(super) fn masks(looks: &[SmallImage], poses: &[Se3]) -> Masks {
     }
 }
 
-/// Part of the images that have `what` at the place that is nearest to all, and the median angle between that place and the
-/// cameras' axes, radians; `None`: too few have it.
+/// Part of the images that have `what` at the place that is nearest to all, and the median angle between that place and
+/// the cameras' axes, radians; `None`: too few have it.
 fn at_one_place(
     looks: &[SmallImage],
     poses: &[Se3],
@@ -108,7 +110,7 @@ fn at_one_place(
     Some((rays.iter().filter(sees).count() as f64 / rays.len() as f64, aimed))
 }
 
-/// Whether foregrounds say that poses are written in the convention of `m`.
+/// Whether foregrounds indicate that poses are written in the convention of `m`.
 pub(super) fn prefers(m: Option<f64>, stated: Option<f64>) -> bool {
     m.zip(stated).is_some_and(|(m, stated)| m >= CONVINCES && stated <= DOUBTFUL)
 }

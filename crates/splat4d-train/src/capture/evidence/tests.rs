@@ -131,7 +131,7 @@ fn apart(poses: &[Se3]) -> f64 {
     (0..poses.len()).map(one).fold(0.0, f64::max)
 }
 
-/// The capture as if its files were of another layout and written as `poses` say.
+/// The capture as if its files were of another layout and written as `poses` specify.
 fn misread(capture: &Capture, stated: Convention, poses: Poses) -> Capture {
     let mut out = Capture { convention: stated, ..capture.clone() };
     for (i, frame) in out.frames.iter_mut().enumerate() {
@@ -342,7 +342,7 @@ fn depth_maps_in_another_unit_are_named() {
     assert!(found.len() == 1 && found[0].what.contains("8 bits"), "{found:?}");
 }
 
-/// What images say of single poses, focal lengths and masks: warnings.
+/// What images show about single poses, focal lengths and masks: warnings.
 fn warned(capture: &Capture) -> Vec<String> {
     let check = capture.check_poses();
     let all = check.more.into_iter().chain([check.finding]);

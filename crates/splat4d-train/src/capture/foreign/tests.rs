@@ -41,7 +41,7 @@ fn arkit(i: usize) -> Se3 {
     p
 }
 
-/// The end of the name of the one image that is said to be missing, and is skipped.
+/// The end of the name of the one image that is declared missing, and is skipped.
 fn one_missing(sample: &Sample) -> String {
     let capture = open(sample);
     assert_eq!(capture.frames.len(), COUNT - 1);

@@ -61,7 +61,7 @@ pub(super) fn read(file: &File<'_>, node: &Node<'_>) -> Result<Entry> {
     Ok(Entry { name: name.replace('\\', "/"), image, source, by_angle, time, mask, depth, split: Split::Train })
 }
 
-/// Nerfstudio's name for equirectangular panoramas, whose focal lengths say nothing.
+/// Nerfstudio's name for equirectangular panoramas, whose focal lengths carry no information.
 const PANORAMA: &str = "EQUIRECTANGULAR";
 
 /// Units of the scene a stored number of a depth map where a file does not say: thousandths, as in Nerfstudio.
@@ -294,7 +294,7 @@ const READ: &[&str] = &[
     "ply_file_path",
     "applied_transform",
 ];
-/// Keys that say nothing of poses, lenses and times: sizes of other programs' volumes, statistics, names.
+/// Keys that carry no information about poses, lenses and times: sizes of other programs' volumes, statistics, names.
 const HARMLESS: &[&str] = &[
     "aabb_scale",
     "aabb",

@@ -158,7 +158,7 @@ impl Codec<f32> for Quantised {
     }
 }
 
-/// Gives rows of wanted blocks of the file the coefficients above degree 0 of their entries.
+/// Gives rows of requested blocks of the file the coefficients above degree 0 of their entries.
 fn paint(table: &mut Table<f32>, labels: &[u16], palette: &Palette, wanted: &[bool]) {
     let chunks: Vec<_> = table.chunks_mut(BLOCK_GAUSSIANS / BLOCK).zip(wanted).filter(|(_, w)| **w).collect();
     chunks.into_par_iter().for_each(|(view, _)| {

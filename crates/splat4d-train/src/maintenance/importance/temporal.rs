@@ -44,7 +44,7 @@ pub enum Spatial {
     #[default]
     Share,
     /// Σ over pixels and channels of the squared change that its removal alone would make. Neighbours of one colour
-    /// stand in for each other, and may all go.
+    /// replace each other, and may all go.
     Change,
     /// The geometric mean of both in each view: neither what covers nor what differs from what is behind goes first.
     Both,

@@ -74,7 +74,7 @@ fn depth_normals_and_flow_have_the_gradient_of_their_values() {
     for life in [LifeKind::Infinite, LifeKind::GaussHalf] {
         let scene = moving(life);
         let velocities = scene.layers[0].params.find("velocities").unwrap();
-        // Opacity logits stand for a learnt column: it is the sigmoid of any.
+        // Opacity logits represent a learnt column: it is the sigmoid of any.
         let sigmoid = Channel::Sigmoid("opacity_logits".to_owned());
         for needs in [
             Needs { depth: true, extra: vec![Channel::Normals, Channel::Flow, Channel::Tracks, sigmoid] },

@@ -108,7 +108,7 @@ fn full<F: Real>(c: [F; 6]) -> Matrix<F> {
     [[c[0], c[1], c[2]], [c[1], c[3], c[4]], [c[2], c[4], c[5]]]
 }
 
-/// dL/dΣ as a symmetric matrix, from the gradient to six numbers of which an off-diagonal stands for two places.
+/// dL/dΣ as a symmetric matrix, from the gradient to six numbers of which an off-diagonal represents two places.
 fn full_gradient<F: Real>(c: [F; 6]) -> Matrix<F> {
     let h = F::HALF;
     full([c[0], h * c[1], h * c[2], c[3], h * c[4], c[5]])
@@ -203,7 +203,7 @@ impl<F: Real> Motion<F> for Skinned {
                 d_time += (0..6).map(|k| (d_pose[k] * speed[k]).f64()).sum::<f64>();
                 self.pose_backward(d, q.t, node, d_pose);
             }
-            // Off-diagonals stand for both their places again.
+            // Off-diagonals represent both their places again.
             let m = d_rest;
             let d_row = [
                 d_mean0[0],

@@ -58,7 +58,7 @@ fn cameras(count: usize, size: usize) -> Vec<Camera> {
     (0..count).map(camera).collect()
 }
 
-/// A random pattern of splats on a ball, and as many that stand around it.
+/// A random pattern of splats on a ball, and as many that are around it.
 fn ball(rows: usize, standing: usize) -> Params<f32> {
     let mut p = Params::new(rows + standing, 1, &[]);
     let rng = Rng::new(8, "ball", 0);

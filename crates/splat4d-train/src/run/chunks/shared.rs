@@ -137,7 +137,7 @@ impl Shared {
     }
 }
 
-/// Why medians would say nothing.
+/// Why medians would not be informative.
 fn nothing_still(capture: &Capture) -> Option<&'static str> {
     let mut fixed: Vec<usize> =
         capture.train.iter().map(|&i| capture.frames[i].camera).filter(|&c| capture.cameras[c].fixed).collect();

@@ -70,7 +70,7 @@ impl ImageTerm for Tie {
         let mut sum = 0.0;
         let numbers = d.color.add().data.iter_mut().zip(shown.color.data.iter().zip(&self.image.color.data));
         for (i, (d, (own, theirs))) in numbers.enumerate() {
-            // Pixels that the lens never filled say nothing.
+            // Pixels that the lens never filled carry no information.
             let counts = view.weight.map_or(1.0, |w| w.data[i % pixels]);
             let off = (own - theirs) * counts;
             sum += f64::from(off.abs());

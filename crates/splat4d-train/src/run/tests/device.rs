@@ -19,7 +19,7 @@ fn a_run_reports_its_device_and_where_it_resumes() {
     train(place.open(&recipe), recipe.clone(), &run, &options, &stop, &mut listen).unwrap();
     let info = || serde_json::from_str::<Value>(&read_text(&run.join("run.json")).unwrap()).unwrap();
     let device = info()["device"].as_str().unwrap().to_owned();
-    // Where there is no GPU, that is said, and the CPU trains.
+    // Where there is no GPU, that is reported, and the CPU trains.
     let missed = device == "the CPU";
     assert!(told.len() == 1 && told[0].starts_with("training on ") && told[0].contains(&device), "{told:?}");
     assert!(missed == told[0].starts_with("training on the CPU: "), "{told:?}");

@@ -42,7 +42,7 @@ fn is_of_tables(notice: &str) -> bool {
     notice.contains("the CPU keeps the tables")
 }
 
-/// Mean squared errors of all steps that are left, and what was said.
+/// Mean squared errors of all steps that are left, and what was reported.
 pub(super) fn finish(trainer: &mut Trainer<'_>, what: &str) -> (Vec<f64>, Vec<String>) {
     let (mut mse, mut notices) = (Vec::new(), Vec::new());
     while !trainer.is_done() {
@@ -69,7 +69,7 @@ fn every_model_learns_as_on_the_cpu() {
         let Some(mut trainer) = on_gpu(&bed, &recipe) else { return };
         let mut cpu = bed.start(&recipe);
         let ((mse, notices), (expected, _)) = (finish(&mut trainer, line), finish(&mut cpu, line));
-        // These stay on the device whole; of the others neighbours, networks and the filter want something else.
+        // These stay on the device whole; of the others neighbours, networks and the filter need something else.
         let whole = ["motion=still", "motion=native4d", "motion=tracked"];
         let stays = whole.iter().any(|m| line.starts_with(m)) || line.contains("strategy=adc");
         assert!(notices.len() == usize::from(!stays) && notices.iter().all(|n| is_of_tables(n)), "{line}: {notices:?}");

@@ -18,7 +18,7 @@ use splat4d::scene::{Camera, GEOMETRY, LIFE, LifeKind, Params, Part, Rows, SH, S
 /// Cameras, moments and pixels across of the synthetic capture; ten frames per second.
 const CAPTURE: (usize, usize, usize) = (3, 9, 40);
 
-/// A layer of Gaussians around the origin, with lifespans of random lengths about random moments of the clip.
+/// A layer of Gaussians around the origin, with lifespans of random lengths about random times of the clip.
 fn layer(rows: usize, life: LifeKind, seed: u64) -> Layer<f32> {
     let rng = Rng::new(seed, "prune", 0);
     let mut params = Params::new(rows, 1, life.columns());
