@@ -11,7 +11,7 @@ use std::path::Path;
 pub const FILE: &str = "import.toml";
 /// The version of the file.
 const VERSION: u32 = 1;
-/// What stands above.
+/// The text above.
 const HEAD: &str =
     "# What `import` found for every camera. Correct it and run the same command again: `import` continues
 # from here.
@@ -133,13 +133,13 @@ impl Camera {
         if self.keep_lens {
             return;
         }
-        // Zeros at the end say nothing.
+        // Zeros at the end carry no information.
         let short = |values: &[f64]| values[..values.iter().rposition(|v| *v != 0.0).map_or(0, |i| i + 1)].to_vec();
         let (k, p, fisheye) = match lens {
             Lens::Brown { k, p, .. } => (short(k), short(p), false),
             Lens::Fisheye { k } => (short(k), Vec::new(), true),
             Lens::Pinhole => (Vec::new(), Vec::new(), false),
-            // Only a calibration has others, which stands in its own file.
+            // Only a calibration has others, which is in its own file.
             _ => return,
         };
         let Intrinsics { fx, fy, cx, cy } = *intrinsics;
@@ -208,8 +208,8 @@ impl Intrinsic {
 }
 
 impl Corrections {
-    /// The file in a capture's folder; that of cameras of which nothing is known where there is none. Cameras that it does
-    /// not name are added, in the order of `names`.
+    /// The file in a capture's folder; that of cameras of which nothing is known where there is none. Cameras that it
+    /// does not name are added, in the order of `names`.
     ///
     /// Errors: no TOML, unknown keys, numbers that are none, cameras that there are not.
     pub fn read(folder: &Path, names: &[String]) -> Result<Self> {

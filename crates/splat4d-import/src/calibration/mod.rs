@@ -73,7 +73,7 @@ struct Text {
     tree: Tree,
 }
 
-/// What a file states of a camera; two files may share what there is to say.
+/// What a file states about a camera; two files may each state a part.
 #[derive(Clone, Debug, Default)]
 struct Part {
     names: Vec<String>,
@@ -110,7 +110,8 @@ const MAX_FILES: usize = 1000;
 
 /// Reads a calibration: a file, or a folder with one, with a file for each camera, or with a COLMAP reconstruction.
 ///
-/// Errors: nothing that is known; damage; matrices that are missing or none; a camera twice; lenses that captures cannot have.
+/// Errors: nothing that is known; damage; matrices that are missing or none; a camera twice; lenses that captures
+/// cannot have.
 pub fn read(path: &Path) -> Result<Calibration> {
     let there = std::fs::metadata(path).map_err(|e| {
         Error::io("the calibration cannot be read", e).at(path.display()).remedy("Check the path behind --calibration.")
@@ -238,7 +239,7 @@ fn same_name(a: &str, b: &str) -> bool {
     a.to_lowercase() == b.to_lowercase()
 }
 
-/// Joins what several files say of a camera.
+/// Joins what several files contain about a camera.
 fn add(parts: &mut Vec<(Part, PathBuf)>, part: Part, file: &Path) -> Result<()> {
     let name = part.names.first().cloned().unwrap_or_default();
     let Some((known, first)) = parts.iter_mut().find(|(p, _)| same_name(&p.names[0], &name)) else {
@@ -293,14 +294,15 @@ fn alike(cameras: &[Calibrated]) -> Result<()> {
 }
 
 impl Calibration {
-    /// Whether it says where the cameras stand.
+    /// Whether it states where the cameras stand.
     pub(crate) fn posed(&self) -> bool {
         self.cameras.iter().all(|c| c.pose.is_some())
     }
 
     /// What its unit of length is, a sentence.
     pub(crate) fn about_lengths(&self) -> String {
-        /// Cameras farther apart than this are measured in millimetres: rigs of more metres are rare, of fewer millimetres too.
+        /// Cameras farther apart than this are measured in millimetres: rigs of more metres are rare, of fewer
+        /// millimetres too.
         const MILLIMETRES: f64 = 200.0;
         let centers: Vec<[f64; 3]> =
             self.cameras.iter().filter_map(|c| c.pose.map(|p| p.inverse().translation)).collect();

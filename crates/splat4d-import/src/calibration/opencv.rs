@@ -63,7 +63,7 @@ fn is_camera(tree: &Tree) -> bool {
     shaped(&MATRIX) || shaped(&EXTRINSICS) || shaped(&ROTATION) && shaped(&TRANSLATION)
 }
 
-/// The cameras of a file: itself, its tables, or the tables in `cameras`; with the keys they stand under.
+/// The cameras of a file: itself, its tables, or the tables in `cameras`; with the keys they are under.
 fn cameras(tree: &Tree) -> Vec<(Option<String>, &Tree)> {
     if is_camera(tree) {
         return vec![(None, tree)];

@@ -5,7 +5,7 @@ use splat4d::{Error, Result};
 /// A value with others in it.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Tree {
-    /// A number; NaN and infinities as they stand there.
+    /// A number; NaN and infinities as they are there.
     Number(f64),
     /// Anything else that is one.
     Word(String),

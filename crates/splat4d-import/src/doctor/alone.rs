@@ -1,4 +1,4 @@
-//! What a camera's own images say.
+//! Findings from a camera's own images.
 
 use super::finding::{FindingList, GAMMA, SHARPNESS, grade, unit, worse};
 use super::look::CameraObservations;
@@ -21,7 +21,7 @@ const DARK: f64 = 20.0;
 /// How much larger steps across blocks are, of 255. Images of two recordings that look sound have 0.9 to 1.4.
 const BLOCKS: [f64; 2] = [2.5, 5.0];
 
-/// What a camera's own images say.
+/// Findings from a camera's own images.
 pub(super) fn alone(capture: &Capture, camera: usize, s: &CameraObservations, report: &mut Report) {
     let name = capture.cameras[camera].name.clone();
     let who = Some(name.as_str());

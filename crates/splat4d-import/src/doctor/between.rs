@@ -1,4 +1,4 @@
-//! What cameras say of each other: poses, exposure, white balance and sharpness, by features that two of them see.
+//! What cameras show about each other: poses, exposure, white balance and sharpness, by features that two of them see.
 
 use super::finding::{AGREE, FindingList, GAMMA, MATCHES, SHARPNESS, grade, unit};
 use super::look::{CameraObservations, Stand, detail};
@@ -23,8 +23,8 @@ pub(super) const EPIPOLAR: [f64; 2] = [1.0, 2.0];
 pub(super) const OWN_PIXELS: [f64; 2] = [1.0, 2.0];
 /// Exposure, and one channel against green, stops.
 pub(super) const EXPOSURE: [f64; 2] = [0.15, 0.5];
-/// And of poses: of pairs with fewer many are chance (measured on a hall and on the bundled capture), of cameras whose axes
-/// are farther apart most, degrees.
+/// And of poses: of pairs with fewer many are chance (measured on a hall and on the bundled capture), of cameras whose
+/// axes are farther apart most, degrees.
 const SURE: usize = 20;
 const APART: f64 = 60.0;
 const TELL: usize = 3;
@@ -87,7 +87,7 @@ fn around(stand: &Stand, [u, v]: [f64; 2]) -> Option<([f64; 3], f64)> {
     (mean > 0.0).then(|| (sums.map(|s| s / (side * side) as f64), fine / mean))
 }
 
-/// What two stands say of each other.
+/// What two stands show about each other.
 struct Pair {
     stands: [usize; 2],
     matches: usize,
@@ -137,8 +137,8 @@ fn pair(
 }
 
 /// A number for each camera from pairwise differences, about the median of the cameras that are connected; None for
-/// those without a pair. Least squares, in which pairs of many features count more and those that contradict little (Cauchy's
-/// weights at `scale`).
+/// those without a pair. Least squares, in which pairs of many features count more and those that contradict little
+/// (Cauchy's weights at `scale`).
 fn relative(cameras: usize, told: &[([usize; 2], f64, f64)], scale: f64) -> Vec<Option<f64>> {
     /// Of the weight of one feature: it only makes the equations of what nothing connects solvable.
     const RIDGE: f64 = 1e-9;

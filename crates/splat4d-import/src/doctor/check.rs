@@ -1,6 +1,6 @@
-//! The checks. Thresholds are of the project's own study of captures ("Doctor": what is seen in results) where no other source
-//! is named: the first of two is a warning, the second is bad. Those of flicker, dark and clipped images are chosen
-//! by eye.
+//! The checks. Thresholds are of the project's own study of captures ("Doctor": what is seen in results) where no other
+//! source is named: the first of two is a warning, the second is bad. Those of flicker, dark and clipped images are
+//! chosen by eye.
 
 use super::finding::{FindingList, grade};
 use super::look::CameraObservations;
@@ -14,9 +14,10 @@ use splat4d_train::vision::triangulate::angle_at;
 const ANGLE: [f64; 2] = [25.0, 45.0];
 /// Fewer cameras than the first are limited, than the second poor.
 const CAMERAS: [usize; 2] = [6, 4];
-/// Part of the space in which something moves that three cameras see; less than the first is a warning, than the second bad.
+/// Part of the space in which something moves that three cameras see; less than the first is a warning, than the second
+/// bad.
 const VOLUME: [f64; 2] = [0.8, 0.5];
-/// Part of the memory that training takes: the system and other programs want theirs, and what does not fit is swapped.
+/// Part of the memory that training takes: the system and other programs need theirs, and what does not fit is swapped.
 const MEMORY: [f64; 2] = [0.8, 1.0];
 /// Cameras with one fault become one finding from this part of all on.
 const MOST: f64 = 0.5;

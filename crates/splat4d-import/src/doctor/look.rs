@@ -18,7 +18,7 @@ const MEDIAN_FROM: usize = 3;
 const STANDS: usize = 16;
 /// A value at or above (at or below one minus) this is clipped, of 255.
 const CLIPPED: [u8; 2] = [2, 253];
-/// Corners that must be found again before a camera is said to have moved.
+/// Corners that must be found again before a camera is declared to have moved.
 const CORNERS: usize = 12;
 /// Pixels along a side of the cells that motion is noted in.
 pub(super) const CELL: usize = 8;

@@ -49,7 +49,7 @@ pub struct Finding {
     pub unit: &'static str,
     /// The finding, a sentence.
     pub what: String,
-    /// What it will look like, a sentence; empty where that is said.
+    /// What it will look like, a sentence; empty where that is reported.
     pub looks: &'static str,
     /// The remedy, a sentence.
     pub remedy: String,
@@ -84,8 +84,8 @@ pub struct CameraReport {
 }
 
 impl CameraReport {
-    /// Limits of one of its numbers, by the name of its field, for images of this camera: beyond the first is a warning,
-    /// beyond the second bad. Of sharpness and focus, below.
+    /// Limits of one of its numbers, by the name of its field, for images of this camera: beyond the first is a
+    /// warning, beyond the second bad. Of sharpness and focus, below.
     pub fn limits(field: &str, view: &Camera) -> Option<[f64; 2]> {
         // Small images resolve less: their own pixels count.
         let or_pixels = |limits, pixels: [f64; 2]| finding::worse(limits, pixels.map(|p| p * finding::unit(view)));
@@ -100,7 +100,7 @@ impl CameraReport {
     }
 }
 
-/// What two cameras say of each other.
+/// What two cameras show about each other.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct PairReport {
     /// Their names.

@@ -7,7 +7,7 @@ use splat4d_train::vision::triangulate::{self, PixelObservation};
 
 /// Cells of the cube along each side.
 const SIDE: usize = 40;
-/// Half the cube's side, of the cameras' median distance from what they look at: it holds what stands half way to them.
+/// Half the cube's side, of the cameras' median distance from what they look at: it holds what is half way to them.
 const HALF: f64 = 0.6;
 /// So many cameras bound a place, and so many give it a shape.
 const SEES: [usize; 2] = [2, 3];

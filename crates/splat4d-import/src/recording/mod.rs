@@ -69,7 +69,7 @@ pub struct Request {
     pub apart: Option<([String; 2], f64)>,
     /// Tags that are in the images, for lengths and upwards.
     pub board: Option<Board>,
-    /// A camera and the metres that it stands above the floor.
+    /// A camera and its height above the floor, metres.
     pub camera_height: Option<(String, f64)>,
     /// A calibration of the cameras, in any of [`crate::calibration`]'s dialects.
     pub calibration: Option<PathBuf>,

@@ -133,7 +133,7 @@ fn stood(stored: &Stored<'_>, solved: &Solved) -> Vec<TagImage> {
     out
 }
 
-/// Moving cameras look from everywhere at a board that stands.
+/// Moving cameras look from everywhere at a fixed board.
 fn walked(stored: &Stored<'_>, solved: &Solved) -> Vec<TagImage> {
     let mut out = Vec::new();
     for (camera, stand) in solved.cameras.iter().enumerate() {

@@ -12,7 +12,7 @@ use splat4d_train::event::Progress;
 
 /// Upwards is an axis of a calibrated world where that is so near (cosine of 15 degrees): people calibrate on floors.
 const ALONG_AXIS: f64 = 0.966;
-/// Degrees between what floor and walls say and what cameras hold upwards that are reported.
+/// Degrees between the up direction of floor and walls and that of the cameras from which on it is reported.
 const TOLD: f64 = 1.0;
 
 /// Where the world is from.
@@ -130,7 +130,7 @@ fn apart(solved: &Solved, stored: &Stored<'_>, pair: &[String; 2], metres: f64) 
     Ok(metres / now)
 }
 
-/// How high a camera stands above the floor, in the unit that is.
+/// How high a camera is above the floor, in the current unit.
 fn height(solved: &Solved, stored: &Stored<'_>, name: &str) -> Result<f64> {
     let other = |what: String| {
         Error::input(what)

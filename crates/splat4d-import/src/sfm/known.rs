@@ -1,4 +1,5 @@
-//! Cameras of which the lens is known, or the lens and the place: features are straightened once, and the rest is found about them.
+//! Cameras of which the lens is known, or the lens and the place: features are straightened once, and the rest is found
+//! about them.
 
 use super::lens::{Known, Lens as Plain, unit};
 use super::mapper::{Ground, Mapped, Mapping};
@@ -11,7 +12,8 @@ use splat4d::scene::{Camera, Intrinsics};
 use splat4d_train::capture::Distortion;
 use splat4d_train::event::Progress;
 
-/// Rays farther off the axis than this (tangent; 72 degrees) are left out: a straightened pixel there is wide, and of little use.
+/// Rays farther off the axis than this (tangent; 72 degrees) are left out: a straightened pixel there is wide, and of
+/// little use.
 const WIDEST: f64 = 3.0;
 
 /// Takes pixels of images to those of the pinhole camera with its principal point in the middle.
@@ -118,10 +120,11 @@ const QUARTILE_TO_MEDIAN: f64 = 2.117;
 const AGREE: usize = 2;
 const TELL: usize = 3;
 
-/// How far what each camera shows is from where the given poses say, pixels of the files' images.
+/// Distance of each camera's features from their positions by the given poses, pixels of the files' images.
 ///
-/// Links must have been found without these poses. Distances are epipolar, as the doctor takes them: the lower quartile of a
-/// pair, as the median that it implies, for chance matches only add large ones; of a camera the second least of its pairs.
+/// Links must have been found without these poses. Distances are epipolar, as the doctor takes them: the lower quartile
+/// of a pair, as the median that it implies, for chance matches only add large ones; of a camera the second least of
+/// its pairs.
 fn errors(sights: &[CameraView], links: &[Link]) -> Vec<Option<f64>> {
     let camera = |s: &CameraView| {
         let lens = Plain::plain(s.focal?, s.size[0], s.size[1]);

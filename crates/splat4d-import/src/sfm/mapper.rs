@@ -38,10 +38,12 @@ pub struct Mapping {
 
 impl Default for Mapping {
     fn default() -> Self {
-        // Schönberger and Frahm 2016 (COLMAP) filter at 4 pixels and 1.5 degrees. The rest is measured: most sightings are exact to
-        // 0.16 pixels, so that a loss of 0.6 halves the errors of focal lengths against one of 2; principal points kept within
-        // 0.3 % are best for the bundled capture, whose true ones are in the middle (0.28 degrees, 0.43 with 1 %), and 1 % for the
-        // hall (0.73 degrees, 0.91 with 0.3 %).
+        // Schönberger and Frahm 2016 (COLMAP) filter at 4 pixels and 1.5 degrees. The rest is measured: most sightings
+        // are exact to
+        // 0.16 pixels, so that a loss of 0.6 halves the errors of focal lengths against one of 2; principal points kept
+        // within
+        // 0.3 % are best for the bundled capture, whose true ones are in the middle (0.28 degrees, 0.43 with 1 %), and
+        // 1 % for the hall (0.73 degrees, 0.91 with 0.3 %).
         Self { seed: 0, starts: 6, clocks: true, tolerance: 4.0, angle: 1.5, center: 0.005, k1: 0.01, scale: 0.6 }
     }
 }
@@ -68,22 +70,23 @@ const ALL_FROM: usize = 7;
 const FEWEST: usize = 4;
 /// Everything is adjusted again once there are so many times as many views.
 const GROWTH: f64 = 1.08;
-/// Standard deviations: of log f where it is guessed and where it is known; of k1; of the principal point, of the larger side; of
-/// clocks, frames (measured on the hall: 6 pixels of 640, 2 frames).
+/// Standard deviations: of log f where it is guessed and where it is known; of k1; of the principal point, of the
+/// larger side; of clocks, frames (measured on the hall: 6 pixels of 640, 2 frames).
 const GUESSED: f64 = 0.3;
 const TOLD: f64 = 0.1;
 const CLOCK: f64 = 2.0;
 /// Epipolar distance of matches that are searched for once cameras are placed, of the tolerance.
 const GUIDED_WITHIN: f64 = 0.5;
-/// Lenses whose focal lengths are found to differ by no more than this share are taken for equal ones, from so many on; they then
-/// differ by this share (standard deviation). Of two phones of one model focal lengths differ by some tenths of a per cent.
+/// Lenses whose focal lengths are found to differ by no more than this share are taken for equal ones, from so many on;
+/// they then differ by this share (standard deviation). Of two phones of one model focal lengths differ by some tenths
+/// of a per cent.
 const ALIKE: f64 = 0.06;
 const FAMILY_FROM: usize = 4;
 const FAMILY: f64 = 0.003;
 /// Where images contradict that, lenses differ by this share: of phones of several models, some per cent.
 const STRANGERS: f64 = 0.05;
-/// Twice the loss that it costs to take lenses for equal, of the variance of a sighting and for each lens: more contradicts it.
-/// Were sightings' errors independent, 1 would be usual (Wilks 1938).
+/// Twice the loss that it costs to take lenses for equal, of the variance of a sighting and for each lens: more
+/// contradicts it. Were sightings' errors independent, 1 would be usual (Wilks 1938).
 const CONTRADICTS: f64 = 8.0;
 /// Rounds of adjusting, leaving out and finding again at the end.
 const ROUNDS: usize = 4;
@@ -224,7 +227,7 @@ impl<'a> Ground<'a> {
         map
     }
 
-    /// The map of cameras that stand where they are said to, with the clocks that were found before.
+    /// The map of cameras at their stated positions, with the clocks that were found before.
     pub(super) fn given(&self, before: Option<&Mapped>) -> Map<'_> {
         let mut map = self.empty(1.0);
         map.order = (0..self.sights.len()).collect();
@@ -463,8 +466,8 @@ impl Map<'_> {
         2.0 * (alike - strangers) > CONTRADICTS * variance * lenses.len() as f64
     }
 
-    /// Whether all lenses seem to be of one model: rigs are often made of equal cameras, and what differs between them is then the
-    /// error of each. Of too few, or of images of several sizes, it is not asked.
+    /// Whether all lenses seem to be of one model: rigs are often made of equal cameras, and what differs between them
+    /// is then the error of each. Of too few, or of images of several sizes, it is not asked.
     fn family(&self, lenses: &[usize]) -> bool {
         if lenses.len() < FAMILY_FROM || self.order.len() < ALL_FROM {
             return false;

@@ -1,11 +1,12 @@
 //! Places of features made exact: the windows about one point in all its images are laid over each other.
 //!
-//! A detector finds the middle of a blob, which is another place of the thing from every side, some tenths of a pixel off. What
-//! counts for poses is that all images mean the same place: the window of one image, warped as a small plane at the
-//! point
+//! A detector finds the middle of a blob, which is another place of the thing from every side, some tenths of a pixel
+//! off. What counts for poses is that all images mean the same place: the window of one image, warped as a small plane
+//! at the point
 //! would be seen from the other camera, is moved over the other image until they agree best (Lucas and Kanade 1981,
 //! with an
-//! affine warp and gain and offset of brightness; features are adjusted before bundle adjustment as by Lindenberger et al. 2021).
+//! affine warp and gain and offset of brightness; features are adjusted before bundle adjustment as by Lindenberger et
+//! al. 2021).
 
 use super::lens::Lens;
 use splat4d::math::Se3;
@@ -62,8 +63,8 @@ impl Shown {
     }
 }
 
-/// Weights of four neighbours at a place between the middle two (Catmull and Rom 1974): linear ones blur, by how much depends on
-/// the place, and draw places to pixels' middles.
+/// Weights of four neighbours at a place between the middle two (Catmull and Rom 1974): linear ones blur, by how much
+/// depends on the place, and draw places to pixels' middles.
 fn cubic(t: f64) -> [f64; 4] {
     let (t2, t3) = (t * t, t * t * t);
     [0.5 * (-t + 2.0 * t2 - t3), 0.5 * (2.0 - 5.0 * t2 + 3.0 * t3), 0.5 * (t + 4.0 * t2 - 3.0 * t3), 0.5 * (t3 - t2)]
@@ -158,9 +159,9 @@ const FLAT: f64 = 4.0;
 /// How far the warp may differ from a plane's that faces the cameras: slanted planes are up to twice as narrow.
 const SLANT: f64 = 1.0;
 
-/// The place of every sighting that agrees with the most central one's, by number, as offsets in pixels; those that do not agree
-/// have none. The most central one itself stays. All `None`: nothing can be said. Then the same of `more` cameras, whose places
-/// are guesses.
+/// The place of every sighting that agrees with the most central one's, by number, as offsets in pixels; those that do
+/// not agree have none. The most central one itself stays. All `None`: nothing can be determined. Then the same of
+/// `more` cameras, whose places are guesses.
 pub(super) fn aligned(x: [f64; 3], seen: &[ImagePoint<'_>], more: &[ImagePoint<'_>]) -> Vec<Option<[f64; 2]>> {
     let toward: Vec<[f64; 3]> = seen.iter().map(|s| normalize(sub(s.eye.center(), x))).collect();
     let central = |k: usize| toward.iter().map(|t| dot(*t, toward[k])).sum::<f64>();
@@ -176,7 +177,7 @@ pub(super) fn aligned(x: [f64; 3], seen: &[ImagePoint<'_>], more: &[ImagePoint<'
     out
 }
 
-/// How pixels about a point in one image are in another one, if it stands on a plane with this normal.
+/// How pixels about a point in one image are in another one, if it is on a plane with this normal.
 fn warp(x: [f64; 3], normal: [f64; 3], from: &ImagePoint<'_>, to: &ImagePoint<'_>) -> Option<[[f64; 2]; 2]> {
     /// Pixels over which the slope is taken.
     const STEP: f64 = 2.0;

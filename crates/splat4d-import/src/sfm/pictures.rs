@@ -69,8 +69,8 @@ pub struct CameraView {
     pub factor: f64,
     /// The focal length in pixels, where it is known roughly.
     pub focal: Option<f64>,
-    /// Whether the lens is known exactly: then features are where a pinhole camera of this focal length, its principal point in
-    /// the middle, sees them.
+    /// Whether the lens is known exactly: then features are where a pinhole camera of this focal length, its principal
+    /// point in the middle, sees them.
     pub exact: bool,
     /// Takes world points into the camera's axes, where that is known.
     pub pose: Option<Se3>,
@@ -102,8 +102,8 @@ pub struct FeatureOptions {
 
 impl Default for FeatureOptions {
     fn default() -> Self {
-        // Measured on a hall with 31 cameras of 640x360: contrasts of OpenCV's 0.004 to 0.01 (divided by its three layers) and ten
-        // times map it. Poses of the bundled capture are 1.3 times as exact with 25 times as with ten.
+        // Measured on a hall with 31 cameras of 640x360: contrasts of OpenCV's 0.004 to 0.01 (divided by its three
+        // layers) and ten times map it. Poses of the bundled capture are 1.3 times as exact with 25 times as with ten.
         Self { moments: 16, contrast: 0.003, still: 4000, moving: 800, pixels: 1_200_000 }
     }
 }
@@ -241,8 +241,8 @@ pub(crate) fn fixed(
     let clock = (0..count).find(|&c| !still(c)).filter(|_| first < last);
     let moments: Vec<f64> = if let Some(clock) = clock {
         let step = (last - first) / look.moments as f64;
-        // Each at a frame of one camera: where clocks agree no feature is brought to another time by its own velocity, whose noise
-        // it would take along.
+        // Each at a frame of one camera: where clocks agree no feature is brought to another time by its own velocity,
+        // whose noise it would take along.
         let frames: Vec<f64> = (0..pictures.frames(clock)).map(|k| pictures.time(clock, k)).collect();
         let near = |t: f64| frames.iter().copied().min_by(|a, b| (a - t).abs().total_cmp(&(b - t).abs()));
         let mut all: Vec<f64> = (0..look.moments).filter_map(|k| near(first + (k as f64 + 0.5) * step)).collect();
@@ -326,7 +326,7 @@ struct Window {
 }
 
 impl Window {
-    /// What holds all wanted pixels and enough about them for features and velocities; `None`: there are none.
+    /// What holds all requested pixels and enough about them for features and velocities; `None`: there are none.
     fn around(width: usize, height: usize, wanted: &dyn Fn(usize, usize) -> bool) -> Option<Self> {
         /// Descriptors of ordinary features and motion of a frame reach no farther, pixels.
         const MARGIN: usize = 48;

@@ -15,7 +15,7 @@ use splat4d_train::vision::triangulate::Transfer;
 const RATIO: f32 = 0.8;
 /// Features nearer than this to each other show one place: no rivals, pixels.
 const SAME: f64 = 1.5;
-/// Pairs of images with fewer verified matches say nothing: seven always agree.
+/// Pairs of images with fewer verified matches carry no information: seven always agree.
 const LEAST: usize = 14;
 /// Of the matches the least share that is verified: by chance more agree only among few.
 const LEAST_SHARE: f64 = 0.15;
@@ -182,7 +182,7 @@ pub(crate) struct Known {
 
 /// Second-best matches are searched for along the epipolar line alone, where there are few: they must be farther away.
 const GUIDED_RATIO: f32 = 0.75;
-/// What is alone on its line must be as good as if something quite unlike stood next to it: squared distance of
+/// What is alone on its line must be as good as if something quite unlike was next to it: squared distance of
 /// descriptors, an
 /// eighth of the largest there is.
 const FAR: f32 = 65_536.0;
@@ -309,8 +309,8 @@ fn verified(sights: &[CameraView], [a, b]: [usize; 2], matches: Vec<([usize; 2],
     })
 }
 
-/// Joins the matches of all links, surest first, so that no track has two places of one sight. Tracks ascend by their first
-/// features.
+/// Joins the matches of all links, surest first, so that no track has two places of one sight. Tracks ascend by their
+/// first features.
 pub fn join(sights: &[CameraView], links: &[Link]) -> Vec<Track> {
     // Features of exactly one place are one.
     let mut starts = vec![0];

@@ -1,4 +1,4 @@
-//! What two images of one scene say about each other: fundamental and essential matrices, and the motion between their
+//! What two images of one scene show about each other: fundamental and essential matrices, and the motion between their
 //! cameras.
 
 use super::algebra::{
@@ -12,8 +12,8 @@ use std::sync::LazyLock;
 /// A place as the first and the second image show it.
 pub type Pair = [[f64; 2]; 2];
 
-/// Samples, at most: enough for seven clean of thirty per cent clean data with a chance of one half, and for five of them
-/// with any chance.
+/// Samples, at most: enough for seven clean of thirty per cent clean data with a chance of one half, and for five of
+/// them with any chance.
 const MOST: usize = 3000;
 /// Chance of leaving too early.
 const MISSED: f64 = 1e-3;
@@ -61,8 +61,8 @@ fn seven(sample: &[Pair]) -> Vec<Mat3> {
         .collect()
 }
 
-/// Pairs in which a fundamental matrix is searched for, about the images' middles and in units of their size, so that the
-/// system is well conditioned (Hartley 1997).
+/// Pairs in which a fundamental matrix is searched for, about the images' middles and in units of their size, so that
+/// the system is well conditioned (Hartley 1997).
 struct Uncalibrated<'a> {
     pairs: &'a [Pair],
     unit: f64,
@@ -119,8 +119,8 @@ pub(crate) fn fundamental(pairs: &[Pair], size: f64, tolerance: f64, rng: Rng) -
     Some(found)
 }
 
-/// How far a fundamental matrix is from one of two cameras of this focal length: 1 − σ₂/σ₁ of the essential matrix, whose
-/// first two singular values are equal. 0 is perfect.
+/// How far a fundamental matrix is from one of two cameras of this focal length: 1 − σ₂/σ₁ of the essential matrix,
+/// whose first two singular values are equal. 0 is perfect.
 pub(crate) fn unlike_focal(f: &Mat3, focal: f64) -> f64 {
     let k = [focal, focal, 1.0];
     let e: Mat3 = std::array::from_fn(|i| std::array::from_fn(|j| f[i][j] * k[i] * k[j]));
@@ -128,8 +128,8 @@ pub(crate) fn unlike_focal(f: &Mat3, focal: f64) -> f64 {
     if s[0] > 0.0 { 1.0 - s[1] / s[0] } else { 1.0 }
 }
 
-/// Exponents of x, y and z of the monomials of degree three and less, in the order of Nistér 2004, so that ten of them can be
-/// eliminated and what is left are polynomials in z times x, y and 1.
+/// Exponents of x, y and z of the monomials of degree three and less, in the order of Nistér 2004, so that ten of them
+/// can be eliminated and what is left are polynomials in z times x, y and 1.
 const MONOMIALS: [[usize; 3]; 20] = [
     [3, 0, 0],
     [0, 3, 0],
@@ -165,8 +165,8 @@ static PRODUCTS: LazyLock<[[usize; 20]; 20]> = LazyLock::new(|| {
     std::array::from_fn(|i| std::array::from_fn(|k| place(MONOMIALS[i], MONOMIALS[k])))
 });
 
-/// The essential matrices of five pairs of rays (depth 1): b·E·a = 0, det E = 0 and 2 E Eᵀ E = tr(E Eᵀ) E (Nistér 2004, "An
-/// efficient solution to the five-point relative pose problem").
+/// The essential matrices of five pairs of rays (depth 1): b·E·a = 0, det E = 0 and 2 E Eᵀ E = tr(E Eᵀ) E (Nistér 2004,
+/// "An efficient solution to the five-point relative pose problem").
 pub fn five(sample: &[Pair; 5]) -> Vec<Mat3> {
     let rows: Vec<[f64; 9]> = sample.iter().map(row).collect();
     let null = null_space(&rows);
@@ -302,8 +302,8 @@ impl Data for Calibrated<'_> {
     }
 }
 
-/// The motion of least squares of the first-order distances of pairs of rays, near a given one: Gauss-Newton on the rotation
-/// and on the direction of the translation.
+/// The motion of least squares of the first-order distances of pairs of rays, near a given one: Gauss-Newton on the
+/// rotation and on the direction of the translation.
 pub(crate) fn polish_motion(start: &Se3, rays: &[Pair]) -> Se3 {
     /// From a good start the steps shrink as fast as rounding allows.
     const STEPS: usize = 10;

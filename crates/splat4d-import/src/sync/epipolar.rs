@@ -1,5 +1,5 @@
-//! Lags by geometry: what moves is on the epipolar line of where the other camera saw it at the same time, and leaves the
-//! line at any other.
+//! Lags by geometry: what moves is on the epipolar line of where the other camera saw it at the same time, and leaves
+//! the line at any other.
 
 use super::tracks::Track;
 use super::{NORMAL_MAD, Refusal, median};
@@ -7,7 +7,8 @@ use rayon::prelude::*;
 use splat4d::math::se3::{mat_mul, mat_vec, norm, sub, transpose};
 use splat4d::scene::Camera;
 
-/// Pixels off the epipolar line from which on a match at some lag is none: a few times what corners and poses are exact to.
+/// Pixels off the epipolar line from which on a match at some lag is none: a few times what corners and poses are exact
+/// to.
 const TOLERANCE: f64 = 3.0;
 /// Pixels that corners and poses are usually off, together, in the search.
 const USUAL: f64 = 1.0;
@@ -23,8 +24,9 @@ const MOVES: f64 = 2.0;
 const MATCHES: usize = 8;
 /// Times that a match must have in common.
 const COMMON: usize = 3;
-/// By how much the best lag's log-likelihood must exceed the median over lags, in median absolute deviations of lags. All of
-/// 22 pairs of a real hall with 2.5 to 12 were right; of tracks without anything in common the other bound decides.
+/// By how much the best lag's log-likelihood must exceed the median over lags, in median absolute deviations of lags.
+/// All of 22 pairs of a real hall with 2.5 to 12 were right; of tracks without anything in common the other bound
+/// decides.
 const STANDS_OUT: f64 = 2.5;
 /// And by how much for every track: tracks without anything in common reach 0.02 by chance, pairs of the hall
 /// 0.23 to 1.05.
@@ -65,8 +67,8 @@ pub struct Range {
 }
 
 /// How much later camera b notes what camera a notes, by tracks in undistorted pixels and the fundamental matrix
-/// (`x_bᵀ F x_a = 0`). `matches` are pairs of tracks that may show the same point, some of them wrongly; without them all
-/// pairs are tried.
+/// (`x_bᵀ F x_a = 0`). `matches` are pairs of tracks that may show the same point, some of them wrongly; without them
+/// all pairs are tried.
 pub(crate) fn lag(
     f: &[[f64; 3]; 3],
     [a, b]: [&[Track]; 2],
@@ -131,7 +133,7 @@ pub(crate) fn fundamental(a: &Camera, b: &Camera) -> [[f64; 3]; 3] {
     mat_mul(&transpose(&inverse(b)), &mat_mul(&mat_mul(&cross, &rotation), &inverse(a)))
 }
 
-/// Pairs of cameras, each with so many that stand nearest to it, in order; None: a camera that takes no part.
+/// Pairs of cameras, each with so many that are nearest to it, in order; None: a camera that takes no part.
 pub fn neighbours(centers: &[Option<[f64; 3]>], count: usize) -> Vec<[usize; 2]> {
     let mut pairs = Vec::new();
     for (a, own) in centers.iter().enumerate() {
@@ -223,8 +225,8 @@ impl Problem<'_> {
 
     /// Mean squared distances of pairs at every lag, none more than the tolerance's; only pairs that fit somewhere.
     fn costs(&self, pairs: &[[usize; 2]], grid: &[f64]) -> Vec<Costs> {
-        // Everything that does not depend on the pair comes first: lines of the one's places, places of the other and their
-        // lines, by time.
+        // Everything that does not depend on the pair comes first: lines of the one's places, places of the other and
+        // their lines, by time.
         let mut times: Vec<f64> = self.a.iter().flat_map(|t| t.samples.iter().map(|s| s.0)).collect();
         times.sort_by(f64::total_cmp);
         times.dedup();
@@ -257,7 +259,8 @@ impl Problem<'_> {
         out
     }
 
-    /// The mean of the squared distances, none more than the tolerance's; that of the tolerance where there are too few.
+    /// The mean of the squared distances, none more than the tolerance's; that of the tolerance where there are too
+    /// few.
     fn cost(&self, pair: [usize; 2], lag: f64) -> f64 {
         let (mut sum, mut count) = (0.0, 0);
         for d in self.distances(pair, lag) {
@@ -315,9 +318,9 @@ impl Problem<'_> {
         matched.iter().map(of).sum::<f64>() / matched.len() as f64
     }
 
-    /// How much a match pulls at the lag (px²/s), and its information on it (px²/s²): the mean square of how fast it leaves the
-    /// line. Its times count as one, for what is wrong with a track is wrong at all of them. The variance of the lag is the sum
-    /// of the squared pulls over the squared sum of the information (White 1980).
+    /// How much a match pulls at the lag (px²/s), and its information on it (px²/s²): the mean square of how fast it
+    /// leaves the line. Its times count as one, for what is wrong with a track is wrong at all of them. The variance of
+    /// the lag is the sum of the squared pulls over the squared sum of the information (White 1980).
     fn information(&self, m: &Sightings, lag: f64, step: f64, scale: f64) -> (f64, f64) {
         let (mut pull, mut sum, mut count) = (0.0, 0.0, 0.0f64);
         for &(t, x) in &m.places {

@@ -17,8 +17,8 @@ const STEPS: usize = 20;
 const SMALL_STEP: f64 = 0.01;
 /// A corner is followed there and back; it is lost where it returns farther than this from where it was, pixels.
 const ROUND_TRIP: f64 = 0.7;
-/// The least eigenvalue of a corner's gradient matrix (mean over its window, of values from 0 to 1): a step of a twentieth
-/// across the window.
+/// The least eigenvalue of a corner's gradient matrix (mean over its window, of values from 0 to 1): a step of a
+/// twentieth across the window.
 const LEAST_EIGENVALUE: f64 = 2e-5;
 /// And relative to the strongest corner's.
 const QUALITY: f64 = 0.01;
@@ -46,7 +46,8 @@ pub fn small(picture: Rgb8) -> (Rgb8, f64) {
     (out, factor)
 }
 
-/// A point that was followed: seconds and pixel positions (the first pixel's centre is at (0.5, 0.5)), in the order of time.
+/// A point that was followed: seconds and pixel positions (the first pixel's centre is at (0.5, 0.5)), in the order of
+/// time.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Track {
     /// Time and place, frame by frame without gaps.
@@ -69,9 +70,9 @@ impl Track {
 
     /// Where it was at a time, smoothed by a cubic B-spline over four frames; None within a frame of its ends.
     ///
-    /// A line between two noisy places is less noisy half way than at either end, so that lags would be drawn to half frames (on
-    /// a real rig half of the pairs were); the weights of a cubic B-spline have nearly the same sum of squares everywhere (0.50
-    /// to 0.46), and blur the motion by the same third of a squared frame.
+    /// A line between two noisy places is less noisy half way than at either end, so that lags would be drawn to half
+    /// frames (on a real rig half of the pairs were); the weights of a cubic B-spline have nearly the same sum of
+    /// squares everywhere (0.50 to 0.46), and blur the motion by the same third of a squared frame.
     pub(crate) fn smooth(&self, time: f64) -> Option<[f64; 2]> {
         let after = self.samples.partition_point(|s| s.0 <= time);
         let first = after.checked_sub(2)?;
@@ -213,8 +214,8 @@ fn step(a: &Pyramid, b: &Pyramid, point: [f64; 2]) -> Option<[f64; 2]> {
     ((0.0..width).contains(&out[0]) && (0.0..height).contains(&out[1])).then_some(out)
 }
 
-/// The motion of a window at one size, by Newton's method on the squared difference; windows' means are taken off, so that
-/// light may change. None: no corner, or at the finest size something else.
+/// The motion of a window at one size, by Newton's method on the squared difference; windows' means are taken off, so
+/// that light may change. None: no corner, or at the finest size something else.
 fn at_level(a: &Grey, b: &Grey, [x, y]: [f64; 2], mut moved: [f64; 2], finest: bool) -> Option<[f64; 2]> {
     const SIDE: usize = 2 * RADIUS + 1;
     const COUNT: f64 = (SIDE * SIDE) as f64;
@@ -314,7 +315,7 @@ impl Tracker {
     }
 
     fn end(&mut self, track: Track) {
-        /// Frames that a corner must last: fewer say little of its motion, and much of what is wrong with it.
+        /// Frames that a corner must last: fewer carry little information about its motion, and mostly noise.
         const SHORTEST: usize = 4;
         if track.samples.len() >= SHORTEST {
             self.done.push(track);

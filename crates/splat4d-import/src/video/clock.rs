@@ -21,7 +21,7 @@ const MOST: f64 = 0.75;
 const STILL: f64 = 0.02;
 /// Intervals that differ from the median by more than this part of it vary.
 const VARIES: f64 = 0.1;
-/// The part of the intervals that must vary, gaps left out, before the rate is said to.
+/// The part of the intervals that must vary, gaps left out, before the rate is reported as variable.
 const VARIABLE_FROM: f64 = 0.05;
 
 /// Frames that are missing.

@@ -7,7 +7,7 @@ use super::{Frame, Info, Reader, SOUND_RATE, Selection, Source, fingerprint_of_f
 use splat4d::{Error, ErrorKind, Result};
 use std::path::{Path, PathBuf};
 
-/// Seconds before the first wanted frame where reading begins, so that rounding does not lose it.
+/// Seconds before the first requested frame where reading begins, so that rounding does not lose it.
 const SEEK_MARGIN: f64 = 1e-3;
 /// A time stamp is this exact: a tick of the coarsest usual clocks (Matroska's) is a millisecond.
 const STAMP_ERROR: f64 = 0.6e-3;
@@ -71,8 +71,8 @@ impl Source for Video {
         }
         let seek = selection.from.map_or(0.0, |from| (from - SEEK_MARGIN).max(0.0));
         if seek > 0.0 {
-            // Its own clock is kept: shifted to the place that was sought, time stamps are rounded to ticks of the file, and those of
-            // AVI are whole frames.
+            // Its own clock is kept: shifted to the place that was sought, time stamps are rounded to ticks of the
+            // file, and those of AVI are whole frames.
             input.extend(["-copyts".into(), "-start_at_zero".into(), "-ss".into(), format!("{seek:.6}")]);
         }
         if let Some(to) = selection.to {

@@ -231,7 +231,7 @@ fn steps(names: &[String]) -> Vec<f64> {
     let Some(numbers) = names.iter().map(number).collect::<Option<Vec<f64>>>() else { return by_position() };
     let gaps: Vec<f64> = numbers.windows(2).map(|w| w[1] - w[0]).collect();
     let least = gaps.iter().copied().fold(f64::INFINITY, f64::min);
-    // Where most steps differ from one another, numbers say nothing of time.
+    // Where most steps differ from one another, numbers carry no information about time.
     let even = gaps.iter().filter(|g| **g == least).count() * 2 >= gaps.len();
     if gaps.is_empty() || least <= 0.0 || !even || gaps.iter().any(|g| (g / least).fract() != 0.0) {
         return by_position();

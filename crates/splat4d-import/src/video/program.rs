@@ -105,7 +105,7 @@ impl Tools {
         Ok(String::from_utf8_lossy(&out.stdout).into_owned())
     }
 
-    /// Starts ffmpeg on a file; `input` stands before the file's name, `output` behind it, and what it makes comes
+    /// Starts ffmpeg on a file; `input` is before the file's name, `output` behind it, and what it makes comes
     /// through a pipe.
     pub(super) fn start(&self, path: &Path, input: &[String], output: &[String]) -> Result<Running> {
         let mut command = Command::new(&self.ffmpeg);
@@ -219,7 +219,7 @@ impl Running {
         done
     }
 
-    /// Waits for the end: whether all went well, and what was said.
+    /// Waits for the end: whether it succeeded, and its messages.
     pub(super) fn finish(&mut self) -> (bool, Said) {
         let well = self.child.wait().is_ok_and(|s| s.success());
         let said = self.listener.take().and_then(|l| l.join().ok()).unwrap_or_default();
@@ -247,7 +247,8 @@ fn version(text: &str) -> Option<(u32, u32)> {
 
 /// The time in a line of one of our two `showinfo` filters:
 /// `[showinfo@all @ 0x5] [info] n: 3 pts: 1536 pts_time:0.1 ...`. `units` are the unit of time stamps, printed before:
-/// `[showinfo@all @ 0x5] [info] config in time_base: 1/15360, ...`. (`pts_time` has six digits, too few for long recordings.)
+/// `[showinfo@all @ 0x5] [info] config in time_base: 1/15360, ...`. (`pts_time` has six digits, too few for long
+/// recordings.)
 fn stamp(line: &str, units: &mut [Option<f64>; 2]) -> Option<(Stamp, Option<f64>)> {
     let rest = line.strip_prefix("[showinfo@")?;
     let which = match rest.split(' ').next()? {

@@ -237,7 +237,7 @@ fn what_is_no_video_is_refused_with_a_reason() {
     std::fs::write(path("noise.mp4"), [7; 3000]).unwrap();
     made.make("sound.wav", "-f lavfi -i sine=d=0.1");
     let whole = made.make("whole.mp4", &format!("{MOVING} -c:v mpeg4"));
-    // Without its table, which stands at the end.
+    // Without its table, which is at the end.
     let bytes = std::fs::read(&whole).unwrap();
     std::fs::write(path("headless.mp4"), &bytes[..bytes.len() / 2]).unwrap();
     for (name, word) in [

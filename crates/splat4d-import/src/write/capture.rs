@@ -47,7 +47,8 @@ pub struct Recording {
     pub up: Option<[f64; 3]>,
     /// The initial cloud, from the folder on.
     pub points: Option<PathBuf>,
-    /// Cameras that are kept from training. None: of a rig of fixed cameras all train, because each was placed with care.
+    /// Cameras that are kept from training. None: of a rig of fixed cameras all train, because each was placed with
+    /// care.
     pub hold_out: Vec<String>,
     /// Anything else for those who read the file; training does not.
     pub extra: Map<String, Value>,
@@ -60,7 +61,7 @@ pub fn capture(folder: &Path, take: &Recording, cameras: &[Placed]) -> Result<Pa
     if cameras.is_empty() {
         return Err(Error::input("no camera has a known position").remedy("See the report for why."));
     }
-    // The median rate of all; each camera's own times say more.
+    // The median rate of all; each camera's own times are more accurate.
     let mut intervals: Vec<f64> = cameras.iter().map(|c| c.pictures.clock.interval).filter(|i| *i > 0.0).collect();
     intervals.sort_by(f64::total_cmp);
     let interval = intervals.get(intervals.len() / 2).copied();

@@ -1,4 +1,4 @@
-//! Sightings of a map whose cameras stand: made exact, and found in cameras whose detectors missed them.
+//! Sightings of a map whose cameras are fixed: made exact, and found in cameras whose detectors missed them.
 
 use super::Map;
 use crate::sfm::overlay::{self, Eye, ImagePoint};
@@ -21,8 +21,8 @@ struct Laid {
 }
 
 impl Map<'_> {
-    /// Sights and tracks with features where windows about the points agree best, also in cameras that did not find them.
-    /// Sightings whose windows do not agree go, but of cameras that would be left with few.
+    /// Sights and tracks with features where windows about the points agree best, also in cameras that did not find
+    /// them. Sightings whose windows do not agree go, but of cameras that would be left with few.
     pub(super) fn overlaid(&self) -> (Vec<CameraView>, Vec<Track>) {
         let laid: Vec<Option<Laid>> = (0..self.tracks.len()).into_par_iter().map(|t| self.laid(t)).collect();
         let mut left = vec![0; self.sights.len()];
