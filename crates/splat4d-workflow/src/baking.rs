@@ -58,7 +58,7 @@ const CUTS: usize = 3;
 const TOO_LARGE: f64 = 1.03;
 /// A finer cut is tried where it may have this many times the primitives.
 const FINER: f64 = 1.05;
-/// A file this much more like its model than wanted, dB, is cut again, coarser.
+/// A file this much more like its model than requested, dB, is cut again, coarser.
 const SPARE: f64 = 2.0;
 /// Of the seconds that are left for baking, what the first sampling of the model may take. Sampling between frames,
 /// fitting, packing and comparing take the rest.
@@ -305,7 +305,7 @@ pub fn bake_into(source: &Source, title: &str, out: &Path, baking: &Baking, cons
     Ok(value)
 }
 
-/// What a file that is less like its model than wanted would need.
+/// What a file that is less like its model than requested would need.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Needs {
     /// dB.
@@ -328,7 +328,7 @@ impl Needs {
     }
 }
 
-/// A file, how like its model it is, and what it would take to be as like it as wanted, where it is not.
+/// A file, how like its model it is, and what it would take to be as like it as requested, where it is not.
 pub struct Cooked {
     pub packed: Packed,
     pub likeness: Option<bake::Likeness>,
@@ -336,7 +336,7 @@ pub struct Cooked {
 }
 
 impl Cooked {
-    /// Greater is better: within its bytes, then as like its model as wanted, then small.
+    /// Greater is better: within its bytes, then as like its model as requested, then small.
     fn rank(&self, most: f64) -> [f64; 3] {
         let bytes = self.packed.bytes.len() as f64;
         let psnr = self.likeness.as_ref().map_or(0.0, |l| l.psnr);

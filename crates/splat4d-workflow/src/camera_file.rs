@@ -4,7 +4,7 @@
 //! {"fx": 500, "fy": 500, "cx": 320, "cy": 240, "w": 640, "h": 480, "background": [0, 0, 0],
 //!  "world_to_camera": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]}
 //! ```
-//! `width` and `height` may stand for `w` and `h`. The pose is a row-major 4x4 in OpenCV axes (x right, y down, z
+//! `width` and `height` may represent `w` and `h`. The pose is a row-major 4x4 in OpenCV axes (x right, y down, z
 //! forward); pixel centres are at +0.5.
 
 use crate::files::read_text;

@@ -59,8 +59,8 @@ pub fn in_words(outlook: &ChunkEstimate) -> String {
     words
 }
 
-/// Does what is wanted of a capture, and appends what is finished to its playback file, within the options' minutes. `None`: nothing
-/// was to do.
+/// Does the requested work on a capture, and appends what is finished to its playback file, within the options'
+/// minutes. `None`: nothing was to do.
 pub fn work(
     run: &Path,
     chunked: &Chunked,

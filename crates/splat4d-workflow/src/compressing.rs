@@ -354,7 +354,7 @@ impl Work {
         Ok(())
     }
 
-    /// What is said where a Ctrl-C ends it.
+    /// What is reported where a Ctrl-C ends it.
     fn kept(&self) -> String {
         format!("what was tuned is kept: splat4d compress --resume {} continues", in_command(&self.dir))
     }
@@ -520,7 +520,7 @@ impl Work {
         Ok(summary)
     }
 
-    /// Whether size or guard want another attempt; then the order is changed, and the folder is ready for it.
+    /// Whether size or guard need another attempt; then the order is changed, and the folder is ready for it.
     fn refused(&mut self, before: &Scores, after: &Scores, bytes: u64, console: &dyn Listener) -> Result<bool> {
         let (Some(was), Some(is)) = (before.train("PSNR"), after.train("PSNR")) else { return Ok(false) };
         let settings = &self.order.settings;
@@ -595,7 +595,7 @@ fn steps(run: &Run) -> Vec<Step> {
     let mut out: Vec<Step> = Vec::new();
     let mut before = (0, 0.0);
     for row in &run.metrics {
-        // The row of the very last step stands behind the last stage.
+        // The row of the very last step is behind the last stage.
         if row.stage != DONE && out.last().is_none_or(|s| s.name != row.stage) {
             before = out.iter().fold((0, 0.0), |b, s| (b.0 + s.steps, b.1 + s.seconds));
             out.push(Step { name: row.stage.clone(), ..Step::default() });

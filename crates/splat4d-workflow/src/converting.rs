@@ -164,7 +164,7 @@ pub fn run(args: &Conversion, console: &dyn Listener) -> Result<()> {
     write(args, source, console)
 }
 
-/// Reads values as they are where the options say so.
+/// Reads values as they are where the options specify it.
 fn read_linear(source: &mut Source, linear: &[Linear]) {
     for &what in linear {
         // The reader's own doubt about them is settled.
@@ -386,7 +386,7 @@ fn write_frames(
     Ok(())
 }
 
-/// Rotates the scene so that the wanted axis is up, and returns the rotation that was made.
+/// Rotates the scene so that the requested axis is up, and returns the rotation that was made.
 fn rotate(scene: &mut Scene<f32>, up: Up, target: Target, console: &dyn Listener) -> [[f64; 3]; 3] {
     let custom = match target {
         Target::Dialect(d) => Some(d.up),

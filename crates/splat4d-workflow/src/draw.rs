@@ -259,7 +259,7 @@ impl<'a> Painter<'a> {
         self.backend.name()
     }
 
-    /// Renders into [`image`](Self::image). A GPU that fails on the way is said, and left for the CPU.
+    /// Renders into [`image`](Self::image). A GPU that fails on the way is reported, and left for the CPU.
     pub fn draw(&mut self, camera: &Camera, time: f64) {
         if self.channel.is_field() {
             return self.draw_field(camera, time);

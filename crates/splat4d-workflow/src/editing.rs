@@ -60,8 +60,8 @@ pub struct EditOptions {
 
 /// Replays edits on a scene and writes the result in the format of the output's extension.
 ///
-/// Errors: a list that cannot be read; nothing to do; a step that fails; an output that cannot be written, in which case the old
-/// file stays.
+/// Errors: a list that cannot be read; nothing to do; a step that fails; an output that cannot be written, in which
+/// case the old file stays.
 ///
 /// ```no_run
 /// use splat4d::edit::Step;
@@ -274,7 +274,7 @@ impl Context for Bring<'_> {
     }
 }
 
-/// Gaussians that float, and what held-out images say of it.
+/// Gaussians that float, and what held-out images show about them.
 pub struct Proposal {
     pub selected: Selected,
     /// Images that were compared, and their mean PSNR with and without the floaters, dB.
@@ -342,8 +342,8 @@ pub fn with_steps(mut edits: Edits, steps: impl IntoIterator<Item = Step>) -> Ed
     edits
 }
 
-/// Where an edited scene comes from: what its file said before, with these edits behind those and other words if there are
-/// some.
+/// Where an edited scene comes from: what its file said before, with these edits behind those and other words if there
+/// are some.
 pub fn provenance(source: &Source, earlier: Option<Provenance>, edits: &Edits, words: Option<String>) -> Provenance {
     let earlier = earlier.unwrap_or_default();
     let print = |run: &Run| run.info.get("capture_fingerprint")?.as_str().map(str::to_owned);

@@ -29,7 +29,7 @@ const KEPT: usize = 4;
 const MOST_SIDE: usize = 1280;
 /// Longer side of the image in which depths are looked up, pixels.
 const PICK_SIDE: usize = 240;
-/// Quality of the JPEG that stands in until the scene is baked.
+/// Quality of the JPEG shown until the scene is baked.
 const QUALITY: u8 = 80;
 /// Most selected Gaussians whose places a page gets: more dots cannot be distinguished.
 const POINTS: usize = 3000;
@@ -200,7 +200,7 @@ impl Editor {
                 let number = self.bakings.fetch_add(1, Ordering::SeqCst) + 1;
                 let (scene, _) = self.replayed(&steps)?;
                 let bytes = self.bake(&scene, &ignore)?;
-                // Who asked again in the meantime wants to see that.
+                // A repeated request in the meantime must see that.
                 let newest = self.bakings.load(Ordering::SeqCst) == number;
                 if newest {
                     self.lock().shown = steps;
@@ -476,7 +476,7 @@ mod tests {
             self.editor.answer(asked.clone()).unwrap_or_else(|e| panic!("{asked}: {e}")).told
         }
 
-        /// What is said of what cannot be done; the list is what it was.
+        /// What is reported of what cannot be done; the list is what it was.
         fn refused(&self, asked: Value) -> String {
             let before = std::fs::read(self.list()).ok();
             let error = self.editor.answer(asked.clone()).map(|a| a.told).expect_err(&asked.to_string()).to_string();

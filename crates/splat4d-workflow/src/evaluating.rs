@@ -203,7 +203,7 @@ impl Times {
     }
 }
 
-/// Bakes the run into `scene.s4d`, whatever it takes. What goes wrong is said and never costs the run.
+/// Bakes the run into `scene.s4d`, whatever it takes. What goes wrong is reported and never costs the run.
 pub fn playback(run: &Path, console: &dyn Listener) -> Result<()> {
     playback_by(run, &Deadline::default(), console)
 }

@@ -56,7 +56,7 @@ pub trait Listener {
     /// Takes an event.
     fn on_event(&self, event: &Event<'_>);
 
-    /// How often it wants the scene during training ([`Training::Snapshot`]); none: never. Asked after
+    /// How often it needs the scene during training ([`Training::Snapshot`]); none: never. Asked after
     /// [`Event::Begun`].
     fn snapshots(&self) -> Option<Duration> {
         None
@@ -183,7 +183,7 @@ pub fn linked(text: &str) -> String {
     while let Some(at) = rest.find(FOLDER) {
         let name = at + FOLDER.len();
         let end = rest[name..].find(|c: char| !(c.is_ascii_lowercase() || c == '-')).map_or(rest.len(), |n| name + n);
-        // A path that the user gave stands at the beginning or behind another folder.
+        // A path that the user gave is at the beginning or behind another folder.
         let ours = rest[..at].ends_with([' ', '(']) && rest[end..].starts_with(".md");
         out += &rest[..at];
         out += if ours { concat!(env!("CARGO_PKG_REPOSITORY"), "/blob/main/") } else { "" };

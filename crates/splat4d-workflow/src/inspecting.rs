@@ -41,14 +41,14 @@ const MANY_FAINT: f64 = 0.5;
 const HUGE: f64 = 1.0;
 /// Share of huge Gaussians that is not healthy.
 const MANY_HUGE: f64 = 0.02;
-/// Below this many Gaussians shares say nothing.
+/// Below this many Gaussians shares carry no information.
 const FEW: usize = 100;
 /// Layers that are listed; playback files have one per page, and their sections are printed already.
 const MANY_LAYERS: usize = 8;
 /// Longest bar of a histogram, characters.
 const BAR: usize = 32;
 
-/// What readers say of values that cannot be right as they were read; all else that they say is a note. Base colours
+/// Remarks of readers about values that cannot be right; all other remarks are notes. Base colours
 /// that are all bright may be those of a bright scene.
 const DOUBTS: [&str; 8] = [
     "--linear scales",

@@ -19,7 +19,7 @@ pub enum RawFormat {
 
 /// First number of a .flo file, as text "PIEH" (Baker et al. 2011).
 const FLO_MAGIC: f32 = 202_021.25;
-/// What stands for a flow that is not known there: readers take anything above 1e9 for it.
+/// What represents a flow that is not known there: readers take anything above 1e9 for it.
 const FLO_UNKNOWN: f32 = 1e10;
 
 impl RawFormat {

@@ -26,7 +26,8 @@ pub const COMPRESS: &str = "compress.json";
 pub const ORDER: &str = "compress.toml";
 /// Start of the commands that train, in the record of who has a folder.
 const TRAIN: &str = "train";
-/// Files and folders of a run that no output of another command may replace; what is baked, rendered or reported is made again.
+/// Files and folders of a run that no output of another command may replace; what is baked, rendered or reported is
+/// made again.
 const KEPT: [&str; 9] = [
     "recipe.toml",
     "run.json",
@@ -479,7 +480,8 @@ impl RunRequest {
         Recipe::from_toml(&self.recipe)
     }
 
-    /// Takes the folder of the run for a new training or the rest of one. What is there of one that took no step is removed.
+    /// Takes the folder of the run for a new training or the rest of one. What is there of one that took no step is
+    /// removed.
     pub fn begin(&self, run: &Path, force: bool, command: &str) -> Result<(OutputFolder, FolderContent)> {
         let asked = serde_json::to_string(self).expect("it is plain data");
         let origin = Origin { capture: Some(self.capture.clone()), elsewhere: self.elsewhere.clone() };
@@ -502,8 +504,8 @@ pub fn on_event(folder: &OutputFolder, event: &Event) {
     }
 }
 
-/// Leaves the folder of a training that ended: one that failed before its first checkpoint after the start leaves nothing to
-/// continue.
+/// Leaves the folder of a training that ended: one that failed before its first checkpoint after the start leaves
+/// nothing to continue.
 pub fn left<T>(folder: OutputFolder, run: &Path, trained: &Result<T>) -> Option<OutputFolder> {
     let begun = checkpoint::list(run).iter().any(|path| *path != checkpoint::path(run, 0));
     if trained.is_err() && !begun {
@@ -514,7 +516,7 @@ pub fn left<T>(folder: OutputFolder, run: &Path, trained: &Result<T>) -> Option<
     Some(folder)
 }
 
-/// Where a new run goes: the wanted folder, or with a number behind it if that is taken.
+/// Where a new run goes: the requested folder, or with a number behind it if that is taken.
 pub fn free_folder(wanted: &Path) -> PathBuf {
     let holds = |p: &Path| std::fs::read_dir(p).is_ok_and(|d| d.flatten().any(|e| e.file_name() != STATE));
     let taken = |p: &Path| p.is_file() || holds(p) || Owner::holder(p).is_some();

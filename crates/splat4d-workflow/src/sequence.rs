@@ -1,4 +1,4 @@
-//! Numbered files, one per frame: finding them, naming them, and the times they stand for.
+//! Numbered files, one per frame: finding them, naming them, and the times they represent.
 
 use crate::files::{cannot_read, either};
 use crate::run_folder::Run;
@@ -145,7 +145,7 @@ pub fn take(patterns: &[&Pattern], count: usize, read: &Read<'_>, command: &str,
     OutputFolder::begin(patterns[0].folder(), &request).map(|(folder, _)| folder)
 }
 
-/// The frames that a folder or a pattern stands for, by their numbers.
+/// The frames that a folder or a pattern represents, by their numbers.
 #[derive(Debug)]
 pub struct Frames {
     /// In the order of their numbers.
@@ -158,7 +158,7 @@ pub struct Frames {
     pub snapshots: Option<PathBuf>,
 }
 
-/// The frames that a folder or a pattern stands for, in the order of their numbers.
+/// The frames that a folder or a pattern represents, in the order of their numbers.
 ///
 /// Errors: none are there, two have one number, or a folder holds several kinds.
 pub fn frames(path: &Path) -> Result<Frames> {
@@ -259,7 +259,7 @@ pub fn newest(folder: &Path) -> Option<(PathBuf, Option<u64>)> {
         .or_else(|| alone.is_file().then_some((alone, None)))
 }
 
-/// The scene file that stands for a folder in a sequence of folders: a result of 3DGS, or the only scene file in it.
+/// The scene file that represents a folder in a sequence of folders: a result of 3DGS, or the only scene file in it.
 fn only_scene(folder: &Path, endings: &[&str]) -> Option<PathBuf> {
     if let Some((file, _)) = newest(folder) {
         return Some(file);

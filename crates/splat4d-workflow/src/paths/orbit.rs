@@ -18,7 +18,7 @@ const FACING: f64 = 0.8;
 const LONG_SIDE: usize = 960;
 /// Vertical field of view where there is no camera to copy: 45°.
 const FOV_Y: f64 = PI / 4.0;
-/// Half-widths of the sway when the training cameras stand in one spot: 6°.
+/// Half-widths of the sway when the training cameras are in one spot: 6°.
 const SMALL_SWAY: f64 = 0.1;
 
 /// Middle, distance, height and arc of an orbit.

@@ -196,7 +196,7 @@ mod tests {
         let svg = draw(&cameras, &[[1.0, 1.0]], &bounds, &|name| (name == "right").then_some(Grade::Bad));
         assert!(svg.contains("left&lt;1&gt;") && !svg.contains("left<1>"));
         assert_eq!(svg.matches("#d4351c").count(), 2, "line and dot of the bad one");
-        // The first stands at the left and looks to the right; y goes downwards in SVG.
+        // The first is at the left and looks to the right; y goes downwards in SVG.
         assert!(svg.contains(&format!("x1=\"{MARGIN:.1}\"")), "{svg}");
     }
 }
