@@ -13,7 +13,7 @@ use splat4d::scene::Params;
 /// Rungs of the ladder, lowest first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Model {
-    /// B0: the last time for ever.
+    /// B0: the last time forever.
     Freeze,
     /// B1: constant velocity and turn.
     Velocity,
