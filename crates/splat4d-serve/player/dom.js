@@ -93,7 +93,7 @@ export function save(blob, name) {
   setTimeout(() => URL.revokeObjectURL(href), 60000);
 }
 
-/** Requests a file; nothing happens where the asked person changes their mind. */
+/** Opens the file dialog; nothing happens if it is cancelled. */
 export function pick(accept, onfile) {
   const input = h('input', { type: 'file', accept, onchange: () => input.files[0] && onfile(input.files[0]) });
   input.click();

@@ -54,7 +54,7 @@ function words({ shift, quat, scale }) {
 
 const near = t => k => Math.abs(k.t - t) < SAME;
 
-/** Keys with one at t that says `value`; how it eases stays. */
+/** Keys with one at t that states `value`; how it eases stays. */
 function put(keys, t, value) {
   const old = keys.find(near(t));
   const key = { t: round(old?.t ?? t), ...value, ...(old?.ease && { ease: true }) };

@@ -82,7 +82,7 @@ const slider = (label, low, high, value, onchange, oninput) => {
 export class Editing {
   #timers = {};
   #run = 0;
-  /** Whether an image stands in, one is being made for another view, and one is wanted for yet another. */
+  /** Whether an image stands in, one is being made for another view, and one is needed for yet another. */
   #standing = false;
   #looking = false;
   #again = false;

@@ -143,7 +143,7 @@ export class Splat4D extends HTMLElement {
   /** Labels as colours, or one label alone: docs/player.md. */
   setLabels(show) { this.#player?.setLabels(show); }
 
-  /** How a scene begins: the attributes say, and a page's address says more. */
+  /** How a scene begins: the attributes say, and a page's address states more. */
   #start() {
     const time = this.getAttribute('time');
     return {
@@ -190,7 +190,7 @@ export class Splat4D extends HTMLElement {
   /** The deep link's part behind '#'. */
   get link() { return this.#player?.link(); }
 
-  /** Requests a file, where there is nothing to show. */
+  /** Opens the file dialog if there is nothing to show. */
   invite() { this.#ui.showEmpty(); }
 
   /** Follows a training run: {events, src, metrics} addresses; `version` of the scene that is there already. */

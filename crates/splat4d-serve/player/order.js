@@ -15,13 +15,13 @@ export class Order {
   #near;
   #worker = null;
   #sorter = null;
-  /// [message, what moves with it], until the worker says that it runs: a page's policy may forbid workers.
+  /// [message, what moves with it], until the worker states that it runs: a page's policy may forbid workers.
   #early = [];
   /// The array that is passed back and forth.
   #array = null;
 
-  /// `onorder({order, count, active, ms, generation})`: the first `count` of `order` are the Gaussians that are visible at
-  /// the requested time, the farthest first; it is valid during the call only.
+  /// `onorder({order, count, active, ms, generation})`: the first `count` of `order` are the Gaussians that are visible
+  /// at the requested time, the farthest first; it is valid during the call only.
   constructor(near, onorder) {
     this.#near = near;
     this.#onorder = onorder;

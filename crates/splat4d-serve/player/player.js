@@ -144,7 +144,7 @@ export class Player extends EventTarget {
   /** Whether the image of a jump of the clock is still to come. */
   get seeking() { return !!this.backend?.shown && this.backend.shown.epoch !== this.#epoch; }
 
-  /** Where the image is or will be next: what a step or a slider continues from. */
+  /** Where the image is or will be next: where a step or a slider continues. */
   get target() { return this.seeking ? this.clock : this.time; }
 
   /** Renders again, as something that moves; `what` CONTENT: as it is. */
@@ -383,7 +383,7 @@ export class Player extends EventTarget {
     this.emit('pause');
   }
 
-  /** The clock continues from what is shown, if it continues: images that were requested ahead are not rendered. */
+  /** A running clock continues from what is shown: images that were requested ahead are not rendered. */
   #stop() {
     if (!this.playing && !this.film) return;
     if (!this.seeking) this.clock = this.time;
@@ -657,7 +657,7 @@ export class Player extends EventTarget {
 
   /** What a backend is to render now, at a size in px. */
   drawing(width, height, camera = this.camera) {
-    // The capture's cameras saw no haze right before them. Who comes closer to look at something wants to see it.
+    // The capture's cameras saw no haze right before them. Who comes closer to look at something needs to see it.
     const least = this.meta.near ?? NEAR;
     const near = camera.lens ? least : Math.min(least, NEAR_SHARE * camera.distance);
     // While pages are missing, what is shown stays, seen by the newest camera.
@@ -709,7 +709,7 @@ export class Player extends EventTarget {
     this.buffered = out;
   }
 
-  // What others request.
+  // What others may call.
 
   /** A PNG of the image, as shown but always at full resolution; its `time` is the second that it shows. */
   async screenshot() {
@@ -769,7 +769,7 @@ export class Player extends EventTarget {
   }
 }
 
-/** Whether WebGL says that it is computed on the CPU. */
+/** Whether WebGL states that it is computed on the CPU. */
 function software(gl) {
   const asked = gl?.getExtension?.('WEBGL_debug_renderer_info');
   return !!asked && /swiftshader|llvmpipe|software|basic render/i.test(gl.getParameter(asked.UNMASKED_RENDERER_WEBGL));

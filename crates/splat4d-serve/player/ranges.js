@@ -5,7 +5,7 @@ import { SceneError } from './errors.js';
 
 /// Requests at a time: what browsers open to one host over HTTP/1.1.
 const PARALLEL = 6;
-/// Longest request that is put together from several sections, bytes: longer ones would keep what is wanted first
+/// Longest request that is put together from several sections, bytes: longer ones would keep what is needed first
 /// waiting on one connection while others idle.
 const RUN = 1 << 20;
 /// Unwanted bytes between two sections that cost less than a request of their own.

@@ -72,7 +72,7 @@ export class Rig {
     this.redraw();
   }
 
-  /** Looks at scene and cameras from behind the cameras, unless the page's address says from where. */
+  /** Looks at scene and cameras from behind the cameras, unless the page's address states a position. */
   #overview() {
     if (!this.poses.length || readLink(location.hash).camera) return;
     const { center, radius } = bounds(this.player.meta), { up } = this.player.camera, n = this.poses.length;

@@ -155,7 +155,7 @@ export class SceneFile {
 
   /// Length of the file, bytes.
   bytesTotal = 0;
-  /// Bytes that the file says it has: more than there are where it was cut short.
+  /// Bytes that the file states it has: more than there are where it was cut short.
   length = 0;
 
   /// Fetches, checks and decodes page `id`: {id, count, headers: Float32Array(24·blocks), words: Uint32Array(8·count),
@@ -324,7 +324,7 @@ export class SceneFile {
       if (page.labels !== -1) this.#refuse(`Page ${page.id} has labels twice`);
       if (!labels.missing) page.labels = labels.id;
     }
-    // What the pages state is what will be drawn, whatever the description says.
+    // What the pages state is what will be drawn, whatever the description states.
     this.meta.gaussians = this.pages.reduce((n, p) => n + p.count, 0);
   }
 

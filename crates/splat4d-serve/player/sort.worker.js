@@ -86,7 +86,7 @@ class KeyMask {
     return this.#mask.keys[k];
   }
 
-  /// Takes up the bits of time `t`; says whether they are others now.
+  /// Takes up the bits of time `t`; states whether they are others now.
   at(t) {
     const { rows, stride } = this.#mask,
       [l, r] = this.around(t);

@@ -67,7 +67,7 @@ export class Stream {
 
   /// `file`: SceneFile. `backend`: of PLAYER's interface; it owns the arrays it is given. `budget`: bytes of words.
   /// `onchange()` after each page that came or went, `onerror(SceneError)` for a page that is given up for now,
-  /// `onleft(Gaussians)` when a time first does not fit into the budget. `show`: labels as `painted` wants it, null:
+  /// `onleft(Gaussians)` when a time first does not fit into the budget. `show`: labels as `painted` needs it, null:
   /// pages are shown as they are.
   constructor(file, backend, { budget = defaultBudget(), onchange, onerror, onleft, show = null } = {}) {
     this.#show = show;
@@ -166,7 +166,7 @@ export class Stream {
     for (const done of this.#waiting.splice(0)) done();
   }
 
-  /// Decides what should be resident: `#now` and `#later`, both in the order in which they are wanted, within budget.
+  /// Decides what should be resident: `#now` and `#later`, both in the order in which they are needed, within budget.
   #plan(t, playing, speed, loop, reach) {
     const [first, last] = this.#file.meta.clip;
     const now = [],
@@ -204,7 +204,7 @@ export class Stream {
     this.#shrink(wanted);
   }
 
-  /// Drops pages until what is wanted fits: the farthest in time first.
+  /// Drops pages until what is needed fits: the farthest in time first.
   #shrink(wanted) {
     let missing = 0;
     for (const page of [...this.#now, ...this.#later]) {

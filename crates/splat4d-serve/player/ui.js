@@ -213,7 +213,7 @@ export class Interface {
     if (!this.#panel) this.wake();
   }
 
-  /** Distances that the depth view's brightness stands for. */
+  /** Distances that the depth view's brightness represents. */
   #showScale() {
     const p = this.player;
     this.scale.hidden = p.channel !== 'depth' || !p.file;
@@ -225,7 +225,7 @@ export class Interface {
   }
 
   #showTime() {
-    // The clock says what is shown; the slider is where it was put.
+    // The clock states what is shown; the slider is where it was put.
     const p = this.player, at = p.target - p.first;
     const u = p.duration > 0 ? clamp(at / p.duration, 0, 1) : 0;
     this.now.textContent = clock(p.time - p.first, p.duration);
@@ -385,7 +385,7 @@ export class Interface {
     this.root.classList.add('idle');
   }
 
-  // What people request.
+  // User requests.
 
   setLoop(on) {
     this.player.loop = on;
@@ -617,7 +617,7 @@ function known(page) {
   return before;
 }
 
-/** Whether a control wants this key for itself. */
+/** Whether a control needs this key for itself. */
 function takes(node, key) {
   if (!(node instanceof Element)) return false;
   if (node.matches('select, textarea, input:not([type=radio], [type=checkbox])')) return true;

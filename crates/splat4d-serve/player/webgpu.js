@@ -254,7 +254,7 @@ export class WebGPUBackend {
     }
     this.#writeHeaders(page);
     this.#queue.writeBuffer(this.#b.words, at * BLOCK_BYTES, words, 0, count * WORDS);
-    // All are admitted until a mask says otherwise; the place may have had one.
+    // All are admitted until a mask states otherwise; the place may have had one.
     const all = new Uint32Array(blocks * MASK_WORDS).fill(0xffffffff);
     this.#queue.writeBuffer(this.#b.admitted, at * MASK_BYTES, all);
     this.#pages.set(id, page);

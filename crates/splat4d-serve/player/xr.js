@@ -11,7 +11,7 @@ const TABLE_RADIUS = 0.6;
 /** WebXR's axes (x right, y up, z back) are ours turned half about x. */
 const FLIP = [0, 1, 0, 0];
 
-/** The contract's view of an eye; `start` is the camera that the headset's origin stands for, `unit` metres a unit. */
+/** The contract's view of an eye; `start` is the camera that the headset's origin represents, `unit` metres a unit. */
 export function eyeView(eye, start, unit, width, height) {
   const { position: p, orientation: o } = eye.transform;
   // Headset origin → world: the starting camera's pose; the eye's own pose is relative to it, in metres.

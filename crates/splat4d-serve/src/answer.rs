@@ -1,4 +1,4 @@
-//! From a request to an answer: fixed routes, and headers that keep a browser from doing anything else with them.
+//! From a request to a response: fixed routes, and headers that keep a browser from doing anything else with them.
 
 use crate::assets::{self, Asset, INDEX};
 use crate::body::Body;
@@ -22,7 +22,7 @@ use tokio::sync::Semaphore;
 const MAX_LISTENERS: usize = 64;
 /// Name of the route of the scene.
 const SCENE: &str = "scene.s4d";
-/// On every answer. Another origin can neither embed nor read anything; a type is what it is said to be.
+/// Headers of every response. Another origin can neither embed nor read anything; a type is what it is declared to be.
 const HEADERS: [(HeaderName, &str); 5] = [
     (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
     (header::REFERRER_POLICY, "no-referrer"),
@@ -211,8 +211,8 @@ fn scene(shared: &Shared, request: &Parts) -> Response<Body> {
     if headers.get(header::IF_NONE_MATCH).is_some_and(|tags| matches(tags, &version.etag)) {
         return with(Body::empty(), StatusCode::NOT_MODIFIED, &common);
     }
-    // A range counts for GET only (RFC 9110), and only of the state that the client knows, where it states which. No date
-    // is ever given out, so that a date matches nothing.
+    // A range counts for GET only (RFC 9110), and only of the state that the client knows, where it states which. No
+    // date is ever given out, so that a date matches nothing.
     let fresh = headers.get(header::IF_RANGE).is_none_or(|tag| tag.as_bytes() == version.etag.as_bytes());
     let range = headers.get(header::RANGE).filter(|_| fresh && request.method == Method::GET);
     match range.and_then(|r| r.to_str().ok()).map_or(Wanted::Whole, |r| range::parse(r, version.length)) {

@@ -1,6 +1,6 @@
-//! The one thing that a page may send: what it wants of a list of edits, where the program was started to edit.
+//! The one thing that a page may send: requests on a list of edits, if the program was started to edit.
 //!
-//! A page of any origin in the user's browser can send a form to loopback. This requests more than a form can bring: a
+//! A page of any origin in the user's browser can send a form to loopback. This requires more than a form can send: a
 //! token that only the address which the program printed holds, JSON (for which a browser asks leave first, and gets
 //! none), and our own origin. What is done with it is the program's business; it may answer with another scene.
 
@@ -31,12 +31,12 @@ const TOKEN: &str = "x-splat4d-token";
 const MAX_BODY: usize = 1 << 20;
 /// A body must be complete in this time.
 const BODY_TIME: Duration = Duration::from_secs(10);
-/// Queries that are worked on at a time: one that takes long, and one that looks meanwhile.
+/// Queries that are worked on at a time: a slow one, and one that only reads.
 const AT_ONCE: usize = 2;
 /// Least length of a token: shorter ones could be guessed.
 const LEAST_TOKEN: usize = 16;
 
-/// What a program answers to a page that edits.
+/// A program's response to a page that edits.
 #[derive(Clone, Debug, Default)]
 pub struct EditAnswer {
     /// Sent to the page.

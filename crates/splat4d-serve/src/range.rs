@@ -1,6 +1,6 @@
 //! The `Range` header of a request (RFC 9110, section 14).
 
-/// Part of a file of known length that is wanted.
+/// Part of a file of known length that is needed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Wanted {
     /// All of it: no range, another unit, several ranges or nonsense, all of which a server may ignore.

@@ -59,7 +59,7 @@ async function shown(backend, made, body, { before, policy } = {}) {
       restart({});
     }, backend);
     await body(page);
-    // The browser itself says in the console what a policy forbids.
+    // The browser itself states in the console what a policy forbids.
     const wrong = errors.filter((e) => !(policy && e.includes('Content Security Policy')));
     assert.deepEqual([wrong, await page.evaluate(() => globalThis.shown.errors)], [[], []]);
   } finally {

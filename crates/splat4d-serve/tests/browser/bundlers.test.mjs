@@ -1,6 +1,6 @@
-// The package in the hands of TypeScript and of bundlers: Vite (its development server and its build), webpack and esbuild. Each page must play
-// with both workers; a bundler that does not find them leaves all work to the main thread, and says nothing. Needs npm, and vite,
-// webpack and esbuild next to playwright-core (`.ci/run`).
+// The package in the hands of TypeScript and of bundlers: Vite (its development server and its build), webpack and
+// esbuild. Each page must play with both workers; a bundler that does not find them leaves all work to the main thread,
+// without a message. Needs npm, and vite, webpack and esbuild next to playwright-core (`.ci/run`).
 
 import assert from 'node:assert/strict';
 import { execFileSync, spawnSync } from 'node:child_process';

@@ -1,5 +1,6 @@
-// The player as npm delivers it: packed, installed from the tarball into an empty folder, and used by pages: the element, and
-// the object of three.js, with meshes before and behind it. Needs npm, and three next to playwright-core (`.ci/run`).
+// The player as npm delivers it: packed, installed from the tarball into an empty folder, and used by pages: the
+// element, and the object of three.js, with meshes before and behind it. Needs npm, and three next to playwright-core
+// (`.ci/run`).
 
 import assert from 'node:assert/strict';
 import { execFileSync } from 'node:child_process';
@@ -60,7 +61,7 @@ test('the package holds what it names, and is small', (t) => {
 const needs = (three) => ({ skip: !browser ? 'needs a browser' : three && !existsSync(THREE) ? 'needs three' : false });
 const ELEMENT = `<splat-4d src="/knight.s4d" backend="webgl2" resolution="1" controls="none"
   style="display:block;width:400px;height:300px"></splat-4d><script type="module">import 'splat4d';</script>`;
-/// three.js with the knight, seen by the file's camera \`at\`; the page says \`shown\` when it is drawn.
+/// three.js with the knight, seen by the file's camera \`at\`; the page states \`shown\` when it is drawn.
 const OBJECT = `<canvas width="400" height="300"></canvas><script type="module">
   import * as THREE from 'three';
   import { Splat4D } from 'splat4d/three';

@@ -188,7 +188,7 @@ export function layout(json, sections, { major = 1, minor = 0 } = {}) {
   return Buffer.concat([head, index, ...bodies]);
 }
 
-/// A finished file as one that grows: its index behind its sections, or where `at` says.
+/// A finished file as one that grows: its index behind its sections, or where `at` states.
 export function grown(bytes, { at } = {}) {
   const size = bytes.readUInt32LE(12),
     out = Buffer.concat([bytes, bytes.subarray(64, 64 + size)]);

@@ -114,7 +114,7 @@ test('what is requested beyond the end is the beginning', () => {
   // One loop lasts 1.1 s: eleven frames of 0.1 s, one of them the last frame's.
   for (const [now, time] of m.rendered.slice(10)) {
     const late = (now / 1000 - time + 1.1) % 1.1;
-    // While the last frame stands the clock runs on.
+    // The clock continues while the last frame is shown.
     assert.ok(late < 0.02 || late > 1.08 || (time === 1 && late < 0.12), `${time} at ${now} ms`);
   }
 });

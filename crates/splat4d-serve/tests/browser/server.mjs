@@ -17,7 +17,7 @@ export async function serve({ files = {}, folders = {}, ranges = true, delay = 0
   const server = http.createServer(async (request, response) => {
     const name = decodeURIComponent(new URL(request.url, 'http://x').pathname),
       { options } = state;
-    // What every browser requests unasked.
+    // What every browser requests by itself.
     if (name === '/favicon.ico') return response.writeHead(204).end();
     if (options.delay) await new Promise((done) => setTimeout(done, options.delay));
     if (options.fail(request, state.log.length)) {
