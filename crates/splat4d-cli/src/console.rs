@@ -18,7 +18,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
-/// How much is said.
+/// How much is reported.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Loudness {
     /// Warnings and errors only.
@@ -63,7 +63,7 @@ struct State {
     last_line: Option<Instant>,
     /// The first iteration after a pause gets a plain line of its own.
     said_progress: bool,
-    /// What `--json` would print, for a program that wants the objects themselves; none: it is printed.
+    /// What `--json` would print, for a program that needs the objects themselves; none: it is printed.
     objects: Option<Vec<Value>>,
 }
 
@@ -446,7 +446,7 @@ pub(crate) fn log_time() {
     LOG_TIME.store(true, Ordering::Relaxed);
 }
 
-/// A line with the time before it, where that is wanted.
+/// A line with the time before it, where that is needed.
 fn stamped(line: &str) -> Cow<'_, str> {
     match LOG_TIME.load(Ordering::Relaxed) {
         true => format!("{} {line}", rfc3339(SystemTime::now())).into(),

@@ -18,9 +18,9 @@ const PATIENCE: Duration = Duration::from_millis(1200);
 /// What a Ctrl-C does now.
 struct State {
     raised: bool,
-    /// What is said of the first one.
+    /// Message on the first one.
     first: Cow<'static, str>,
-    /// Where the program is ended soon: what is said then.
+    /// Where the program ends soon: the message then.
     last: Option<String>,
     /// Whether another program has called, which must not be ended.
     embedded: bool,
@@ -56,7 +56,7 @@ impl State {
     }
 }
 
-/// A flag that the first Ctrl-C (or SIGTERM) raises. `first` is then said on stderr.
+/// A flag that the first Ctrl-C (or SIGTERM) raises. `first` is then printed on stderr.
 pub fn flag(first: &'static str) -> Arc<AtomicBool> {
     let flag = Arc::new(AtomicBool::new(false));
     let raised = flag.clone();
@@ -78,14 +78,14 @@ pub fn flag(first: &'static str) -> Arc<AtomicBool> {
     flag
 }
 
-/// From now on the work requests the flag, and does what `first` says.
+/// From now on the work reads the flag and does what `first` states.
 pub(crate) fn stop_polled(first: impl Into<Cow<'static, str>>) {
     let mut state = state();
     (state.first, state.last) = (first.into(), None);
 }
 
-/// From now on a Ctrl-C ends the program after a moment, also where the work does not ask; `last` says what is kept and
-/// how to go on. A Ctrl-C that came before, and that nothing has followed, ends it now.
+/// From now on a Ctrl-C ends the program after a moment, also where the work does not read the flag; `last` states what
+/// is kept and how to go on. A Ctrl-C that came before, and that nothing has followed, ends it now.
 pub(crate) fn stop_not_polled(last: impl Into<String>) {
     let last = last.into();
     let mut state = state();

@@ -1,4 +1,4 @@
-//! The player's server as verbs use it: options, what is said about it, the browser, and a run that is being watched.
+//! The player's server as verbs use it: options, its messages, the browser, and a run that is being watched.
 
 use crate::console::Console;
 use serde_json::{Value, json};
@@ -44,7 +44,7 @@ pub(crate) struct Place {
 }
 
 impl Place {
-    /// Whether any of it was said.
+    /// Whether any of it was printed.
     pub(crate) fn is_told(&self) -> bool {
         self.port.is_some() || self.host.is_some() || self.no_open || self.player_folder.is_some()
     }

@@ -1,4 +1,4 @@
-//! `eval`: measures a run again, perhaps next to a scene that stands still.
+//! `eval`: measures a run again, perhaps next to a scene that is static.
 
 use crate::console::Console;
 use crate::device::Device;

@@ -85,7 +85,7 @@ fn capture_at(path: &Path) -> splat4d::Result<Option<Capture>> {
     if is_metadata(path) {
         return open_capture(path, &Recipe::default()).map(Some);
     }
-    // What is wrong with a folder that is neither is said by the reader of scenes.
+    // The reader of scenes reports what is wrong with a folder that is neither.
     Ok(if path.is_dir() && !Run::is(path) { open_capture(path, &Recipe::default()).ok() } else { None })
 }
 

@@ -1,4 +1,4 @@
-//! Files go between the formats of other programs, and what is lost is said.
+//! Conversion between formats of other programs, with reports of lost data.
 
 use crate::sample::{shown, splat4d};
 use splat4d::format::{Dialect, ply, scene, splatv};

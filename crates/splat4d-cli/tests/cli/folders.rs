@@ -137,7 +137,7 @@ fn no_output_replaces_what_is_read() {
         splat4d(words).run().refused();
         assert!(std::fs::read(&ply).unwrap() == before && !at("a.s4d").exists(), "{words:?}");
     }
-    // An ending states what is wanted, and a file may be replaced that is not read.
+    // The extension states the format, and a file may be replaced that is not read.
     splat4d(&["export", str(&ply), "-o", str(&page)]).run().ok();
     assert!(std::fs::read(&page).unwrap().starts_with(b"<!doctype html>"), "a page");
     splat4d(&["convert", str(&ply), str(&at("frames/1.ply"))]).run().ok();
