@@ -65,7 +65,7 @@ pub(crate) fn warn(py: Python<'_>, messages: &[String]) -> PyResult<()> {
     })
 }
 
-/// Words of the command in remedies, and what says the same in Python.
+/// Words of the command in remedies, and their equivalents in Python.
 const WORDS: [(&str, &str); 5] = [
     ("`train --resume`", "splat4d.resume"),
     (RESUME, "splat4d.resume"),

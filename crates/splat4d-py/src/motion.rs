@@ -38,7 +38,7 @@ const SCRATCH: u64 = 256;
 /// Opacities are kept this far from 0 and 1, where logits are infinite.
 const OPACITY_MARGIN: f32 = 1e-6;
 
-/// The Python object, and what it says of itself.
+/// The Python object, and what it states about itself.
 pub(crate) struct Hook {
     object: Py<PyAny>,
     name: String,
@@ -51,7 +51,7 @@ pub(crate) struct Hook {
 }
 
 impl Hook {
-    /// Makes the model of a `splat4d.Motion` known by its name. Errors: what it says of itself is not as it should be.
+    /// Makes the model of a `splat4d.Motion` known by its name. Errors: its declaration is invalid.
     pub(crate) fn register(motion: &Bound<'_, PyAny>) -> PyResult<Arc<Self>> {
         let get = |name: &str| {
             motion.getattr(name).map_err(|_| bad_input(format!("the motion has no `{name}`"), "Give a splat4d.Motion"))
