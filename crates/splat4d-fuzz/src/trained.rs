@@ -75,7 +75,7 @@ fn seeds(number: usize) -> Vec<Vec<u8>> {
     vec![open, bytes]
 }
 
-/// Shapes of AlexNet's tensors, as `docs/metrics.md` wants them.
+/// Shapes of AlexNet's tensors, as in `docs/metrics.md`.
 fn alexnet() -> Vec<(String, Vec<usize>)> {
     let convolutions: [(usize, [usize; 4]); 5] = [
         (0, [64, 3, 11, 11]),
