@@ -149,7 +149,7 @@ pub(crate) fn run(args: &Args, threads: Option<u16>, console: &Console) -> anyho
     if !args.playback.is_empty() {
         return play(args, console);
     }
-    // What cannot work is said before anything takes time.
+    // What cannot work is reported before anything takes time.
     if (args.sweep || args.beside.is_some()) && args.device != Measured::Gpu {
         let error = Error::new(ErrorKind::BadInput, "--sweep and --beside need a GPU");
         return Err(error.remedy("Add --device gpu.").into());

@@ -1,6 +1,7 @@
-//! E00: what a deformation network is. Fifty points move by sinusoids, straight lines and circles; a perceptron of 4,546
-//! numbers learns their displacement from noisy positions, against the best that standing still can do. A penalty on
-//! speed trades fidelity for smoothness; a sharp edge between two motions and a jump in time are what it cannot follow.
+//! E00: what a deformation network is. Fifty points move by sinusoids, straight lines and circles; a perceptron of
+//! 4,546 numbers learns their displacement from noisy positions, against the best that being at rest can do. A penalty
+//! on speed trades fidelity for smoothness; a sharp edge between two motions and a jump in time are what it cannot
+//! follow.
 
 use splat4d::math::Rng;
 use splat4d::nn::mlp::{InputGrad, Mlp, MlpShape, Passed};

@@ -140,7 +140,7 @@ fn plots(s: &Settings, first: &Findings, sweep: &[(f64, Vec<Findings>)]) -> Vec<
         points: values.iter().enumerate().map(|(n, v)| (n as f64 / (s.frames - 1) as f64, *v)).collect(),
     };
     let by_time = [over_time("standing still", &first.distances[0]), over_time("network", &first.distances[1])];
-    // Zero has no logarithm: it stands a decade left of the smallest.
+    // Zero has no logarithm: it is a decade left of the smallest.
     let place = |l: f64| if l > 0.0 { l.log10() } else { LAMBDAS[1].log10() - 1.0 };
     let curve = |name: &str, of: &dyn Fn(&Findings) -> f64| Series {
         name: name.into(),

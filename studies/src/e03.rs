@@ -71,7 +71,7 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
-    // What cannot work is said before anything takes time.
+    // What cannot work is reported before anything takes time.
     let trials = args.runs.iter().map(|path| Trial::open(path, args)).collect::<anyhow::Result<Vec<_>>>()?;
     check_names(&trials)?;
     let file = args.output.join("e03.json");

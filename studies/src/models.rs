@@ -59,7 +59,7 @@ pub(crate) struct Args {
     /// Reduce images by k
     #[arg(long, value_name = "K", default_value_t = 2)]
     downscale: usize,
-    /// Also replace what stands between `<!-- models -->` and `<!-- /models -->` in this page
+    /// Also replace what is between `<!-- models -->` and `<!-- /models -->` in this page
     #[arg(long, value_name = "FILE")]
     into: Option<PathBuf>,
     /// Set a setting of every cell's recipe; may be repeated

@@ -20,7 +20,7 @@ const HEIGHT: usize = 300;
 /// Pixels; gives 67° across.
 const FOCAL: f64 = 300.0;
 pub(crate) const CAMERAS: usize = 20;
-/// The cameras stand on an arc of this many degrees about the scene, alternately at two heights.
+/// The cameras are on an arc of this many degrees about the scene, alternately at two heights.
 const ARC_DEGREES: f64 = 170.0;
 const ARC_RADIUS: f64 = 5.8;
 const ARC_HEIGHTS: [f64; 2] = [1.7, 3.3];

@@ -48,8 +48,8 @@ pub(crate) fn cut_out(textures: [&Texture; 2], frame: &Frame, camera: &Camera, s
     out
 }
 
-/// Shades every sample, filters the samples to pixels and hands out each pixel's linear colour (nothing is black) and the
-/// share that moving objects cover, rows from the top.
+/// Shades every sample, filters the samples to pixels and hands out each pixel's linear colour (nothing is black) and
+/// the share that moving objects cover, rows from the top.
 fn each_pixel(
     textures: [&Texture; 2],
     frame: &Frame,
@@ -129,7 +129,7 @@ impl SampleShader<'_> {
     }
 }
 
-/// How much of the sky a point sees: darker in the hall's corners, under things that stand on the floor, and on the
+/// How much of the sky a point sees: darker in the hall's corners, under things that are on the floor, and on the
 /// lower side of things.
 fn openness(frame: &Frame, point: V3, normal: V3, object: u8) -> f64 {
     let wall = (SIDE - point.x.abs()).min(point.z - BACK).min(FRONT - point.z);

@@ -1,6 +1,6 @@
 //! What happens: the hall, its props, and thirty frames of a knight who storms at a mage's orb.
 //!
-//! Scene units are about 0.7 m: the knight stands 2.4 units tall. World +y is up.
+//! Scene units are about 0.7 m: the knight is 2.4 units tall. World +y is up.
 
 use crate::glb::Glb;
 use crate::light::Light;
@@ -58,7 +58,7 @@ pub(crate) struct Frame {
     pub skinned: [Range<usize>; 2],
     /// The light with its shadow map.
     pub light: Light,
-    /// Where each moving thing stands on the floor, for contact shade.
+    /// Where each moving thing is on the floor, for contact shade.
     pub feet: Vec<V3>,
 }
 
@@ -81,7 +81,7 @@ impl Stage {
         [&self.knight.texture, &self.mage.texture]
     }
 
-    /// The hall with something else that moves; `feet`: where it stands on the floor.
+    /// The hall with something else that moves; `feet`: where it is on the floor.
     pub(crate) fn with(&self, moving: &Mesh, feet: Vec<V3>) -> Frame {
         let mut casters = self.props.clone();
         casters.append(moving);

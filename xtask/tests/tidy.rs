@@ -144,7 +144,7 @@ fn files_are_short() {
 #[test]
 fn unsafe_stays_where_it_is() {
     let says = |path: &str| {
-        // A hyphen belongs to the word: `unsafe-inline` is what web servers say about styles.
+        // A hyphen belongs to the word: `unsafe-inline` is what web servers show about styles.
         let word = |l: &str| l.split(|c| !is_word(c) && c != '-').any(|w| w == "unsafe");
         code(&read(path)).iter().any(|(_, l)| word(l))
     };
@@ -425,8 +425,8 @@ const DIALECT_LIST: &str = "crates/splat4d/src/format/mod.rs";
 const DIALECT_NAMES: [(&str, &str); 1] =
     [("crates/splat4d-workflow/src/source/bundle.rs", "a SOG scene may lie in a folder")];
 
-/// A new dialect is its own file and its entry in the list: no other code may name one. Its properties answer what others
-/// need to know.
+/// A new dialect is its own file and its entry in the list: no other code may name one. Its properties answer what
+/// others need to know.
 #[test]
 fn dialects_are_named_only_in_their_modules() {
     let list = read(DIALECT_LIST);

@@ -155,7 +155,7 @@ fn frames(base: &Pinned, count: usize, side: usize, way: Way) -> Result<Vec<Row>
     Ok(vec![step, load])
 }
 
-/// A synthetic capture: eight image files, each of which stands for every eighth frame.
+/// A synthetic capture: eight image files, each of which represents every eighth frame.
 fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> Capture {
     let clip = pinned.scene.clip;
     let frame = |i: usize| {
@@ -303,7 +303,7 @@ fn split(from: &Scene<f32>, count: usize, degree: usize) -> Scene<f32> {
         from.layers.iter().flat_map(|l| (0..l.params.len()).map(move |row| (l, row))).collect();
     let [geometry, colors, lives, speeds] = params.get_mut([GEOMETRY, SH, LIFE, velocities]);
     for child in 0..count {
-        // Children of one parent stand together, so that the order in space stays.
+        // Children of one parent are together, so that the order in space stays.
         let (layer, row) = parents[child * had / count];
         let p = &layer.params;
         let mut g = p[GEOMETRY].read::<11>(row, 0);

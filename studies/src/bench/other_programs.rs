@@ -163,7 +163,7 @@ fn apart(ours: &Ran, theirs: &Ran) -> Option<String> {
     })
 }
 
-/// What is to be said of all other programs whose runs are in a scene's folder.
+/// What is to be reported of all other programs whose runs are in a scene's folder.
 fn verdicts(ours: &Ran, folder: &Path) -> Result<Vec<String>> {
     let unread = |e: std::io::Error| Error::io("the folder cannot be read", e).at(folder.display());
     let mut paths: Vec<_> = std::fs::read_dir(folder).map_err(unread)?.flatten().map(|entry| entry.path()).collect();
@@ -190,7 +190,8 @@ fn verdicts(ours: &Ran, folder: &Path) -> Result<Vec<String>> {
     paths.iter().filter(other).map(verdict).collect()
 }
 
-/// Writes a scene into a folder of its name, trains it with `backend`, and prints how it compares with programs that were measured before.
+/// Writes a scene into a folder of its name, trains it with `backend`, and prints how it compares with programs that
+/// were measured before.
 pub(super) fn measure(
     pinned: &Pinned,
     folder: &Path,
@@ -231,7 +232,7 @@ mod tests {
                 return println!("skipped: {e}");
             }
         };
-        // The CPU stands for another program.
+        // The CPU represents another program.
         let folder = place.path().join("small");
         let cpu = || splat4d::device::cpu(config());
         assert!(measure(&pinned, place.path(), way, cpu(), "the CPU").unwrap().1.is_empty(), "nobody else is there");

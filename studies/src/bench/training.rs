@@ -145,7 +145,7 @@ fn stage(scene: &Scene<f32>, extent: f64) -> Result<Stage> {
     Ok(stage)
 }
 
-/// A trainer that continues for ever and changes next to nothing.
+/// A trainer that continues forever and changes next to nothing.
 pub(super) fn trainer(scene: Scene<f32>, frames: Arc<dyn Frames>, way: Way) -> Result<Trainer<'static>> {
     let renderer = Renderer::new(RenderConfig { simd: way.simd, ..RenderConfig::default() });
     trainer_on(scene, frames, Box::new(renderer))

@@ -296,7 +296,7 @@ hand-held-60 36359dac295000bb
                 let sight = to.map(|v| v / norm(to));
                 let there = scene.world.look(eye, sight, at).unwrap();
                 if norm(sub(there.point, seen.point)) > 1e-6 {
-                    continue; // something stands before it
+                    continue; // something is before it
                 }
                 let pixel = |picture: &[u8], [x, y]: [f64; 2]| -> V3 {
                     std::array::from_fn(|k| f64::from(picture[3 * (y as usize * 160 + x as usize) + k]) / 255.0)

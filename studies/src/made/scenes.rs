@@ -14,7 +14,7 @@ const RADIUS: f64 = 4.0;
 const HEIGHTS: [f64; 2] = [1.1, 1.9];
 /// What rigs look at.
 const TARGET: V3 = [0.0, 0.7, -0.3];
-/// Half the arc of rigs that stand before the scene, and of one that stands all round it, radians.
+/// Half the arc of rigs that are before the scene, and of one that is all round it, radians.
 const HALF_ARC: f64 = 0.9;
 const HALF_RING: f64 = 3.0;
 /// Times of captures in which something moves, and of the rig with many cameras.
@@ -22,7 +22,7 @@ const MOMENTS: usize = 10;
 const FEW_MOMENTS: usize = 5;
 /// Distance of a far background, in distances of the cameras.
 const FAR: f64 = 100.0;
-/// Gains of training cameras, in turns: their product is 1, so that the held-out cameras stand for their mean.
+/// Gains of training cameras, in turns: their product is 1, so that the held-out cameras represent their mean.
 const GAINS: [f64; 4] = [0.65, 1.25, 1.0 / 0.65, 0.8];
 /// Turn of a pose that is wrong: 3°.
 const WRONG: f64 = 3.0 * std::f64::consts::PI / 180.0;

@@ -142,7 +142,7 @@ struct Order<'a> {
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
-    // What cannot work is said before anything takes time.
+    // What cannot work is reported before anything takes time.
     let list = List::open(args.list.as_deref())?;
     let entries = list.only(&args.only)?;
     let baseline = args.baseline.as_deref().map(Results::read).transpose()?;
@@ -198,7 +198,7 @@ fn judged(cells: &[FolderContent]) -> String {
     }
 }
 
-/// Every cell of the captures that are there; of others it is said that they are not.
+/// Every cell of the captures that are there; of others it is reported that they are not.
 fn orders<'a>(args: &Args, list: &List, entries: &[&'a Entry], console: &Console) -> anyhow::Result<Vec<Order<'a>>> {
     let own = std::env::current_exe().context("this program does not know where it lies")?;
     let program = files::fingerprint(std::fs::read(&own).map_err(|e| files::cannot_read(&own, e))?);

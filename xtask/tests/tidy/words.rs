@@ -2,8 +2,8 @@
 
 use super::{documents, files, is_test, is_word, read, report, sources};
 
-/// Phrases that texts do not use, because readers have to translate them into the field's terms; outside of code. A phrase
-/// begins a word: `picture` also finds `pictures`. CONTRIBUTING.md, "Language", states what to write.
+/// Phrases that texts do not use, because readers have to translate them into the field's terms; outside of code. A
+/// phrase begins a word: `picture` also finds `pictures`. CONTRIBUTING.md, "Language", states what to write.
 const FORBIDDEN: [&str; 24] = [
     "anew",
     "anybody",
@@ -85,7 +85,7 @@ fn spoken(path: &str, text: &str) -> String {
     let mut out = String::new();
     for (at, line) in lines.iter().enumerate() {
         help |= command && line.starts_with("const EXAMPLES");
-        // A comment of an argument stands above its attribute.
+        // A comment of an argument is above its attribute.
         let below = lines[at..].iter().find(|l| !l.trim().starts_with("///"));
         let argument = command && below.is_some_and(|l| ["#[arg", "#[command"].iter().any(|a| l.trim().starts_with(a)));
         if module && line.starts_with("//!") || argument && line.trim().starts_with("///") || help {
