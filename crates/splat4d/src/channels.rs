@@ -1,4 +1,4 @@
-//! What images show next to colour, alpha and depth: normals, labels, features, lives and uncertainty, each as
+//! Image channels next to colour, alpha and depth: normals, labels, features, lifespans and uncertainty, each as
 //! further channels of the
 //! renderer ([`Shot::extra`](crate::render::Shot::extra)) with a last column that is 1 where a splat has a value, so
 //! that [`divided`](crate::flow::divided) gives the mean over what a pixel shows. Velocity and flow are in

@@ -66,7 +66,7 @@ fn or_cpu(config: RenderConfig, gpu: Result<(Box<dyn Backend>, String)>) -> Open
     }
 }
 
-/// The requested device, with the CPU next to it: what the GPU cannot render is rendered by the CPU, image by
+/// The requested device, together with the CPU, which renders what the GPU does not support, image by
 /// image,
 /// and a GPU that fails is left for good. Each is reported once ([`Backend::notice`]), and neither is an error.
 pub fn open_to_train(device: Device, config: RenderConfig) -> Opened {
@@ -83,7 +83,7 @@ pub fn on_cpu(config: RenderConfig, reason: &dyn std::fmt::Display) -> Opened {
     Opened { backend: cpu(config), name: CPU.into(), why: format!("drawing on {CPU}: {reason}"), fell_back: true }
 }
 
-/// Renders. A backend that fails on the way is left for the CPU, which renders instead; its error is returned.
+/// Renders. If the backend fails, the CPU takes over and the error is returned.
 pub fn draw(backend: &mut Box<dyn Backend>, shot: &Shot<'_>, out: &mut Image) -> Option<Error> {
     let error = backend.render(shot, out).err()?;
     *backend = cpu(*backend.config());
@@ -98,10 +98,10 @@ struct WithCpu {
     cpu: Box<dyn Backend>,
     /// Whether the last image is the other's.
     drawn_by_other: bool,
-    /// What it was refused for.
+    /// Why it was refused.
     refused: Vec<String>,
     notices: Vec<String>,
-    /// Where an image that is rendered again goes.
+    /// Target of images that are rendered again.
     again: Image,
     name: String,
 }
@@ -233,7 +233,7 @@ const TEST_SIZE: [usize; 2] = [75, 45];
 /// roundings and a splat at the α cut-off, far below any mistake.
 const TRUSTED: [f64; 2] = [0.02, 0.05];
 
-/// Renders a little scene and takes it back, as the CPU does. Errors: something else comes out.
+/// Renders a small scene and runs the backward pass, as the CPU does. Errors: the results differ.
 #[cfg_attr(not(feature = "gpu"), allow(dead_code))]
 fn trusted(backend: &mut dyn Backend) -> Result<()> {
     let rng = Rng::new(1, "self-test", 0);

@@ -20,7 +20,7 @@ use crate::scene::{Camera, Planes, Space, Splats, Table, Time};
 /// Less alpha than this does not carry a flow: dividing by it would only amplify rounding.
 pub(crate) const FLOW_ALPHA_MIN: f64 = 1e-3;
 
-/// A scene at one time as a camera sees it.
+/// A scene at one time, seen by a camera.
 #[derive(Clone, Copy, Debug)]
 pub struct Shot<'a> {
     /// When.
@@ -82,10 +82,10 @@ pub fn velocity_columns<F: Real>(scene: &Scene<F>, instant: &Evaluation<F>) -> T
 
 /// 2D flow in pixels, [2, h, w] (x right, y down): F(p) = Σ w_i [π_to(μ_i(t_to)) − π_from(μ_i(t_from))] / Σ w_i.
 ///
-/// The rows alive at `from.t` are followed to `to.t`, whatever their lifespan states there. With the same camera twice
-/// it is the flow of objects alone, else the camera's motion is in it. A splat that is behind a camera has no vector.
-/// Source: "F_simple" of rendered optical flow, Σ w Δμ_2D, as in Gao et al. 2024 (GaussianFlow) §3.2 without its
-/// covariance term.
+/// The rows alive at `from.t` are followed to `to.t`, whatever their temporal opacity there. With the same camera for
+/// both it is the flow of objects alone, else the camera's motion is in it. A splat that is behind a camera has no
+/// vector. Source: "F_simple" of rendered optical flow, Σ w Δμ_2D, as in Gao et al. 2024 (GaussianFlow) §3.2 without
+/// its covariance term.
 pub fn render_flow<F: Real>(scene: &Scene<F>, from: Shot<'_>, to: Shot<'_>, renderer: &mut Renderer<F>) -> Flow<F> {
     let mut start = Evaluation::default();
     scene.at(from.t, &mut start);
@@ -93,8 +93,8 @@ pub fn render_flow<F: Real>(scene: &Scene<F>, from: Shot<'_>, to: Shot<'_>, rend
     draw(&scene.splats(&start), from.camera, scene.background, &extra, renderer)
 }
 
-/// The way of every splat on the screen as further channels of an image: [splats, 3], u, v in pixels and 1, or zeros
-/// for a
+/// The displacement of every splat on the screen as further channels of an image: [splats, 3], u, v in pixels and 1, or
+/// zeros for a
 /// splat that is behind a camera ([`divided`]).
 ///
 /// Panics: `start` is not this scene's.

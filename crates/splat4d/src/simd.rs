@@ -3,7 +3,7 @@
 //! A kernel is one `#[inline(always)]` body over fixed-size lane arrays. It is compiled three times, inside functions
 //! that enable nothing, AVX2 with FMA, and AVX-512; LLVM turns the lane loops into that level's vectors. Levels differ
 //! in the rounding of fused multiply-adds (the scalar level) and of what steps from row to row (the blend under
-//! AVX-512). On ARM the baseline has NEON and fused multiply-add already. Everything that is fast goes through here:
+//! AVX-512). On ARM the baseline has NEON and fused multiply-add already. All SIMD code is dispatched here:
 //! this is the one file of the workspace that states `unsafe`.
 #![allow(unsafe_code)] // calling a function that enables a target feature, after that feature was found present
 
@@ -20,11 +20,11 @@ pub enum Simd {
     Avx512,
 }
 
-/// The level above which [`Simd::detect`] answers nothing.
+/// The highest level that [`Simd::detect`] returns.
 static LIMIT: AtomicU8 = AtomicU8::new(Simd::Avx512 as u8);
 
 impl Simd {
-    /// Lowers what [`detect`](Self::detect) answers from now on, in the whole process: tests and measurements of what
+    /// Lowers the result of [`detect`](Self::detect) from now on, in the whole process, for tests and measurements of
     /// lesser machines compute. Matrix products (`nn::matmul`) choose their instructions themselves.
     pub fn limit(level: Self) {
         LIMIT.store(level as u8, Ordering::Relaxed);
@@ -84,13 +84,13 @@ pub trait Kernel {
     }
 }
 
-/// Work that writes to two things that the caller lends. They are arguments of the compiled function itself, since only
-/// then does LLVM know that they do not overlap with what is read: plain loops over slices that are inside a
+/// Work that writes to two buffers of the caller. They are arguments of the compiled function itself, since only
+/// then can LLVM assume that they do not overlap with the inputs: plain loops over slices inside a
 /// [`Kernel`] stay scalar (measured on the loss: five times slower). `run` must be `#[inline(always)]`.
 pub trait Pass {
     /// Working memory.
     type Scratch: ?Sized;
-    /// Where results go.
+    /// Destination of results.
     type Into: ?Sized;
     /// Its result.
     type Out;

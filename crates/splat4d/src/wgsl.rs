@@ -63,7 +63,7 @@ pub(crate) const ANSWER: &str = include_str!("gpu/answer.wgsl");
 pub(crate) const ANSWER_BACK: &str = include_str!("gpu/answer_back.wgsl");
 /// Gradients of colours → those of SH and means, and statistics. After `PROJECT`, `SHADE` and `LEARNT`.
 pub(crate) const COLORS_BACK: &str = include_str!("gpu/colors_back.wgsl");
-/// What a step leaves of itself: `view_sums`, `cameras`, `record`.
+/// Record of a step: `view_sums`, `cameras`, `record`.
 pub(crate) const RECORD: &str = include_str!("gpu/record.wgsl");
 /// A step of Adam on one table.
 pub(crate) const ADAM: &str = include_str!("gpu/adam.wgsl");
@@ -86,7 +86,7 @@ mod tests {
     const STORAGE_BUFFERS: usize = 8;
     const WORKGROUP_BYTES: u32 = 16 << 10;
     const INVOCATIONS: u32 = 256;
-    /// Those that need more than WebGPU's core, on devices that have it.
+    /// Those that need more than WebGPU's core.
     const SUBGROUPS: [&str; 3] = [
         "rasterize, backward, with subgroups",
         "sort with subgroups",

@@ -21,7 +21,7 @@ use std::borrow::Cow;
 
 /// Rows of a straight layer between two calls of the progress listener.
 const STRAIGHT_RUN: usize = 1 << 16;
-/// Samples of a scene are kept up to so many numbers (512 MiB), and taken again for every cut beyond.
+/// Samples of a scene are kept up to so many numbers (512 MiB), and sampled again for every cut beyond that.
 const KEPT: usize = 128 << 20;
 /// Rows of a task that measures.
 const ROWS: usize = 128;
@@ -100,7 +100,7 @@ impl Curve {
     }
 }
 
-/// A scene on its way into segments.
+/// A scene that is being cut into segments.
 pub struct Bakery<'a> {
     scene: &'a Scene<f32>,
     options: &'a Options,
@@ -150,7 +150,7 @@ impl<'a> Curved<'a> {
 }
 
 impl<'a> Bakery<'a> {
-    /// A scene that was not sampled yet. Errors: a scene with a pixel head; options out of range; a clip that is no
+    /// A scene before sampling. Errors: a scene with a pixel head; options out of range; an invalid
     /// clip.
     pub fn new(scene: &'a Scene<f32>, options: &'a Options) -> Result<Self> {
         scene.without_head("a playback file")?;
@@ -178,7 +178,7 @@ impl<'a> Bakery<'a> {
     }
 
     /// Samples the model and measures the curve of segments and errors. None: all motion is straight, and there is
-    /// nothing to choose. `progress` hears of all that is done.
+    /// nothing to choose. `progress` is called with all finished work.
     pub fn measure(&mut self, progress: &mut dyn FnMut(usize, usize)) -> Result<Option<Curve>> {
         let layers = self.layers();
         let count = |l: &Cow<'_, Layer<f32>>| if self.is_split(l) { l.params.len() } else { 0 };
@@ -226,8 +226,8 @@ impl<'a> Bakery<'a> {
         Ok(Some(curve))
     }
 
-    /// Cuts the scene into segments. A price needs what [`measure`](Self::measure) found. `progress` hears how many
-    /// Gaussians of how many are done.
+    /// Cuts the scene into segments. A price needs what [`measure`](Self::measure) found. `progress` is called with the
+    /// finished number of Gaussians and their total.
     ///
     /// Errors: a model that would become too many primitives. Panics: a price before anything was measured.
     pub fn bake(&self, by: Cut, progress: &mut dyn FnMut(usize, usize)) -> Result<Baked> {
@@ -299,7 +299,7 @@ impl<'a> Bakery<'a> {
         self.scene.layers.iter().map(Layer::with_frame_absorbed).collect()
     }
 
-    /// Whether the layer's pages stay as they are.
+    /// Whether the layer's pages are kept unchanged.
     fn is_kept(&self, layer: &Layer<f32>) -> bool {
         self.options.repeat == 1 && is_page(layer)
     }

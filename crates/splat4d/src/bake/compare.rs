@@ -13,7 +13,7 @@ use crate::scene::{Camera, Color, Part, Rows, Table, Time};
 /// PSNR where two images are the same, dB: rounding to 8 bits alone would give about 59.
 const SAME: f64 = 99.0;
 
-/// How like the model the baked scene looks.
+/// Similarity of the baked scene to the model.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Likeness {
     /// PSNR of all pixels together, dB.
@@ -93,8 +93,8 @@ pub enum Shown<'a> {
 }
 
 /// Renders the baked scene and the model from these cameras at these times, clamped to the clip, and compares.
-/// `progress` hears how many images of how many are done; `false` ends the comparison with those. `None`: nothing was
-/// compared. Errors: the backend's.
+/// `progress` is called with the finished and the total number of images; `false` ends the comparison with those.
+/// `None`: nothing was compared. Errors: the backend's.
 pub fn compare(
     scene: &Scene<f32>,
     baked: Shown<'_>,

@@ -1,4 +1,4 @@
-//! One Gaussian becomes pieces: straight lines in the deepest nodes that hold its lifespan, halved where they miss.
+//! Fits linear segments to one Gaussian, in the deepest nodes that hold its lifespan; segments that miss are halved.
 
 use super::life::Envelope;
 use super::sample::{GEOMETRY, Row, Samples};
@@ -14,11 +14,11 @@ use crate::math::sh::{MAX_COEFFS, dc_to_rgb};
 /// changes its neighbourhood by up to 0.6·d, but with both signs, so that most of it cancels; a wrong opacity does
 /// not, and is held five times as strictly.
 pub(super) const LEVEL_PIXELS: f64 = 8.0;
-/// Weight of a look at which nothing is to be seen: it keeps a line through two frames defined.
+/// Weight of a time sample at which the Gaussian is invisible: it keeps a line through two frames defined.
 const FAINT: f64 = 1e-4;
 /// Share of the trace by which a covariance may differ before it counts as turned or stretched: f32 rounding.
 const SAME_SHAPE: f64 = 1e-5;
-/// The envelope's centre may be so many reaches off a node before rounded velocities would be felt; a piece further
+/// The envelope's centre may be so many reaches away from a node before rounded velocities matter; a segment further
 /// out gets a centre of its own.
 const FAR: f64 = 8.0;
 /// SH coefficients of all channels.
@@ -51,7 +51,7 @@ pub(super) struct Subject<'a> {
     pub samples: &'a Samples,
     pub row: &'a Row,
     pub life: Envelope,
-    /// Whether its layer comes or goes by a cross-fade.
+    /// Whether its layer fades in or out.
     pub cross_fades: bool,
     /// Learnt rotation and scales: exact where motion leaves shapes alone.
     pub own: Shape,
@@ -59,7 +59,7 @@ pub(super) struct Subject<'a> {
     pub colors: Option<[f32; COLORS]>,
 }
 
-/// One frame's look, in f64.
+/// One time sample, in f64.
 struct FrameSample {
     time: f64,
     mean: [f64; 3],
@@ -69,14 +69,14 @@ struct FrameSample {
 }
 
 impl Fitter<'_> {
-    /// The pieces of one Gaussian in a span, in time order.
+    /// The segments of one Gaussian in a span, in time order.
     pub(super) fn pieces(&self, subject: &Subject<'_>, span: Span) -> Vec<Piece> {
         let mut out = Vec::new();
         self.place(subject, span, &mut out);
         out
     }
 
-    /// Goes down while one half holds all that is to be seen, then fits; a miss continues in both halves.
+    /// Descends while one half holds the whole visible time, then fits; if the fit misses, continues in both halves.
     fn place(&self, subject: &Subject<'_>, span: Span, out: &mut Vec<Piece>) {
         match narrow(self.tree, subject.row.seen, span) {
             Place::Nowhere => return,
@@ -85,21 +85,21 @@ impl Fitter<'_> {
         }
         match (self.fit(subject, span), self.tree.split(span)) {
             (Some((primitive, error)), _) if error <= self.accepted => out.push(Piece { span, primitive, error }),
-            // Where nothing could be fitted a half may still hold a frame that is sound.
+            // Where nothing could be fitted, a half may still hold a valid frame.
             (_, Some(halves)) => halves.into_iter().for_each(|half| self.place(subject, half, out)),
             (Some((primitive, error)), None) => out.push(Piece { span, primitive, error }),
             (None, None) => {}
         }
     }
 
-    /// The best primitive of a node, and its error in pixels. None: not one look is finite, or the node is split
+    /// The best primitive of a node, and its error in pixels. None: no sample is finite, or the node is split
     /// whatever its shape is.
     fn fit(&self, subject: &Subject<'_>, span: Span) -> Option<(Primitive, f64)> {
         let looks = self.looks(subject, span);
         let single = span[1] - span[0] == 1;
         let first = looks.first().filter(|l| !single || l.frame == span[0])?;
-        // The look at a node's end belongs to the next node. The line goes through it, so that motion is whole between
-        // frames too, but a single frame is what it is.
+        // The sample at a node's end belongs to the next node. The line goes through it, so that motion is whole
+        // between frames too, but a single frame is what it is.
         let held = if single { &looks[..1] } else { &looks[..] };
 
         let weight = |l: &FrameSample| l.alpha + FAINT;
@@ -148,7 +148,7 @@ impl Fitter<'_> {
         sound.then_some((primitive, error))
     }
 
-    /// The shape of the looks that a piece is held to. That of a single frame turns on to the next one's, so that what
+    /// The target shape of a segment's samples. That of a single frame turns on to the next one's, so that what
     /// is seen between them is whole, where it then misses its own by no more than is allowed, and both by less.
     fn shape(
         &self,
@@ -171,7 +171,7 @@ impl Fitter<'_> {
         if allowed && worst(&turning) < worst(&own) { turning } else { own }
     }
 
-    /// The finite looks at a span's frames, its end included.
+    /// The finite samples at a span's frames, its end included.
     fn looks(&self, subject: &Subject<'_>, span: Span) -> Vec<FrameSample> {
         let [first, last] = subject.row.frames;
         let look = |frame: usize| {
@@ -192,7 +192,7 @@ impl Fitter<'_> {
         [subject.row.seen[0].max(self.tree.border(span[0])), subject.row.seen[1].min(self.tree.border(span[1]))]
     }
 
-    /// Envelope and opacity: the lifespan as it was learnt, or, where that is not what is seen, a constant.
+    /// Envelope and opacity: the learnt lifespan, or a constant where the samples differ from it.
     fn life(&self, subject: &Subject<'_>, span: Span, looks: &[FrameSample]) -> (Envelope, f64) {
         let [from, to] = [self.tree.border(span[0]), self.tree.border(span[1])];
         let still = Envelope::forever(0.5 * (from + to));
@@ -238,10 +238,10 @@ impl Fitter<'_> {
     }
 }
 
-/// An envelope about the strongest look that falls as the looks do: σ = exp(−½y²), y = (x − h)/s beyond h, is a line
-/// through √(−2 ln(α/α_max)).
+/// An envelope about the strongest sample that falls as the samples do: σ = exp(−½y²), y = (x − h)/s beyond h, is a
+/// line through √(−2 ln(α/α_max)).
 fn tail(looks: &[FrameSample]) -> Option<(Envelope, f64)> {
-    /// Looks at which next to nothing has fallen yet, or next to nothing is left, carry little information about the
+    /// Samples close to full strength or close to zero, carry little information about the
     /// slope.
     const TELLING: std::ops::Range<f64> = 0.02..0.98;
     let peak = looks.iter().max_by(|a, b| a.alpha.total_cmp(&b.alpha))?;
@@ -255,7 +255,7 @@ fn tail(looks: &[FrameSample]) -> Option<(Envelope, f64)> {
     let mean = |k: usize| told.iter().map(|t| t[2] * t[k]).sum::<f64>() / total;
     let (x, y) = (mean(0), mean(1));
     let spread: f64 = told.iter().map(|t| t[2] * (t[0] - x).powi(2)).sum();
-    // Through the strongest look, where there is but one other.
+    // Through the strongest sample, where there is but one other.
     let slope =
         if spread > 0.0 { told.iter().map(|t| t[2] * (t[0] - x) * (t[1] - y)).sum::<f64>() / spread } else { y / x };
     let half = (x - y / slope).max(0.0);
@@ -264,7 +264,7 @@ fn tail(looks: &[FrameSample]) -> Option<(Envelope, f64)> {
     sound.then_some((Envelope { center: peak.time, half, softness }, peak.alpha))
 }
 
-/// The shape: as it was learnt where that is what is seen, else turning at a steady rate.
+/// The shape: the learnt one where the samples agree with it, else turning at a steady rate.
 fn shape(subject: &Subject<'_>, looks: &[FrameSample], center: f64) -> Shape {
     let own = subject.own;
     let same = |cov: [f64; 6], other: [f64; 6]| {
@@ -307,7 +307,8 @@ fn color_difference(a: &[f32; COLORS], b: &[f32]) -> f64 {
     (square.into_iter().fold(0.0, f64::max) / (4.0 * std::f64::consts::PI)).sqrt()
 }
 
-/// Assembles a primitive. `area` weighs its importance: pixels² a unit² times the share of the node in which it lives.
+/// Assembles a primitive. `area` weighs its importance: pixels² per unit² times the share of the node in which it is
+/// alive.
 pub(super) fn primitive(
     mean: [f64; 3],
     life: &Envelope,
@@ -319,7 +320,7 @@ pub(super) fn primitive(
 ) -> Primitive {
     let mut sizes = shape.scales;
     sizes.sort_by(f64::total_cmp);
-    // How much of the image it covers, how strongly, for how long: what is missed most comes first.
+    // How much of the image it covers, how strongly, for how long: the most important come first.
     let importance = (opacity * sizes[2] * sizes[1] * area) as f32;
     Primitive {
         mean,
@@ -339,9 +340,9 @@ pub(super) fn primitive(
     }
 }
 
-/// How a node and a Gaussian's time relate to each other.
+/// Relation of a node to a Gaussian's visible time.
 pub(super) enum Place {
-    /// Nothing is to be seen in the node.
+    /// The Gaussian is invisible in the node.
     Nowhere,
     /// All of it is in this half, and the node is longer than a segment.
     In(Span),
@@ -366,7 +367,7 @@ pub(super) fn narrow(tree: &Tree, seen: [f64; 2], span: Span) -> Place {
     Place::Here
 }
 
-/// The span in which a Gaussian whose motion is a straight line lies: the deepest that holds all that is to be seen.
+/// The span of a Gaussian with linear motion: the deepest that holds its whole visible time.
 pub(super) fn home(tree: &Tree, seen: [f64; 2]) -> Option<Span> {
     let mut span = tree.root();
     loop {
@@ -386,7 +387,7 @@ pub(super) fn seen(tree: &Tree, [from, to]: [f64; 2]) -> Option<[f64; 2]> {
     (from <= to && seen[0] <= seen[1]).then_some(seen)
 }
 
-/// A Gaussian as faint as this is not rendered at any time.
+/// A Gaussian fainter than this is never rendered.
 pub(super) fn is_visible(opacity: f64) -> bool {
     opacity >= ALPHA_MIN
 }

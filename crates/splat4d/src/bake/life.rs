@@ -4,7 +4,8 @@ use crate::layers::Layer;
 use crate::scene::life::{CENTER, LOG_SOFTNESS, LOG_WIDTH};
 use crate::scene::{LIFE, LifeKind, Table};
 
-/// A half-width or softness above this is forever, seconds: three years, as intervals that represent it have thirty.
+/// A half-width or softness above this counts as infinite, seconds: three years; intervals that stand for infinity have
+/// thirty.
 const FOR_EVER: f64 = 1e8;
 /// A softness below this is an edge, seconds.
 const SHARP: f64 = 1e-9;
@@ -21,7 +22,7 @@ pub(super) struct Envelope {
 }
 
 impl Envelope {
-    /// For ever, with motion counted from `center`.
+    /// An infinite lifespan, with motion counted from `center`.
     pub(super) fn forever(center: f64) -> Self {
         Self { center, half: f64::INFINITY, softness: 1.0 }
     }
@@ -62,7 +63,7 @@ impl<'a> Lives<'a> {
         Envelope { softness: if own.softness < SHARP { SHARP } else { own.softness }, ..own }
     }
 
-    /// Whether lives have centres.
+    /// Whether the lifespans have centres.
     pub(super) fn has_centers(&self) -> bool {
         self.table.width() > 0
     }

@@ -6,7 +6,7 @@
 //! linearly to the next frame (key states). Linear motion is copied and not fitted.
 //!
 //! [`Cut`] decides where to split: [`bake`] splits every segment that misses by more than a tolerance in pixels.
-//! [`Bakery`] knows the curve of segments and image error (`rate.rs`), so that a budget can be met.
+//! [`Bakery`] measures the curve of segments and image error (`rate.rs`) to meet a budget.
 //!
 //! The model is sampled in runs of rows, each at all its frames, so that memory does not grow with frames times
 //! Gaussians.
@@ -38,15 +38,16 @@ pub(crate) use compare::Moment;
 pub use compare::{Likeness, Shown, compare};
 
 /// Default of [`Options::tolerance`], pixels: on models that no straight line holds, baked and model then differ by
-/// less than 40 dB can show (measured; see the tests), at a fraction of the pieces that a tenth of it would need.
+/// less than 40 dB can show (measured; see the tests), at a fraction of the segments that a tenth of it would need.
 pub const TOLERANCE: f64 = 0.25;
 /// Default of [`Options::segment`], seconds: what a player fetches for a seek; shorter ones repeat too much.
 pub const SEGMENT: f64 = 1.0;
-/// Default of [`Options::looks`]: what players show. A network between the frames of a slow take is no line.
+/// Default of [`Options::looks`]: the frame rate of players. Between the frames of a slow capture a network is not
+/// linear.
 pub const LOOKS: f64 = 30.0;
 /// Most rounds of [`Options::repeat`].
 pub const MAX_REPEAT: usize = 10_000;
-/// Default of [`Options::renders`]: as many as pay off.
+/// Default of [`Options::renders`]: more do not improve the result.
 pub(crate) const RENDERS: usize =
     if weights::STILL_RENDERS > weights::PATH_RENDERS { weights::STILL_RENDERS } else { weights::PATH_RENDERS };
 /// Default of [`Options::samples`]: 30,000 Gaussians at 27 seconds of 30 frames per second.
@@ -59,7 +60,7 @@ pub struct Options {
     pub tolerance: f64,
     /// About how long a segment lasts, seconds.
     pub segment: f64,
-    /// Time samples of the model a second, at least; each of the clip's frames is one, as far as `samples` allows.
+    /// Time samples of the model per second, at least; each of the clip's frames is one, as far as `samples` allows.
     pub looks: f64,
     /// Most samples of Gaussians at a time, over all Gaussians whose motion is not straight: bounds the time of baking.
     /// At least the clip's ends are sampled.

@@ -1,4 +1,4 @@
-//! Ranks primitives by what images lack without them, so that a part of a file looks like the whole.
+//! Ranks primitives by the change of images without them, so that a part of a file looks like the whole.
 //!
 //! What a primitive covers states little: a large one behind a wall, or one of its neighbours' colour, is not missed.
 //! Renders of the baked scene at times spread over the clip measure what the removal of each primitive changes. A short
@@ -13,7 +13,7 @@ use crate::render::{Importance, RenderConfig, Shot};
 use crate::scene::splats::SPLAT_OPACITY;
 use crate::scene::{Camera, Time};
 
-/// Renders a second of the clip: a lifespan of 0.1 s is met twice.
+/// Renders a second of the clip: a lifespan of 0.1 s is sampled twice.
 const A_SECOND: f64 = 20.0;
 /// Fewest renders, and most products of renders and Gaussians: some seconds of one core.
 const FEWEST: usize = 12;

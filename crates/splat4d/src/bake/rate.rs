@@ -26,10 +26,10 @@ const SHAPE: f64 = 0.125;
 const ROUND: f64 = 0.05;
 /// A thin axis counts at least as this share of the longest.
 const THIN: f64 = 0.05;
-/// Weight of a look at which nothing is to be seen.
+/// Weight of a sample at which the Gaussian is invisible.
 const FAINT: f64 = 1e-6;
 
-/// Numbers of a look before its colours, whose running sums are kept.
+/// Numbers of a sample before its colours, whose running sums are kept.
 const NUMBERS: usize = 29;
 /// Their places.
 mod at {
@@ -49,7 +49,7 @@ mod at {
     pub(super) const SIGMA_SQUARE: usize = 27;
     pub(super) const COLOR_SQUARE: usize = 28;
 }
-/// Entries of a packed matrix that count twice in its square.
+/// Entries of a packed matrix that occur twice in the full matrix.
 const OFF_DIAGONAL: [usize; 3] = [1, 2, 4];
 
 /// Segments and error at every price.
@@ -57,7 +57,7 @@ const OFF_DIAGONAL: [usize; 3] = [1, 2, 4];
 pub(super) struct Rate {
     /// Segments.
     pub pieces: [f64; PRICES],
-    /// Mean squared error of an image, summed over the looks.
+    /// Mean squared error of an image, summed over the samples.
     pub error: [f64; PRICES],
 }
 
@@ -81,7 +81,7 @@ pub(super) fn price(g: usize) -> f64 {
     LOWEST * FACTOR.powi(g as i32)
 }
 
-/// Running sums of one Gaussian's looks.
+/// Running sums of one Gaussian's samples.
 pub(super) struct Sums<'a> {
     tree: &'a Tree,
     row: &'a Row,
@@ -97,8 +97,8 @@ pub(super) struct Sums<'a> {
 }
 
 impl<'a> Sums<'a> {
-    /// Sums over the looks at `row`. `weigh` gives the weight of its errors from its clearest look. None: no look is
-    /// finite.
+    /// Sums over the samples of `row`. `weigh` gives the weight of its errors from its clearest sample. None: no sample
+    /// is finite.
     pub(super) fn new(
         tree: &'a Tree,
         samples: &Samples,
@@ -164,8 +164,8 @@ impl<'a> Sums<'a> {
         Some(Self { tree, row, weight, turns, peak, colors, width, sums })
     }
 
-    /// What one segment over a span leaves, summed over its looks; those at its ends, which its neighbours share, count
-    /// half.
+    /// The error that one segment over a span leaves, summed over its samples; those at its ends, which its neighbours
+    /// share, count half.
     pub(super) fn error(&self, span: Span) -> f64 {
         let [first, last] = self.row.frames;
         let (a, b) = (first.max(span[0]), last.min(span[1]));

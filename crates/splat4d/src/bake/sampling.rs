@@ -1,4 +1,4 @@
-//! How large a length in the world looks to the cameras: the measure of every error.
+//! Lengths in the world as the cameras see them, in pixels: the unit of every error.
 
 use crate::math::median;
 use crate::math::se3::{norm, sub};
@@ -13,7 +13,7 @@ const NEAREST: f64 = 0.2;
 const FOCAL: f64 = 1000.0;
 const DISTANCE: f64 = 2.0;
 
-/// Where cameras stand, and how sharp they see.
+/// Positions and resolutions of the cameras.
 #[derive(Clone, Debug)]
 pub(super) struct Lookout {
     /// Centre and larger focal length.

@@ -2,11 +2,11 @@
 
 use crate::math::{quat, sym3};
 
-/// Gauss-Newton steps: a handful is the rule; what takes more is split anyway.
+/// Gauss-Newton steps: usually a few; spans that need more are split anyway.
 const STEPS: usize = 12;
 /// Two scales whose squares differ by less than this share of the largest: a turn between them cannot be seen.
 const ROUND: f64 = 1e-4;
-/// Largest change of a step, radians (and of log scales): beyond it the linear part means nothing.
+/// Largest change of a step, radians (and of log scales): beyond it the linear part is invalid.
 const STRIDE: f64 = 0.6;
 /// A step smaller than this changes nothing that can be seen.
 const STILL: f64 = 1e-7;
@@ -68,7 +68,7 @@ impl Shape {
         self
     }
 
-    /// One step, `pace` times as long as the linear part states, and how far it went (radians).
+    /// One step, `pace` times as long as that of the linear part, and its length (radians).
     fn step(&self, looks: &[(f64, f64, [f64; 6])], [total, mean, spread]: [f64; 3], pace: f64) -> (Self, f64) {
         let mut out = *self;
         let lambda = self.scales.map(|s| s * s);

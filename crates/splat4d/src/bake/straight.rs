@@ -1,4 +1,4 @@
-//! Motion that is a straight line already: its primitives are read off the parameters, exactly and at once.
+//! Linear motion: primitives are computed from the parameters exactly, without samples.
 
 use super::fit::{COLORS, Piece, home, is_visible, primitive, seen};
 use super::life::{Envelope, Lives};
@@ -51,7 +51,7 @@ impl Line {
         }
         let origin = if lives.has_centers() { own.center } else { self.origin };
         let [from, to] = [tree.border(node[0]), tree.border(node[1])];
-        // For ever counts from the middle of the node: nothing is ever further from it than half the node.
+        // Infinite lifespans count from the middle of the node: nothing is further from it than half the node.
         let life = if own.is_forever() { Envelope::forever(0.5 * (from + to)) } else { own };
         let at = |t: f64| std::array::from_fn(|k| mean[k] + velocity[k] * (t - origin));
         let shown = [seen[0].max(from), seen[1].min(to)];
@@ -62,7 +62,7 @@ impl Line {
     }
 }
 
-/// Rotation and scales as they are learnt.
+/// Learnt rotation and scales.
 pub(super) fn learnt(row: &[f32; 11]) -> Shape {
     let q = std::array::from_fn(|k| f64::from(row[QUAT + k]));
     let scales = std::array::from_fn(|k| f64::from(row[LOG_SCALE + k]).exp());

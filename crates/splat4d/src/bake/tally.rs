@@ -1,4 +1,4 @@
-//! The primitives of the layers so far, and how they become nodes.
+//! Collects the primitives of the layers and makes nodes of them.
 
 use super::fit::Piece;
 use super::sampling::Lookout;
@@ -26,7 +26,7 @@ pub(super) struct Tally {
 }
 
 impl Tally {
-    /// Adds all pieces of one Gaussian of a layer that is seen during `window`.
+    /// Adds all segments of one Gaussian of a layer that is seen during `window`.
     pub(super) fn add(&mut self, window: [f64; 2], pieces: impl IntoIterator<Item = Piece>) -> Result<()> {
         let place = match self.windows.iter().position(|w| *w == window) {
             Some(place) => place,
@@ -66,7 +66,7 @@ pub(super) fn bounded(primitives: usize) -> Result<()> {
         .remedy("Raise --tolerance, or bake a shorter clip or fewer Gaussians."))
 }
 
-/// A layer of a playback file: pieces already, which stay as they are in their span. Their importance is not in the
+/// A layer of a playback file: its segments are kept unchanged in their span. Their importance is not in the
 /// file.
 pub(super) fn page(layer: &Layer<f32>, sampling: &Lookout, tally: &mut Tally) -> Result<Option<Node>> {
     let mut all = primitives(layer);
@@ -88,7 +88,7 @@ pub(super) fn page(layer: &Layer<f32>, sampling: &Lookout, tally: &mut Tally) ->
     Ok((!all.is_empty()).then_some(Node { from, to, primitives: all }))
 }
 
-/// What is left of a node of a layer that is seen during `window` only.
+/// The remaining part of a node of a layer that is seen during `window` only.
 pub(super) fn cut(mut node: Node, [first, last]: [f64; 2]) -> Option<Node> {
     let (from, to) = (node.from.max(first), node.to.min(last));
     if [from, to] != [node.from, node.to] {
@@ -103,8 +103,8 @@ pub(super) fn cut(mut node: Node, [first, last]: [f64; 2]) -> Option<Node> {
     (from < to).then_some(node)
 }
 
-/// Nodes by their beginning; of those that begin together the longest, which holds the others, comes first. Those of
-/// one span are one.
+/// Sorts nodes by their beginning; of those that begin together the longest, which contains the others, is first. Those
+/// of one span are merged.
 pub(super) fn in_order(mut nodes: Vec<Node>) -> Vec<Node> {
     nodes.sort_by(|a, b| a.from.total_cmp(&b.from).then(b.to.total_cmp(&a.to)));
     let mut out: Vec<Node> = Vec::with_capacity(nodes.len());

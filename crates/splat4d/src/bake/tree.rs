@@ -12,7 +12,7 @@ const MAX_FRAMES: f64 = 1_000_000.0;
 const MAX_PARTS: f64 = 32.0;
 
 /// Borders of spans are on frames, so that a frame is shown by one node a level and by no two. Where the clip has few
-/// frames per second, what is called a frame here is a part of one: a player shows the times between them too, and a
+/// frames per second, a frame here is a part of one: a player also shows the times between them, and a
 /// model need not be straight there.
 ///
 /// The tree halves the clip at the borders of segments, and a segment, where motion demands it, frame by frame. Its
@@ -29,13 +29,13 @@ pub(super) struct Tree {
 }
 
 impl Tree {
-    /// At least `looks` frames per second, but at most `most` of them (and at least two, where the clip has a length).
+    /// At least `rate` frames per second, but at most `most` of them (and at least two, where the clip has a length).
     /// Errors: the clip or the segment's length is no sensible number.
-    pub(super) fn new(clip: [f64; 2], fps: f64, looks: f64, segment: f64, most: usize) -> Result<Self> {
+    pub(super) fn new(clip: [f64; 2], fps: f64, rate: f64, segment: f64, most: usize) -> Result<Self> {
         let fps = if fps > 0.0 && fps.is_finite() { fps } else { DEFAULT_FPS };
         let after = 1.0 / fps;
         // 30 frames per second are enough where 29.97 are.
-        let fps = fps * (looks / fps - 0.1).ceil().clamp(1.0, MAX_PARTS);
+        let fps = fps * (rate / fps - 0.1).ceil().clamp(1.0, MAX_PARTS);
         let frames = ((clip[1] - clip[0]) * fps).round() + 1.0;
         if !(1.0..=MAX_FRAMES).contains(&frames) || clip.iter().any(|t| !t.is_finite()) {
             return Err(Error::input(format!("the clip from {} to {} s at {fps} frames/s", clip[0], clip[1]))

@@ -2,9 +2,9 @@
 //!
 //! A Gaussian behind a wall, or one of its neighbours' colour, may err by pixels without a trace; the edge of a sign
 //! may not. [`Importance::sensitivities`] gives the exact second moment of the image's gradient for each Gaussian
-//! alone. Some cameras at some times represent all. Of a camera that moves, each time has its own pose: a Gaussian
-//! counts when that camera sees it. What no render sees keeps a share of what its size and opacity would weigh alone,
-//! so that it is not lost for other views.
+//! alone. Some cameras at some times stand for all. Of a camera that moves, each time has its own pose: a Gaussian
+//! counts when that camera sees it. A Gaussian that no render sees keeps a share of the weight that its size and
+//! opacity give, so that it is not lost for other views.
 
 use super::sample::GEOMETRY;
 use super::sampling::Lookout;
@@ -21,12 +21,12 @@ pub(super) const STILL_RENDERS: usize = 12;
 pub(super) const PATH_RENDERS: usize = 32;
 /// Longer side of these renders, pixels.
 const SIDE: usize = 480;
-/// Share of an error that counts in every direction, also along a line of sight that no render looked across.
+/// Share of an error that counts in every direction, also along a line of sight that no render crosses.
 const ISOTROPIC: f64 = 0.1;
-/// Share of the weight by size and opacity alone that is kept where no render sees the Gaussian, and of its greatest
+/// Share of the weight by size and opacity alone for Gaussians that no render sees, and of its greatest
 /// weight at times at which the moving camera does not.
 const UNSEEN: f64 = 0.02;
-/// Squared contrast to what is around it that is assumed where none is known, each channel.
+/// Squared contrast to the surroundings, assumed where it is unknown, per channel.
 const CONTRAST: f64 = 0.05;
 /// Low-pass of the projection, pixels² (CONVENTIONS.md).
 const LOW_PASS: f64 = 0.3;
@@ -42,7 +42,7 @@ const FAINT: f64 = 0.02;
 /// Sums over renders for one Gaussian, each divided by its squared opacity there.
 #[derive(Clone, Copy, Debug, Default)]
 struct GaussianSums {
-    /// Second moment of the image's gradient with respect to the mean, mean squared error a unit².
+    /// Second moment of the image's gradient with respect to the mean, mean squared error per unit².
     moment: [f64; 6],
     /// Its trace in units of the Gaussian's own size: mean squared error of all of it.
     energy: f64,
@@ -74,7 +74,7 @@ pub(super) struct Weight {
     pub opacity: f64,
     /// For a change of colour by 1.
     pub color: f64,
-    /// The most that it can cost to be somewhere else: it is missing where it should be, and wrong where it is.
+    /// The largest cost of a wrong position: missing at the right one, and wrong at its own.
     pub most: f64,
     /// Its share at other times: seconds and share. Empty: 1 at all times.
     shares: Vec<(f64, f64)>,

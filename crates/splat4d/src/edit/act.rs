@@ -170,7 +170,7 @@ fn keep(scene: &mut Scene<f32>, selected: &Selected, wanted: bool) {
     scene.layers.retain(|l| !l.params.is_empty() || HeadKeys::of(&l.params).is_some());
 }
 
-/// Whether opacity and colour at all times are what geometry and spherical harmonics say, times the lifespan.
+/// Whether opacity and colour at all times equal geometry and spherical harmonics times the lifespan.
 fn tables_say_all(layer: &Layer<f32>) -> bool {
     layer.motion.polynomial().is_some()
 }

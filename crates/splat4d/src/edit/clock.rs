@@ -11,7 +11,7 @@ use crate::{Error, ErrorKind, Result};
 use std::any::Any;
 use std::sync::Arc;
 
-/// The layer as it is seen for from ≤ t < to, without the Gaussians that are not; none where there are none.
+/// The layer restricted to from ≤ t < to, without Gaussians that are invisible then; none where no Gaussian is left.
 pub(super) fn window(layer: &Layer<f32>, [from, to]: [f64; 2]) -> Option<Layer<f32>> {
     let span = [layer.span[0].max(from), layer.span[1].min(to)];
     if span[0] >= span[1] {
@@ -40,7 +40,7 @@ pub(super) fn seen_in(layer: &Layer<f32>, [from, to]: [f64; 2]) -> usize {
 
 /// The layer on another clock: what it showed at s = rate·t + offset it shows at t.
 ///
-/// Errors: a filter around a model whose motion hangs on its lifespans.
+/// Errors: a filter around a model whose motion depends on its lifespans.
 pub(super) fn retime(layer: &mut Layer<f32>, rate: f64, offset: f64) -> Result<()> {
     let outside = |s: f64| (s - offset) / rate;
     // Before the lifespans change: models that read them take the same clock in their own tables.

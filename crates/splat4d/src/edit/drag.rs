@@ -18,12 +18,12 @@ use std::sync::Arc;
 
 /// Nodes by default (SC-GS).
 const NODES: usize = 512;
-/// Rounds of turning and moving: after these no eye sees a difference.
+/// Rounds of turning and moving: more make no visible difference.
 const ROUNDS: usize = 8;
 /// Most times at which nodes are followed.
 const MOST_TIMES: usize = 256;
-/// Nodes that pull a Gaussian, and the next one, whose kernel is taken off theirs so that nothing jumps where neighbours
-/// change.
+/// Nodes that pull a Gaussian, and the next one, whose kernel is taken off theirs so that nothing jumps where
+/// neighbours change.
 const PULLING: usize = 4;
 /// Fainter Gaussians carry no node.
 const OPAQUE: f32 = 0.1;
@@ -43,7 +43,7 @@ pub struct DragHandle {
     /// Its radius; the nearest node is always held.
     #[serde(default)]
     pub radius: f64,
-    /// Where it goes, along broken lines; before the first key and after the last it stays there.
+    /// Its path, piecewise linear, constant before the first and after the last key.
     pub keys: Vec<DragKey>,
 }
 
@@ -55,12 +55,12 @@ pub struct DragKey {
     pub t: f64,
     /// Scene units.
     pub by: [f64; 3],
-    /// Whether it is come to and left slowly.
+    /// Whether the motion eases in and out.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub ease: bool,
 }
 
-/// A drag as it was asked for.
+/// A drag as requested.
 pub(super) struct Asked<'a> {
     pub at: f64,
     pub nodes: usize,
@@ -202,7 +202,7 @@ fn unmoved(rest: &[[f64; 3]]) -> Vec<NodeOffset> {
     rest.iter().map(|x| (*x, [0.0; 3], [1.0, 0.0, 0.0, 0.0])).collect()
 }
 
-/// A drag under the hand: one time of a scene, of which nodes are pulled again and again. What is shown is what a step
+/// An interactive drag: one time of a scene whose nodes are pulled repeatedly. It shows what a step
 /// with the same nodes, handles and pins makes of that time; away from the second at which places are meant nearly so,
 /// because who follows which node then depends on their current positions.
 #[derive(Clone, Debug)]
@@ -217,7 +217,7 @@ pub struct Dragging {
 }
 
 impl Dragging {
-    /// Takes hold of what is selected, as it is at second `now`, by nodes whose places are meant at second `at`.
+    /// Grabs the selection at second `now` by nodes whose positions are given at second `at`.
     ///
     /// Errors: as of the step; a scene with a pixel head.
     pub fn new(
@@ -274,7 +274,7 @@ impl Dragging {
         &self.nodes
     }
 
-    /// The time as it is bent now: the same at any time.
+    /// The deformed scene, constant in time.
     pub fn scene(&self) -> &Scene<f32> {
         &self.scene
     }
@@ -378,12 +378,12 @@ struct Bend<'a> {
     at: f64,
 }
 
-/// A layer's place in the scene, and for each of its rows in turn the nodes that pull it, with their shares.
+/// A layer's index in the scene, and for each of its rows the nodes that pull it, with their weights.
 type Pulled = (usize, Vec<(u32, f32)>);
 
 impl Bend<'_> {
-    /// Puts a drag around the selected Gaussians, which get layers of their own; returns the places of those, and which nodes
-    /// pull their rows. It is to be filled.
+    /// Puts a drag around the selected Gaussians, which get layers of their own; returns the places of those, and which
+    /// nodes pull their rows. It is to be filled.
     fn around(&self, scene: &mut Scene<f32>, selected: &Selected) -> Result<Vec<Pulled>> {
         let count = self.start.len();
         let neighbours = PULLING.min(count - 1).max(1);
@@ -398,8 +398,8 @@ impl Bend<'_> {
     }
 }
 
-/// Of every Gaussian the nodes that pull it, by where they are while it is there: kernels of its distances, that of the next
-/// node taken off.
+/// Of every Gaussian the nodes that pull it, by where they are while it is there: kernels of its distances, that of the
+/// next node taken off.
 fn pulls(layer: &Layer<f32>, bend: &Bend<'_>, neighbours: usize) -> Vec<(u32, f32)> {
     // The time of `bend.times` nearest to `at` at which a row is there.
     let spans = layer.spans();

@@ -1,4 +1,4 @@
-//! What a step may make of a scene: as many Gaussians as memory holds, a clip that can be gone through, finite numbers.
+//! Limits of the scenes that edit steps may produce: Gaussians in memory, length of the clip, finite numbers.
 
 use super::{Context, Step};
 use crate::layers::{Evaluation, Layer, Scene};
@@ -13,7 +13,7 @@ const WORKING: u64 = 8;
 const MOST_FRAMES: f64 = 1e6;
 /// Most changes around a model, each inside the next: readers of JSON take a hundred and some levels.
 const MOST_NESTED: usize = 40;
-/// Times of the clip at which it is looked whether all numbers are finite.
+/// Times of the clip at which all numbers are checked to be finite.
 const LOOKS: usize = 3;
 
 /// Rows and bytes of some Gaussians.
@@ -81,7 +81,7 @@ pub(super) fn check_growth(before: usize, steps: &[Step], scene: &Scene<f32>, co
     Ok(())
 }
 
-/// Refuses a clip of so many seconds before anything goes through it.
+/// Refuses a clip of so many seconds before anything iterates over it.
 pub(super) fn check_clip(clip: [f64; 2], fps: f64) -> Result<()> {
     let fps = if fps > 0.0 && fps.is_finite() { fps } else { DEFAULT_FPS };
     let seconds = clip[1] - clip[0];

@@ -24,7 +24,7 @@ const ON_SUBJECT: f32 = 0.75;
 pub type Selected = Vec<Vec<bool>>;
 
 /// Selects in a scene. A predicate of places holds for a Gaussian where it holds at more than half of the times of its
-/// life that are examined; `ever`, `always` and `at` say otherwise.
+/// life that are examined; `ever`, `always` and `at` differ.
 ///
 /// Errors: names of cameras, layers or masks that there are not; masks of another size than their camera.
 pub fn select(expr: &Expr, scene: &Scene<f32>, context: &dyn Context) -> Result<Selected> {
@@ -33,7 +33,7 @@ pub fn select(expr: &Expr, scene: &Scene<f32>, context: &dyn Context) -> Result<
     Ok(most(&bits, &looks))
 }
 
-/// What is seen of one layer: of row i at [`LOOKS`] places from `LOOKS · i` on, of which `count[i]` are there.
+/// Samples of one layer: [`LOOKS`] entries for row i from `LOOKS · i` on, of which `count[i]` are used.
 struct LayerLooks {
     count: Vec<u8>,
     means: Vec<[f32; 3]>,
@@ -46,14 +46,14 @@ struct LayerLooks {
 
 struct Looks(Vec<LayerLooks>);
 
-/// A time, the rows that are examined then, and which of its looks it is for each.
+/// A time, the rows that are examined then, and the index of each row's sample.
 type Query<'a> = (Time, &'a (Vec<u32>, Vec<u8>));
 
 /// By layer and row: bit i represents time i of the row.
 type Bits = Vec<Vec<u8>>;
 
 impl Looks {
-    /// Looks spread over lifespans, on frames.
+    /// Samples spread over lifespans, on frames.
     fn over_lives(scene: &Scene<f32>, expr: &Expr) -> Self {
         let fps = if scene.fps > 0.0 && scene.fps.is_finite() { scene.fps } else { crate::scene::time::DEFAULT_FPS };
         let [start, end] = scene.clip;
@@ -155,7 +155,7 @@ fn base_color(color: &Color<'_>, j: usize) -> [f32; 3] {
     }
 }
 
-/// All bits of so many looks.
+/// All bits of so many samples.
 fn all(count: u8) -> u8 {
     ((1u16 << count) - 1) as u8
 }

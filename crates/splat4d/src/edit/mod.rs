@@ -29,7 +29,7 @@ pub(crate) const VERSION: u32 = 1;
 /// Most steps: a bound for files.
 const MOST_STEPS: usize = 10_000;
 
-/// A list of steps, as `edits.toml` has it.
+/// A list of steps, as in `edits.toml`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Edits {
@@ -50,7 +50,7 @@ impl Default for Edits {
 }
 
 impl Edits {
-    /// Refuses lists that this version does not know, and those for another scene.
+    /// Refuses lists of unsupported versions and those for another scene.
     pub fn check(&self, title: &str) -> Result<()> {
         if self.version != VERSION {
             let what = format!("the edits have version {}, this splat4d supports {VERSION}", self.version);
@@ -95,7 +95,7 @@ pub struct PlaceKey {
     pub turn: Option<[f64; 4]>,
     /// How many times as large.
     pub scale: Option<f64>,
-    /// Whether it is come to and left slowly.
+    /// Whether the motion eases in and out.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub ease: bool,
 }
@@ -105,12 +105,12 @@ pub struct PlaceKey {
 #[serde(tag = "do", rename_all = "kebab-case", deny_unknown_fields)]
 #[non_exhaustive]
 pub enum Step {
-    /// They are gone.
+    /// Deletes them.
     Delete {
         /// What.
         select: String,
     },
-    /// All others are gone.
+    /// Deletes all others.
     Crop {
         /// What stays.
         select: String,
@@ -128,13 +128,13 @@ pub enum Step {
     Recolor {
         /// What.
         select: String,
-        /// Stops: 1 is twice as bright.
+        /// Stops: 1 doubles the brightness.
         #[serde(default)]
         exposure: f64,
         /// Factors of red, green and blue.
         #[serde(default)]
         tint: Option<[f64; 3]>,
-        /// 0 is grey, 1 as it is.
+        /// 0 is grey, 1 changes nothing.
         #[serde(default)]
         saturation: Option<f64>,
         /// Corners [in, out] of a broken line, 0 to 1; none: no curve.
@@ -180,14 +180,14 @@ pub enum Step {
         /// Its name.
         name: String,
     },
-    /// The clip is from to to; what is seen outside of it alone is gone.
+    /// The clip becomes from..to; Gaussians visible only outside of it are deleted.
     Cut {
         /// Seconds.
         from: f64,
         /// Seconds.
         to: f64,
     },
-    /// A part of the clip runs `rate` times as fast, backwards below zero; what follows comes earlier or later.
+    /// A part of the clip runs `rate` times as fast, backwards below zero; the rest is shifted in time.
     Retime {
         /// Factor of speed, not zero.
         rate: f64,
@@ -293,7 +293,7 @@ pub trait Context {
         Err(missing(&format!("mask `{name}`"), "Give a file that can be read"))
     }
 
-    /// The subject as masks of a capture have it: by camera and time.
+    /// The subject from the masks of a capture: by camera and time.
     fn subject(&self) -> Result<Vec<(Camera, Time, Mask)>> {
         Err(missing("subject", "Give the run of a capture with masks"))
     }
@@ -354,7 +354,7 @@ pub fn replay(
     replay_after(Vec::new(), steps, scene, context, progress)
 }
 
-/// The same, on a scene on which others were run before; what those did comes back in front.
+/// The same, on a scene on which others were run before; their steps are listed first.
 ///
 /// Errors: as [`replay`].
 pub fn replay_after(

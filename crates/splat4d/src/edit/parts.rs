@@ -43,8 +43,8 @@ pub(super) fn each_part(
     scene.layers = layers;
 }
 
-/// Puts a change around the models of the selected Gaussians, which get layers of their own. Changes are in the world: a
-/// frame goes inside first.
+/// Puts a change around the models of the selected Gaussians, which get layers of their own. Changes are in the world:
+/// a frame is applied first.
 pub(super) fn wrap(scene: &mut Scene<f32>, selected: &Selected, change: &dyn Fn(usize) -> Change) -> Result<()> {
     each_part(scene, selected, None, &|layer| vec![layer.clone()]);
     for (from, index) in parts(selected) {

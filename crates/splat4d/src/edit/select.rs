@@ -1,7 +1,7 @@
-//! Selections: what an edit is about, in words that hold for any scene.
+//! Selections: the Gaussians of an edit, described by text that is valid for any scene.
 //!
-//! `box(-1,-1,0, 1,1,2) and not color(0,0.6,0, 0.2)`: predicates of places, looks and lifespans, never row numbers, so
-//! that a selection finds the same thing again after the scene was trained again. See docs/edit.md for the list.
+//! `box(-1,-1,0, 1,1,2) and not color(0,0.6,0, 0.2)`: predicates of positions, appearance and lifespans, never row
+//! numbers, so that a selection finds the same object after the scene was trained again. See docs/edit.md for the list.
 
 use crate::math::quat;
 use crate::math::se3::{mat_vec, sub, transpose};
@@ -49,7 +49,7 @@ pub enum Expr {
     Like([f64; 3], f64),
     /// On the white of a mask image, seen by a camera.
     Mask(String, String),
-    /// On the subject, as the capture's masks have it.
+    /// On the subject of the capture's masks.
     Subject,
     /// What holds at that second.
     At(f64, Box<Expr>),
@@ -67,7 +67,7 @@ pub enum Expr {
     Not(Box<Expr>),
 }
 
-/// A polygon on an image, and how far behind it is looked.
+/// A polygon on an image, and the depth behind it that counts.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Lasso {
     /// Where the image was seen from, scene units.
@@ -181,7 +181,7 @@ impl Expr {
 enum Token {
     Word(String),
     Text(String),
-    /// Its value, and as it is written: a camera may be called 00.
+    /// Its value and its text: a camera may be called 00.
     Number(f64, String),
     Open,
     Close,

@@ -4,8 +4,8 @@
 //! A pixel belongs to the Gaussians that it shows: the eight heaviest α_i T_i at about the depth of the one at which
 //! half of the pixel's weight is reached (what a translucent edge lets through behind it has another motion), and its
 //! point is on the pixel's ray at that depth. A place belongs to the Gaussians nearest to it. They carry the point on
-//! by their mean displacement; where half of them have died, the nearest that live on take over, so that points are
-//! followed through models with short lifespans, at the price of the drift of an integration.
+//! by their mean displacement; where half of them have died, the nearest ones that are still alive take over, so that
+//! points are followed through models with short lifespans, at the price of the drift of an integration.
 
 use super::tracks::Member;
 use crate::layers::{Evaluation, Scene};
@@ -63,7 +63,7 @@ impl Followed {
     }
 }
 
-/// A camera's sight of a point.
+/// A camera's view of a point.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PointView {
     /// Pixel position; outside of the image too.
@@ -259,7 +259,7 @@ impl Point {
         self.at.iter().all(|x| x.is_finite())
     }
 
-    /// The mean displacement of the carriers that live at both times; `None`: fewer than half of them do.
+    /// The mean displacement of the carriers that are alive at both times; `None`: fewer than half of them do.
     fn moved(&self, now: &ActiveGaussians, next: &ActiveGaussians) -> Option<[f64; 3]> {
         let (mut sum, mut all) = ([0.0; 3], 0.0);
         for &(member, weight) in &self.carriers {
@@ -304,8 +304,8 @@ impl ActiveGaussians {
         Some(tape.out().read::<3>(j, 0).map(f64::from)).filter(|x| x.iter().all(|x| x.is_finite()))
     }
 
-    /// The Gaussians that carry what is at x, alike; of those that live on at `next` where it is given. None where the
-    /// nearest is too far to be of one thing with it.
+    /// The Gaussians that carry the point at x, with equal weights; only those alive at `next` if it is given. None
+    /// where the nearest is too far away to belong to it.
     fn around(&self, x: [f64; 3], next: Option<&ActiveGaussians>) -> Vec<(Member, f64)> {
         let mut best: Vec<(f64, f64, Member)> = Vec::with_capacity(NEAREST + 1);
         for (layer, tape) in self.evaluation.tapes().enumerate() {

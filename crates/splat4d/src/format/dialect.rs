@@ -29,7 +29,7 @@ pub struct Dialect {
     pub name: &'static str,
     /// How names of its files end, in lower case, dot included. It may end with another one's: the longer one counts.
     pub ending: &'static str,
-    /// The direction that its world calls up, by custom, where the file does not say it.
+    /// The conventional up direction where the file does not state it.
     pub up: [f64; 3],
     /// Whether it holds a moving scene.
     pub moves: bool,
@@ -43,7 +43,7 @@ pub struct Dialect {
     pub world: bool,
 }
 
-/// How a dialect is written. Writers say what was left out.
+/// How a dialect is written. Writers report what was left out.
 #[derive(Clone, Copy)]
 pub enum Writer {
     /// One time.
@@ -61,7 +61,7 @@ pub struct WriteOptions {
     pub spz_version: u32,
     /// Views that a player may offer, in the axes of the scene.
     pub cameras: Vec<Camera>,
-    /// Refuse Gaussians whose fade in time the dialect cannot say exactly, in place of fitting one.
+    /// Refuse Gaussians whose fade in time the dialect cannot express exactly, instead of fitting one.
     pub exact: bool,
     /// Which way is up, for dialects whose files specify it; `Dialect::write` takes it from the scene.
     pub up: [f64; 3],
@@ -84,7 +84,7 @@ pub struct PlyInfo {
     pub gaussians: usize,
     /// Degree of the spherical harmonics, 0-3.
     pub sh_degree: usize,
-    /// Rows that hold a NaN or an infinity without a meaning; they are kept as they are.
+    /// Rows that hold a NaN or an infinity without a meaning; they are kept.
     pub non_finite_rows: usize,
     /// Infinities that mean something, now finite.
     pub mended: Mended,
@@ -106,7 +106,7 @@ pub struct PlyInfo {
 /// An opened file.
 #[derive(Debug)]
 pub struct Opened {
-    /// The scene, in the file's own axes; `up` states which way they lie.
+    /// The scene, in the file's own axes; `up` states their orientation.
     pub scene: Scene<f32>,
     /// Which way is up, where the file itself states so.
     pub up: Option<[f64; 3]>,
@@ -128,7 +128,7 @@ impl From<(Params, Warnings)> for Opened {
     }
 }
 
-/// A scene of one layer that is static; its `up` is not said.
+/// A scene of one layer that is static; its `up` is not set.
 pub fn still(params: Params) -> Scene<f32> {
     let layer = Layer::new("gaussians", params, Arc::new(Still), LifeKind::Infinite);
     Scene { layers: vec![layer], fps: DEFAULT_FPS, ..Scene::default() }
@@ -161,7 +161,7 @@ impl Dialect {
         (self.read)(bytes).map(|opened| self.finish(opened))
     }
 
-    /// What [`open`](Self::open) does after reading: states which way is up and mends values at the edge. For files
+    /// What [`open`](Self::open) does after reading: sets the up direction and repairs values at the edge. For files
     /// that are read with others next to them ([`gltf::read_text`](super::gltf::read_text)).
     pub fn finish(&self, mut opened: Opened) -> Opened {
         opened.scene.up = opened.up.unwrap_or(self.up);
@@ -185,8 +185,8 @@ impl Dialect {
         Err(Error::new(ErrorKind::Unsupported, format!("{} is read, but not written", self.name)).remedy(remedy))
     }
 
-    /// Writes a scene, whose axes are taken as they are; of a scene that moves, a dialect that does not gets the clip's
-    /// first time. Says what was left out.
+    /// Writes a scene, whose axes are not changed; a dialect without motion gets the clip's
+    /// first time. Returns what was left out.
     ///
     /// Errors: it is only read; it cannot hold the scene, or what it should of it; a number is NaN or infinite; the
     /// sink's.

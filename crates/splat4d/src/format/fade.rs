@@ -1,5 +1,5 @@
 //! Smooth fades for Gaussians whose opacity has a flat top in time or ends at once: what playback files hold, and the
-//! moving dialects of other programs cannot say.
+//! moving dialects of other programs cannot express.
 //!
 //! A Gaussian's opacity over time becomes A·exp(−((t − centre)/width)²), least squares over the clip. One that is cut
 //! off within the clip, because its path continues as another Gaussian, fades over half its length to either side of
@@ -33,7 +33,7 @@ pub(super) struct Visibility {
     pub(super) opacity: f64,
     /// Outside of it, nothing is rendered.
     pub(super) span: [f64; 2],
-    /// Seconds in which the layer comes and goes.
+    /// Seconds in which the layer fades in and out.
     pub(super) cross_fade: [f64; 2],
     pub(super) clip: [f64; 2],
 }

@@ -17,7 +17,7 @@ use std::sync::Arc;
 pub(super) const FOREVER: f64 = 1e4;
 /// Least logit of an opacity that was fitted: nothing is seen of it.
 const LEAST_LOGIT: f64 = -20.0;
-/// Narrowest fade that is believed, in clips: below it lies no number, and nothing to see.
+/// Narrowest fade that is accepted, in clips: narrower ones are outside the number range and invisible.
 const NARROWEST: f64 = 1e-7;
 /// Assumed length of a file without a clock of its own: one second.
 const UNKNOWN_CLIP: f64 = 1.0;

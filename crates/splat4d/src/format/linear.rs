@@ -1,4 +1,4 @@
-//! Numbers that a program stored as they are, where the format has logarithms, logits and coefficients.
+//! Numbers that a program stored unconverted, where the format has logarithms, logits and coefficients.
 
 use super::bytes::SH_C0;
 use super::mend::{FLAT, OPAQUE};
@@ -9,7 +9,7 @@ use crate::math::{median, median_by};
 use crate::scene::params::{LOG_SCALE, OPACITY};
 use crate::scene::{GEOMETRY, Params, SH};
 
-/// Values that a program stored as they are, where the format has logarithms, logits and coefficients.
+/// Values that a program stored unconverted, where the format has logarithms, logits and coefficients.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Linear {
     /// Scales are lengths.
@@ -47,7 +47,7 @@ const PERCENT: f32 = 100.0;
 /// Base colours of trained scenes seldom exceed this coefficient, which is more than twice as bright as white.
 const BRIGHTEST: f32 = 6.0;
 
-/// What the values of a layer suggest is stored as it is. Evidence, not proof: nothing is converted.
+/// Which values of a layer appear to be stored unconverted. Evidence, not proof: nothing is converted.
 pub(super) fn doubts(params: &Params) -> Vec<(Linear, String)> {
     let (geometry, sh) = (&params[GEOMETRY], &params[SH]);
     let finite = |&r: &usize| {
@@ -156,7 +156,7 @@ fn radius(params: &Params, rows: &[usize]) -> f64 {
     of(means.iter().map(|m| norm(sub(*m, middle))).collect())
 }
 
-/// Reads values that are stored as they are: lengths become logarithms, alphas logits, RGB coefficients. Says what was
+/// Reads values that are stored unconverted: lengths become logarithms, alphas logits, RGB coefficients. Says what was
 /// out of range.
 pub fn from_linear(layer: &mut Layer<f32>, what: Linear) -> Warnings {
     let [geometry, sh] = layer.params.get_mut([GEOMETRY, SH]);
@@ -205,7 +205,7 @@ mod tests {
     use crate::format::dialect::still;
     use crate::format::samples::gaussians;
 
-    /// Every value of trained Gaussians as it is: opacities up to `alpha`, colours up to `white`.
+    /// Every value of trained Gaussians unconverted: opacities up to `alpha`, colours up to `white`.
     fn stored(logs: &Params, alpha: f32, white: f32) -> Params {
         let mut linear = logs.clone();
         for row in 0..logs.len() {

@@ -50,7 +50,7 @@ impl Mended {
         out
     }
 
-    /// Says so.
+    /// Reports it.
     pub(super) fn say(&self, of: usize, warnings: &mut Warnings) {
         warnings.counted(self.opaque, of, "have opacity +infinity: they are opaque");
         warnings.counted(self.invisible, of, "have opacity -infinity: their alpha is 0, they are never seen");
@@ -69,7 +69,7 @@ pub(super) fn median_size(params: &Params) -> Option<f64> {
     median_by(&mut sizes, f32::total_cmp).map(|size| f64::from(size).exp())
 }
 
-/// Says how coarse f32 is at the largest coordinates, where that shows.
+/// Reports how coarse f32 is at the largest coordinates, where that is visible.
 pub(super) fn say_coarse(params: &Params, warnings: &mut Warnings) {
     let table = &params[GEOMETRY];
     let far = (0..table.rows()).flat_map(|r| table.read::<3>(r, 0)).filter(|x| x.is_finite());

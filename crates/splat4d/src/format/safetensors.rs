@@ -251,7 +251,7 @@ impl<'a> SafeTensors<'a> {
 /// Writes a file: the same arrays and metadata always give the same bytes.
 ///
 /// Arrays are ordered by the size of their numbers, largest first, so that every array is aligned, then by name: how
-/// the tables came about does not show.
+/// the tables were made does not matter.
 ///
 /// Errors: the sink's. Panics: two arrays of one name, or one called `__metadata__`.
 pub fn write(tensors: &[Tensor<'_>], metadata: &BTreeMap<String, String>, out: &mut impl Write) -> Result<()> {
@@ -285,7 +285,7 @@ fn hexadecimal(sum: u32) -> String {
     format!("{sum:08x}")
 }
 
-/// Metadata with the checksums of a file's arrays and of itself; a file without metadata goes without.
+/// Metadata with the checksums of a file's arrays and of itself; a file without metadata has none.
 pub(crate) fn sealed(
     metadata: &BTreeMap<String, String>,
     sums: impl Iterator<Item = (String, u32)>,
@@ -339,7 +339,7 @@ pub(crate) fn header<'a>(
     [&(header.len() as u64).to_le_bytes(), header.as_bytes()].concat()
 }
 
-/// The header as it is in the file; a list, so that a name that occurs twice is seen.
+/// The header of the file; a list, so that a name that occurs twice is seen.
 #[derive(Default)]
 struct Header {
     metadata: BTreeMap<String, String>,

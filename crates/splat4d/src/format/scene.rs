@@ -29,7 +29,7 @@ pub(crate) const VERSION: u64 = 4;
 const FADING: u64 = 3;
 /// The version of scenes whose layers have frames, and do not cross-fade.
 const FRAMED: u64 = 2;
-/// The version of scenes whose layers have no frame: programs that know no frames may read them.
+/// The version of scenes whose layers have no frame: programs without support for frames may read them.
 const UNFRAMED: u64 = 1;
 /// The metadata's key.
 pub const METADATA: &str = "splat4d";
@@ -106,7 +106,7 @@ pub fn spec_to_json(spec: &Spec) -> Value {
     }
 }
 
-/// A motion model's spec from JSON. Errors: a model that this version does not know, or a field that is missing or
+/// A motion model's spec from JSON. Errors: a model that this version does not support, or a field that is missing or
 /// wrong.
 pub fn spec_from_json(v: &Value) -> Result<Spec> {
     let model = text(v, "model")?;
@@ -178,7 +178,7 @@ fn check(scene: &Scene<f32>) -> Result<()> {
 /// Writes a scene whose layers do not fit into memory together: the bytes of [`write()`]. `scene` has no layers;
 /// `layer` is requested each of the `count` twice.
 ///
-/// Errors: those of `layer`, the sink's. Panics: `scene` has layers; `layer` answers twice differently, or with masks.
+/// Errors: those of `layer`, the sink's. Panics: `scene` has layers; `layer` returns different results, or masks.
 pub fn write_by_layer(
     scene: &Scene<f32>,
     count: usize,
@@ -265,7 +265,7 @@ pub fn from_tensors(file: &SafeTensors<'_>) -> Result<Scene<f32>> {
     Ok(scene)
 }
 
-/// How blended channels become colour; files that do not say it have no head.
+/// How blended channels become colour; files without it have no head.
 fn head(meta: &Value) -> Result<Head> {
     if meta["head"].is_null() {
         return Ok(Head::Identity);

@@ -1,4 +1,4 @@
-//! Frames of plain Gaussians, one file each, as one moving scene: every Gaussian lives for its own frame.
+//! Frames of plain Gaussians, one file each, as one moving scene: every Gaussian is alive during its own frame.
 
 use crate::layers::{Layer, Scene};
 use crate::math::sh;

@@ -45,12 +45,12 @@ const SMALLEST_SCALE: f32 = 6e-8;
 /// Writes a moving scene. The options' cameras are offered by the players; without any, the first of [`Scene::clip`] is
 /// viewed from afar.
 ///
-/// Errors: the scene moves in a way that the format cannot say, or lives so and may not be fitted; the sink's.
+/// Errors: the format cannot express the scene's motion or lifespans, and fitting is not allowed; the sink's.
 pub fn write(scene: &Scene<f32>, options: &WriteOptions, out: &mut impl Write) -> Result<Warnings> {
     let mut warnings = Warnings::default();
     let span = scene.clip[1] - scene.clip[0];
     let fps = if scene.fps > 0.0 { scene.fps } else { crate::scene::time::DEFAULT_FPS };
-    // A single time still needs a clock to stand on.
+    // A single time still needs a clip.
     let clock = Clock { clip: scene.clip, fps, duration: if span > 0.0 { span } else { 1.0 } };
     let rows = rows(scene, clock, ".splatv", options.exact, &mut warnings)?;
     let height = (rows.len() * ROW / 16).div_ceil(TEXTURE_WIDTH).max(1);
@@ -84,7 +84,7 @@ pub fn write(scene: &Scene<f32>, options: &WriteOptions, out: &mut impl Write) -
     Ok(warnings)
 }
 
-/// A camera as 3DGS' cameras.json has it: centre, world-from-camera rotation as rows, focal lengths in pixels.
+/// A camera as in 3DGS' cameras.json: centre, world-from-camera rotation as rows, focal lengths in pixels.
 fn camera_json(id: usize, camera: &Camera) -> Value {
     let r = camera.cam_from_world.rotation;
     let rotation: [[f64; 3]; 3] = std::array::from_fn(|i| std::array::from_fn(|j| r[j][i]));
@@ -136,7 +136,7 @@ fn pack(m: &Moving, outside: &mut [bool; 2]) -> [u8; ROW] {
 
 /// Reads a moving scene. Without our own key, one second is assumed for the clip.
 ///
-/// Errors: another magic number; JSON that does not say where the Gaussians are; truncated.
+/// Errors: another magic number; JSON that does not state where the Gaussians are; truncated.
 pub fn read(bytes: &[u8]) -> Result<(Scene<f32>, Warnings)> {
     let mut warnings = Warnings::default();
     let mut c = Cursor::new(bytes, ".splatv file");

@@ -1,9 +1,9 @@
-//! Files of `torch.save` (PyTorch 1.6 and later), read without running anything: a zip with a pickle that names tensors, and
-//! a file for each storage of numbers.
+//! Files of `torch.save` (PyTorch 1.6 and later), read without running anything: a zip with a pickle that names
+//! tensors, and a file for each storage of numbers.
 //!
-//! The pickle is read by a machine that knows the operations of plain data and four callables ([`CALLABLES`]). Whatever else
-//! it names becomes [`Value::Opaque`], is never looked up and never called. Objects are made once by the operation that
-//! pushes them, so that their number is bounded by the bytes of the pickle.
+//! The interpreter of the pickle supports the operations of plain data and four callables ([`CALLABLES`]). Whatever
+//! else it names becomes [`Value::Opaque`], is never looked up and never called. Objects are made once by the operation
+//! that pushes them, so that their number is bounded by the bytes of the pickle.
 //! Sources: Python's `pickletools` documentation (operations), PyTorch documentation, "Serialization semantics".
 
 use super::bytes::Cursor;

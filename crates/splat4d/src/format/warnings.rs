@@ -1,7 +1,7 @@
 //! Warnings about what a file could not hold or what had to be assumed: collected while a dialect is read or written,
 //! printed by the shell.
 
-/// Sentences without a final full stop, in the order in which things came up.
+/// Sentences without a final full stop, in order of occurrence.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Warnings {
     lines: Vec<String>,
@@ -25,7 +25,7 @@ impl Warnings {
         &self.lines
     }
 
-    /// Leaves out sentences that hold `text`: what they say was settled.
+    /// Removes sentences that contain `text`, because they were resolved.
     pub fn drop(&mut self, text: &str) {
         self.lines.retain(|line| !line.contains(text));
     }

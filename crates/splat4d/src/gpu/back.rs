@@ -16,7 +16,7 @@ use rayon::prelude::*;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-/// Numbers that come back of a splat: five vec4 (splats_back.wgsl).
+/// Numbers returned per splat: five vec4 (splats_back.wgsl).
 const NUMBERS: usize = 20;
 /// Bits of `Blend::flags` in rasterize_back.wgsl.
 const FLAG_ALPHA: u32 = 1;
@@ -25,19 +25,19 @@ pub(super) const FLAG_ABS: u32 = 4;
 /// Splats in a task: whole blocks of a table.
 const CHUNK: usize = 1024;
 
-/// What came back, splat by splat; memory is reused from call to call.
+/// The returned gradients, splat by splat; memory is reused from call to call.
 #[derive(Debug, Default)]
 pub(super) struct Returned {
     /// 0: not rendered.
     pub radii: Vec<f32>,
-    /// Of which the CPU's half of the backward pass looks at the radius alone.
+    /// The CPU's half of the backward pass reads only the radius.
     projected: Vec<Projected<f32>>,
     channels: Vec<[f32; CHANNELS]>,
     d_channels: Vec<[f32; CHANNELS]>,
     partial: Vec<[f64; 3]>,
 }
 
-/// Where things are in the memory that the CPU reads.
+/// Offsets in the memory that the CPU reads.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Layout {
     cameras: u64,
@@ -75,7 +75,7 @@ pub(super) enum End {
 }
 
 impl GpuRenderer {
-    /// Compiles the kernels of the backward pass, and renders so that its records have room. Errors: the driver
+    /// Compiles the kernels of the backward pass, and renders once to size its records. Errors: the driver
     /// refuses one.
     pub fn for_training(&mut self) -> Result<()> {
         // Lists may grow by a share more than they need; behind the records are a few sums.
@@ -148,7 +148,7 @@ impl GpuRenderer {
         Ok(())
     }
 
-    /// Hands out what came back of all bands.
+    /// Returns the gradients of all bands.
     pub(super) fn deliver(
         &mut self,
         shot: &Shot<'_, f32>,
@@ -167,7 +167,7 @@ impl GpuRenderer {
         self.spread(shot, &came.rows, d_sh, d)
     }
 
-    /// `partials`: numbers of a loss that come back too.
+    /// `partials`: numbers of a loss to return as well.
     pub(super) fn make_room_to_return(
         &mut self,
         n: usize,
@@ -221,7 +221,8 @@ impl GpuRenderer {
         }
     }
 
-    /// Takes one band back; `again`: it must be listed and rendered again; `last`: with what came of the splats.
+    /// Runs the backward pass of one band; `again`: it must be listed and rendered again; `last`: also returns the
+    /// splats' gradients.
     fn return_band(
         &self,
         (band, pairs): (Band, usize),
@@ -243,7 +244,7 @@ impl GpuRenderer {
 
     /// The backward pass of a band whose lists, planes and gradient are available after what `recorder` holds, and the
     /// reading of
-    /// what comes of it. `pairs`: so many at most.
+    /// the copy of its results. `pairs`: their largest number.
     pub(super) fn come_back(
         &self,
         mut recorder: Recorder<'_>,

@@ -34,7 +34,7 @@ impl Grown {
         Self::new(what, Usage::STORAGE | Usage::COPY_SRC | Usage::COPY_DST)
     }
 
-    /// Sees to it that there are `bytes`. Whether the buffer is a new one: what it held is lost then.
+    /// Ensures a size of `bytes`. Returns whether the buffer is new, with undefined content.
     ///
     /// Errors: more than one binding may hold, or no memory.
     pub(super) fn ensure(&mut self, gpu: &Gpu, bytes: u64) -> Result<bool> {
@@ -68,7 +68,7 @@ impl Grown {
         gpu.check()
     }
 
-    /// Sees to it that there are `bytes`, and no more than that of a buffer that is made: for what never grows.
+    /// Ensures a size of `bytes` without spare capacity, for buffers that never grow.
     ///
     /// Errors: as of [`ensure`](Self::ensure).
     pub(super) fn fit(&mut self, gpu: &Gpu, bytes: u64) -> Result<()> {

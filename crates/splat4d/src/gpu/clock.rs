@@ -240,7 +240,7 @@ impl<'a> Recorder<'a> {
         self.recorded
     }
 
-    /// Submits what was recorded so far.
+    /// Submits the recorded commands.
     pub(crate) fn submit(&mut self) -> wgpu::SubmissionIndex {
         let done = std::mem::replace(&mut self.encoder, encoder(self.gpu));
         self.gpu.queue.submit([done.finish()])

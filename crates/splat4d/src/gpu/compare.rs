@@ -73,7 +73,7 @@ pub(super) fn means(held: &Held, [l1, ssim, mse]: [f64; 3], d_response: Option<[
 }
 
 impl GpuRenderer {
-    /// Whether an image of so many splats can be compared at all: its planes are in one piece.
+    /// Whether an image of so many splats can be compared at all: its planes are one buffer.
     pub(super) fn can_compare(&self, splats: usize, [w, h]: [usize; 2]) -> bool {
         let room = largest_binding(&self.gpu) - 4 * UNIFORM_STRIDE;
         let whole = Band { first: 0, rows: h.div_ceil(TILE) };
@@ -165,7 +165,7 @@ impl GpuRenderer {
         self.gpu.queue.write_buffer(self.buffers.uniforms.get(), at, bytemuck::bytes_of(loss));
     }
 
-    /// Buffers of the loss of an image, of which so many numbers come.
+    /// Buffers of the loss of an image, which returns this many numbers.
     pub(super) fn make_room_for_loss(&mut self, [w, h]: [usize; 2], partials: usize) -> Result<bool> {
         let (gpu, b) = (&self.gpu, &mut self.buffers);
         b.maps.ensure(gpu, (4 * CHANNELS * MAPS * w * h) as u64)?;
@@ -173,8 +173,8 @@ impl GpuRenderer {
         b.d_planes.ensure(gpu, (4 * PLANES * w * h) as u64)
     }
 
-    /// One submission: rendering, comparison, backward pass. What came means nothing if there are more pairs than there
-    /// is room for.
+    /// One submission: rendering, comparison, backward pass. The results are invalid if there are more pairs than
+    /// fit.
     fn there_and_back(
         &mut self,
         held: &Held,

@@ -1,6 +1,6 @@
 //! Choice and opening of the GPU: nothing beyond WebGPU's default limits is requested, so that what runs here runs in
-//! a browser too; but for the size of buffers, which natively may be as large as the driver has them, and subgroups,
-//! where it has them.
+//! a browser too; except for the size of buffers, which natively is the driver's limit, and subgroups,
+//! where available.
 
 use super::tuning::Tuning;
 use crate::{Error, ErrorKind, Result};
@@ -105,12 +105,12 @@ impl Gpu {
         Self { tuning, ..self }
     }
 
-    /// The card's name as its driver gives it.
+    /// The adapter's name from its driver.
     pub(crate) fn name(&self) -> &str {
         &self.info.name
     }
 
-    /// Card, kind, interface and driver in one line, and whether kernels use its subgroups.
+    /// Adapter, kind, interface and driver in one line, and whether kernels use its subgroups.
     pub fn describe(&self) -> String {
         let i = &self.info;
         let driver = [i.driver.as_str(), i.driver_info.as_str()].join(" ");
@@ -139,7 +139,7 @@ impl Gpu {
         self.poll(wgpu::PollType::wait_indefinitely())
     }
 
-    /// Waits until some work has been done, and not for what came after it.
+    /// Waits until the given work is done, and not for later work.
     pub(super) fn wait_for(&self, work: &wgpu::SubmissionIndex) -> Result<()> {
         self.poll(wgpu::PollType::Wait { submission_index: Some(work.clone()), timeout: None })
     }

@@ -45,8 +45,8 @@ pub(super) mod count {
     pub(crate) const ALL: usize = 5;
 }
 
-/// The two buffers of arguments, and what is in each: triples of u32, first for a thread a thing, then for a workgroup
-/// a block of things.
+/// The two buffers of arguments, and what is in each: triples of u32, first for one thread per item, then for one
+/// workgroup per block of items.
 pub(super) mod arguments {
     pub(crate) const VISIBLE: usize = 0;
     pub(crate) const PAIRS: usize = 1;
@@ -259,7 +259,7 @@ impl Frame<'_> {
     }
 
     /// Lists and blends one band; `bytes`: so many pixels of it in 8 bits too. Returns in which of the two buffers the
-    /// sorted pairs lie.
+    /// sorted pairs are.
     pub(super) fn band(
         &self,
         recorder: &mut Recorder<'_>,

@@ -60,7 +60,7 @@ const OWNER_SHIFT: u32 = 28;
 const FLAG_ANTIALIAS: u32 = 1;
 /// Pairs of tile and splat that are held at once (a quarter GiB); bands are made so that no more are needed.
 const MOST_PAIRS: usize = 1 << 24;
-/// Pairs that there is room for at first, for each splat and at least.
+/// Initial capacity for pairs, per splat and at least.
 const FIRST_PAIRS: (usize, usize) = (4, 1 << 16);
 /// Workgroups of one dispatch in one direction (WebGPU's default limit).
 const MOST_GROUPS: usize = 65_535;
@@ -292,7 +292,7 @@ impl GpuRenderer {
         Ok(fresh)
     }
 
-    /// Pairs that there is room for.
+    /// Capacity for pairs.
     fn pair_capacity(&self) -> usize {
         (self.buffers.pair_keys[0].bytes() / 4) as usize
     }
@@ -477,7 +477,7 @@ struct Way {
     view: u32,
 }
 
-/// Where an image goes.
+/// Destination of an image.
 enum Out<'a> {
     Planes(&'a mut Image<f32>),
     /// Red, green, blue, alpha of every pixel.

@@ -1,6 +1,6 @@
 //! Tables that stay on the GPU: rows become splats, splats an image, and its loss steps of Adam, without a number of
 //! them
-//! passing through the CPU. Densification, files and whatever else looks at a scene fetch the tables, and hand them
+//! passing through the CPU. Densification, files and other readers of a scene fetch the tables, and hand them
 //! back.
 //!
 //! Tables of more rows than a binding holds are in pages of whole blocks, each with buffers and dispatches of its own;
@@ -36,13 +36,13 @@ use std::ops::Range;
 use ties::Tied;
 use uniforms::{Ask, MOST_COLUMNS, RecordRule, Rule};
 
-/// Number of the SH table; those before it lie side by side in one buffer.
+/// Number of the SH table; those before it are contiguous in one buffer.
 const SH: usize = KEPT - 1;
 /// Columns of a row's statistics.
 const STATS_WIDTH: usize = 3;
-/// Pieces in which Adam takes the widest table: three blocks of SH of degree 3.
+/// Pieces in which Adam processes the widest table: three blocks of SH of degree 3.
 const PIECES: usize = 3;
-/// Structures a page in the buffer of uniforms: what is asked, a rule a piece of a table, losses on rows, noise, ties.
+/// Structures per page in the buffer of uniforms: the query, a rule per piece of a table, losses on rows, noise, ties.
 mod at {
     pub(super) const ASK: usize = 0;
     pub(super) const RULES: usize = 1;
@@ -130,7 +130,7 @@ impl ResidentBuffers {
         }
     }
 
-    /// First columns of the pieces in which Adam takes a table.
+    /// First columns of the pieces in which Adam processes a table.
     fn pieces(&self, table: usize) -> impl Iterator<Item = usize> {
         (0..self.widths[table]).step_by(MOST_COLUMNS)
     }
@@ -147,7 +147,7 @@ pub(super) struct Tables {
     layers: usize,
     /// Page after page of layer after layer.
     pages: Vec<ResidentBuffers>,
-    /// Geometry and SH of the pages, as they are rendered.
+    /// Geometry and SH of the pages, for rendering.
     upload: Upload,
     kernels: ResidentKernels,
     uniforms: Grown,
@@ -208,7 +208,7 @@ impl Tables {
         })
     }
 
-    /// What is asked of a page.
+    /// The query to a page.
     fn ask(&self, page: usize) -> wgpu::BindingResource<'_> {
         self.uniform(page * at::ALL + at::ASK, size_of::<Ask>())
     }
@@ -270,7 +270,7 @@ fn history<'a>(table: &ResidentTable<'a>, page: &Range<usize>) -> Cow<'a, [f32]>
     }
 }
 
-/// The other way round: some columns of tables that lie side by side.
+/// The inverse: some columns of contiguous tables.
 fn apart(all: &[f32], stride: usize, columns: Range<usize>) -> Vec<f32> {
     all.chunks_exact(stride.max(1) * BLOCK)
         .flat_map(|block| &block[columns.start * BLOCK..columns.end * BLOCK])
@@ -298,12 +298,12 @@ impl ResidentPass<'_> {
         self.view + 1 == self.step.views.len()
     }
 
-    /// Whether losses look at rows.
+    /// Whether there are losses on rows.
     fn has_row_losses(&self) -> bool {
         self.step.rows != RowWeights::default()
     }
 
-    /// Writes what is asked and by which rules is learnt, of an image of so many tiles.
+    /// Writes queries and rules of learning, for an image of this many tiles.
     fn write_uniforms(&self, gpu: &Gpu, tiles: usize) {
         let Self { tables, step, view } = *self;
         let status = tables.status(step.views.len());
@@ -356,7 +356,7 @@ impl ResidentPass<'_> {
         self.tables.uniform(at, size)
     }
 
-    /// What is asked of a page.
+    /// The query to a page.
     fn ask(&self, page: usize) -> wgpu::BindingResource<'_> {
         self.tables.ask(page)
     }
@@ -418,7 +418,7 @@ impl ResidentPass<'_> {
         recorder.stage(Stage::Adam, |pass| runs.iter().for_each(|run| run.record(pass)))
     }
 
-    /// Losses that look at rows, which add to their gradients.
+    /// Losses on rows, which add to their gradients.
     fn losses(&self, gpu: &Gpu, b: &Buffers, words: &wgpu::BindingResource<'_>, runs: &mut Vec<Run>) {
         let (k, pages) = (&self.tables.kernels, &self.tables.pages);
         if self.has_row_losses() {
@@ -654,7 +654,7 @@ impl GpuRenderer {
     }
 }
 
-/// Rows of a page of a layer: whole blocks, as many as every one of its buffers has room for.
+/// Rows of a page of a layer: whole blocks, as many as fit into each of its buffers.
 fn page_rows(gpu: &Gpu, layer: &ResidentLayer<'_>) -> usize {
     let small = layer.tables[..SH].iter();
     let [params, moments] = small.fold([0, 0], |[p, m], t| [p + t.width, m + moments_width(t.width)]);

@@ -100,7 +100,7 @@ impl GpuRenderer {
         Ok(groups * (THREADS * SPLATS) as f64)
     }
 
-    /// Bytes per second that come up, and go down: as tables are sent and images are read.
+    /// Bytes per second of uploads and downloads: tables are sent and images are read.
     fn bus(&self) -> Result<[f64; 2]> {
         let data = vec![1u8; BUS as usize];
         let mut on_gpu = Grown::storage("a copy's target");

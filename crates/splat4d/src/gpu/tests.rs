@@ -140,7 +140,7 @@ fn on_cpu(shot: &Shot<'_>, config: &RenderConfig) -> (Renderer<f32>, Image<f32>)
     (renderer, image)
 }
 
-/// Things in a block of a sum or of a sort.
+/// Items in a block of a sum or of a sort.
 fn block() -> usize {
     Tuning::default().block()
 }

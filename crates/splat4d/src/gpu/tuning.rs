@@ -1,14 +1,14 @@
 //! Constants of the kernels that decide how fast they are, and of what they compute nothing but, where it states so,
-//! last bits: what a sweep on a card varies.
+//! last bits: a sweep on a GPU varies them.
 
 use super::limits::THREADS;
 
-/// See the module's documentation. The defaults are the portable ones, chosen without a card.
+/// See the module's documentation. The defaults are the portable ones, chosen without a GPU.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Tuning {
     /// Threads of a workgroup of the kernels over rows that stay on the GPU.
     pub row_threads: usize,
-    /// Things that a thread of a sort, of a sum or of the search for tiles' lists handles.
+    /// Items that a thread of a sort, of a sum or of the search for tiles' lists handles.
     pub rounds: usize,
     /// Splats that a tile reads at a time, to blend them.
     pub batch: usize,
@@ -85,7 +85,7 @@ impl Tuning {
         (!words.is_empty()).then(|| words.join(" "))
     }
 
-    /// Things in a block of a sum or of a sort (scan.wgsl, sort.wgsl).
+    /// Items in a block of a sum or of a sort (scan.wgsl, sort.wgsl).
     pub(super) fn block(&self) -> usize {
         THREADS * self.rounds
     }

@@ -8,7 +8,7 @@ use crate::math::quat;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use crate::scene::{GEOMETRY, Params, SH, Time};
 
-/// Opacity (logit) of a Gaussian that does not live: alpha 2·10⁻⁹, far below what is rendered.
+/// Opacity (logit) of a Gaussian that is not alive: alpha 2·10⁻⁹, far below what is rendered.
 pub(crate) const HIDDEN: f32 = -20.0;
 
 /// The frames of a scene as rows that are the same Gaussian in all of them.
@@ -17,7 +17,7 @@ pub struct Constant<'a> {
     times: Vec<f64>,
     /// By layer: for each row its place among the kept ones; [`u32::MAX`]: never alive.
     places: Vec<Vec<u32>>,
-    /// Every kept row as it is when it is first alive, its opacity hidden.
+    /// Every kept row at the first time at which it is alive, its opacity hidden.
     first: Params<f32>,
     /// The rows at the last time that was queried for.
     now: Params<f32>,
@@ -67,7 +67,7 @@ impl<'a> Constant<'a> {
         &self.times
     }
 
-    /// Frame `i`, whose opacities are `HIDDEN` where a Gaussian does not live. Frames are requested one after the
+    /// Frame `i`, whose opacities are `HIDDEN` where a Gaussian is not alive. Frames are requested one after the
     /// other; frame 0 begins again. Rotations keep the sign and the order of axes that are nearest to the frame before.
     pub fn frame(&mut self, i: usize) -> &Params<f32> {
         if i == 0 {
@@ -91,7 +91,7 @@ fn alive(layer: &Layer<f32>, t: f64) -> Vec<u32> {
     rows
 }
 
-/// Writes rows of a layer as they are at a time to their places.
+/// Writes rows of a layer at a time to their positions.
 fn copy(
     layer: &Layer<f32>,
     rows: &[u32],
@@ -181,7 +181,7 @@ mod tests {
     use crate::motion::{SpacetimeSpec, Spec, build};
     use crate::scene::{LIFE, LifeKind};
 
-    /// Gaussians that fly, spin and live for a part of a second.
+    /// Gaussians that fly, spin and have lifespans of a part of a second.
     fn moving() -> Scene<f32> {
         let life = LifeKind::GaussHalf;
         let mut params = Params::new(60, 4, life.columns());

@@ -21,7 +21,7 @@ fn cannot(what: &str, remedy: &str) -> Error {
     Error::input(what.to_owned()).remedy(remedy.to_owned())
 }
 
-/// The layer as a polynomial of time where its model is one in other numbers (`native4d`); else the layer as it is.
+/// The layer as a polynomial of time where its model is one in other numbers (`native4d`); else the layer unchanged.
 ///
 /// Errors: those of `to_spacetime`.
 pub(crate) fn with_polynomial<F: Real>(layer: &Layer<F>) -> Result<Cow<'_, Layer<F>>> {

@@ -9,7 +9,7 @@ use crate::scene::table::TableMut;
 use crate::scene::{BLOCK, LifeKind, Rows, Table, Time};
 use crate::simd::{Kernel, Simd, dispatch, each};
 
-/// Rows a task looks at.
+/// Rows per task.
 const TASK_ROWS: usize = 8192;
 
 /// σ, ∂σ/∂t, ∂σ/∂log width and ∂σ/∂log softness of sixteen rows; columns that the lifespan lacks are not read.

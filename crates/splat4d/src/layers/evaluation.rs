@@ -1,6 +1,6 @@
 //! [`Evaluation`]: the scene at these times, forth and back.
 //!
-//! A motion model needs all queries of a step at once (`prepare`), then answers them one by one (`at`); in the
+//! A motion model needs all queries of a step at once (`prepare`), then computes them one by one (`at`); in the
 //! backward pass it
 //! takes a gradient a query (`backward`) and hears when that was the last one (`finish`). That order is written here,
 //! once, for training, playback, freezing, flow and baking.
@@ -30,7 +30,7 @@ struct Query<F: Real> {
     tape: LayerTape<F>,
     /// Whether the rows alive at that time are among those requested.
     alive: bool,
-    /// Whether the gradients below belong to the result; what they hold otherwise is of an earlier one.
+    /// Whether the gradients below belong to the result; otherwise they are those of an earlier one.
     begun: bool,
     d_out: Table<F>,
     d_color: Option<Table<F>>,
@@ -39,7 +39,7 @@ struct Query<F: Real> {
 }
 
 impl<F: Real> Evaluation<F> {
-    /// These rows of one layer at one time, answered.
+    /// A query's result: these rows of one layer at one time.
     pub fn of_layer(layer: &Layer<F>, of: Space, rows: Rows<'_>, t: Time) -> Self {
         let mut out = Self::default();
         out.request(0, of, rows, t);
@@ -115,7 +115,7 @@ impl<F: Real> Evaluation<F> {
         }
     }
 
-    /// Answers all queries: `prepare` once per layer, `at` once per query. Gradients begin again.
+    /// Computes the results of all queries: `prepare` once per layer, `at` once per query. Gradients are reset.
     pub fn evaluate(&mut self, layers: &[Layer<F>]) {
         self.caches.resize_with(layers.len(), Default::default);
         for (index, (layer, (cache, d_cache))) in layers.iter().zip(&mut self.caches).enumerate() {
@@ -148,7 +148,7 @@ impl<F: Real> Evaluation<F> {
         &self.questions[i].tape
     }
 
-    /// All queries and results, in the order in which they were first asked.
+    /// All queries and results, in the order of the first requests.
     pub fn tapes(&self) -> impl ExactSizeIterator<Item = &LayerTape<F>> {
         self.questions.iter().map(|q| &q.tape)
     }
@@ -177,7 +177,7 @@ impl<F: Real> Evaluation<F> {
     }
 
     /// Adds to the gradient of result i: that of [`Part::out`](crate::scene::Part::out), of direct colours, and of
-    /// weights of colours. Tables may come back exchanged for others, whose numbers mean nothing.
+    /// weights of colours. Tables may be replaced by others with undefined numbers.
     pub fn add_gradient(
         &mut self,
         i: usize,
@@ -232,7 +232,7 @@ impl<F: Real> Query<F> {
     }
 }
 
-/// Shows the answers to many queries for the Gaussians of one layer, of which one is held at a time, however many there
+/// Passes the results of many queries for the Gaussians of one layer to a callback, one at a time, however many there
 /// are. The motion model hears of all of them first, so that one that scans through time does so once.
 pub(crate) fn sweep<F: Real>(layer: &Layer<F>, asked: &[(Rows<'_>, Time)], mut show: impl FnMut(usize, &LayerTape<F>)) {
     let (p, of) = (&layer.params, Space::Gaussians);

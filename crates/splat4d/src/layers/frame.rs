@@ -104,8 +104,8 @@ fn congruence<F: Real>(a: &[[F; 3]; 3], m: [[F; 3]; 3]) -> [[F; 3]; 3] {
 }
 
 impl Layer<f32> {
-    /// The layer with its frame in its tables, as far as [`apply_transform`](Self::apply_transform) goes; itself where
-    /// it has none.
+    /// The layer with its frame in its tables, as far as [`apply_transform`](Self::apply_transform) supports it; itself
+    /// where it has none.
     pub(crate) fn with_frame_absorbed(&self) -> Cow<'_, Self> {
         if self.frame.is_identity() {
             return Cow::Borrowed(self);

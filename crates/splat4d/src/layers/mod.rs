@@ -50,7 +50,7 @@ pub struct Layer<F: Real = f32> {
     pub params: Params<F>,
     /// How it moves.
     pub motion: Arc<dyn Motion<F>>,
-    /// How long its Gaussians live.
+    /// Lifespans of its Gaussians.
     pub life: LifeKind,
     /// The layer is seen for from ≤ t < to, seconds; [`ALWAYS`] but for pages of a playback file.
     pub span: [f64; 2],
@@ -87,7 +87,7 @@ impl<F: Real> std::fmt::Debug for Layer<F> {
     }
 }
 
-/// One layer's answer at one time, and what its backward needs.
+/// One layer's result at one time, and the state for its backward.
 #[derive(Debug)]
 pub struct LayerTape<F = f32> {
     of: Space,
@@ -163,7 +163,7 @@ impl<F: Real> LayerTape<F> {
         if self.world.width() > 0 { &self.world } else { &self.tape.out }
     }
 
-    /// The query as the motion model sees it.
+    /// The query as the motion model gets it.
     pub fn question<'a>(&'a self, p: &'a Params<F>) -> At<'a, F> {
         At { p, of: self.of, rows: self.rows(), t: self.t }
     }
@@ -246,7 +246,7 @@ impl<F: Real> Layer<F> {
         LifeBuckets::new(self.spans(), clip, count)
     }
 
-    /// Answers the query in `tape`: the motion model, then the lifespan, the cross-fade and the frame. Nodes have none
+    /// Computes the query in `tape`: the motion model, then the lifespan, the cross-fade and the frame. Nodes have none
     /// of these.
     pub fn at(&self, cache: &Cache, tape: &mut LayerTape<F>) {
         let mut own = std::mem::take(&mut tape.tape);
@@ -351,7 +351,7 @@ impl<F: Real> Layer<F> {
         d_time
     }
 
-    /// One row edit: gathers every table of its space, then lets the model mend what copying cannot.
+    /// One row edit: gathers every table of its space, then lets the model correct what copying cannot.
     pub fn edit(&mut self, edit: &RowEdit, rng: &Rng) {
         self.params.apply(edit);
         self.masks = self.masks.take().map(|m| Arc::new(m.edited(edit)));
@@ -448,7 +448,7 @@ impl<F: Real> Scene<F> {
         self.layers.iter().map(of).max().unwrap_or(0)
     }
 
-    /// From when on the scene shows what was predicted, seconds; `None`: it was seen as it is.
+    /// Start of the predicted part, seconds; `None`: all of it was observed.
     pub fn predicted_from(&self) -> Option<f64> {
         let predicted = self.layers.iter().filter(|l| l.name.starts_with(PREDICTED));
         predicted.map(|l| l.span[0]).filter(|t| t.is_finite()).min_by(f64::total_cmp)
@@ -481,7 +481,7 @@ impl<F: Real> Scene<F> {
         self.head_keys().map(|(layer, keys)| keys.weights(&self.layers[layer].params))
     }
 
-    /// Errors where Gaussians alone do not say how the scene looks: `what` (a format, a way to play) has no pixel head.
+    /// Errors if Gaussians alone do not determine the image: `what` (a format, a player) does not support a pixel head.
     pub fn without_head(&self, what: &str) -> Result<()> {
         match self.head {
             Head::Identity => Ok(()),

@@ -85,7 +85,7 @@ pub fn largest(m: [f64; 6]) -> f64 {
     mean + 2.0 * p * angle.cos()
 }
 
-/// A unit quaternion and log scales with this covariance: the way from any activated Gaussian back to a learnable one.
+/// A unit quaternion and log scales with this covariance: from any activated Gaussian to a learnable one.
 ///
 /// Eigenvalues below `floor²` are lifted to it.
 pub fn to_quat_log_scales(cov: [f64; 6], floor: f64) -> ([f64; 4], [f64; 3]) {

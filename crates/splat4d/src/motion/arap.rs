@@ -35,7 +35,7 @@ const TASK_NODES: usize = 64;
 pub struct Handle {
     /// Its number.
     pub node: usize,
-    /// Where it goes, scene units.
+    /// Target position, scene units.
     pub target: [f64; 3],
     /// How it turns (rows), for handles with six degrees of freedom; `None`: as its neighbours require.
     pub rotation: Option<[[f64; 3]; 3]>,
@@ -72,7 +72,7 @@ impl Dragged {
 
 /// Drags `handles` of nodes at `rest`, with `iterations` rounds (SC-GS: 3). See `Elastic` to drag the same nodes again.
 ///
-/// Errors: a handle that is no node or occurs twice, a target that is not finite.
+/// Errors: a handle that is not a node or occurs twice, a target that is not finite.
 pub fn drag(rest: &[[f64; 3]], handles: &[Handle], iterations: usize) -> Result<Dragged> {
     Elastic::new(rest).drag(handles, iterations)
 }
@@ -142,7 +142,7 @@ impl Elastic {
 
     /// Puts handles where they belong and lets all others follow. Parts without a handle stay.
     ///
-    /// Errors: a handle that is no node or occurs twice, a target that is not finite.
+    /// Errors: a handle that is not a node or occurs twice, a target that is not finite.
     pub(crate) fn drag(&self, handles: &[Handle], iterations: usize) -> Result<Dragged> {
         let n = self.len();
         let mut held: Vec<Option<Handle>> = vec![None; n];

@@ -5,9 +5,9 @@
 //! x_t = x + r·δx or c + r·exp([w; v])((x − c)/r), q_t = q/|q| + δq, s_t = max(exp(log_scales) + r·δs, 1e-6) — scales
 //! are changed after the activation — each head times its constant of `GAINS`. Opacity and SH stay.
 //! `sg` stops the gradient: the network's input is detached from the mean, so that dL/dx = dL/dx_t (with a screw:
-//! turned by it). The network sees γ(x̂) and γ(t̂), t̂'s perhaps through a small network of its own, or hash grids over
-//! (x, y, z) and (x, y, t), (y, z, t), (x, z, t). What depends on t̂ alone enters as a shift of biases, which is the
-//! same as repeating it in every row.
+//! turned by it). The inputs of the network are γ(x̂) and γ(t̂), t̂'s perhaps through a small network of its own, or
+//! hash grids over (x, y, z) and (x, y, t), (y, z, t), (x, z, t). What depends on t̂ alone enters as a shift of biases,
+//! which is the same as repeating it in every row.
 //! At the start the last map is zero: the result is then the canonical cloud bit for bit, as in `still`.
 //! Source: Yang et al. 2024 (Deformable 3D Gaussians) §3; heads that start at zero as in SC-GS (Huang et al. 2024);
 //! hash grids after Müller et al. 2022 and Grid4D (Xu et al. 2024).
@@ -59,7 +59,7 @@ pub enum Input {
         x_levels: usize,
         /// Levels of t̂.
         t_levels: usize,
-        /// Whether γ(t̂) goes through a small network first (`TIME_WIDTH` → `TIME_OUTPUTS`).
+        /// Whether γ(t̂) passes through a small network first (`TIME_WIDTH` → `TIME_OUTPUTS`).
         time_net: bool,
     },
     /// Hash grids.
@@ -71,7 +71,7 @@ pub enum Input {
     },
 }
 
-/// Hidden numbers of the network that only sees time (Yang et al. 2024, synthetic scenes).
+/// Hidden width of the network of time alone (Yang et al. 2024, synthetic scenes).
 pub(crate) const TIME_WIDTH: usize = 256;
 /// Number of its outputs, which the trunk gets.
 pub(crate) const TIME_OUTPUTS: usize = 30;
@@ -81,7 +81,7 @@ const TIME_AXES: [[usize; 3]; 3] = [[0, 1, 3], [1, 2, 3], [0, 2, 3]];
 const POINT: usize = 4;
 /// Name of the table that holds the centre and the half side of the box of the initial cloud, scene units.
 pub(crate) const BOUNDS: &str = "deform_bounds";
-/// Share of the points that may lie outside the box on either side of an axis.
+/// Share of the points that may be outside the box on either side of an axis.
 const OUTSIDE: f64 = 0.005;
 /// The box is this much larger than what holds the points.
 const MARGIN: f64 = 1.25;
@@ -107,7 +107,7 @@ enum Eyes {
     Encoded {
         x_levels: usize,
         t_levels: usize,
-        /// γ(t̂) → what the shifts are made of.
+        /// γ(t̂) → the inputs of the shifts.
         time: Option<Mlp>,
         /// → the shift of the trunk's first map.
         enter: Mlp,
@@ -140,7 +140,7 @@ struct Own<F> {
     /// [rows, 4]: x̂ and t̂ in [0, 1], for grids.
     points: Vec<F>,
     shifts: Vec<Vec<F>>,
-    /// γ(t̂), and what the shifts are made of.
+    /// γ(t̂), and the inputs of the shifts.
     time: [Vec<F>; 2],
     kept: LayerOutputs<F>,
     time_kept: LayerOutputs<F>,
@@ -267,7 +267,7 @@ impl Deform {
         Bounds { center: [b[0], b[1], b[2]], radius: b[3], rigid: self.spec.rigid }
     }
 
-    /// Asks the network for every row of the query.
+    /// Evaluates the network for every row of the query.
     fn request<F: Real>(&self, q: &At<'_, F>, own: &mut Own<F>) {
         let (n, bounds, t) = (q.len(), self.bounds(q.p), F::of(self.unit_time(q.t).0));
         let geometry = &q.p[GEOMETRY];
@@ -369,7 +369,7 @@ impl Deform {
         }
     }
 
-    /// Whether everything that comes out is zero.
+    /// Whether all outputs are zero.
     fn rests<F: Real>(&self, p: &Params<F>) -> bool {
         let shifted = self.spec.layers == 0 && matches!(&self.eyes, Eyes::Encoded { enter, .. } if !enter.is_zero(p));
         !shifted && self.trunk.is_zero(p)

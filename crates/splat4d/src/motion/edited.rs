@@ -1,7 +1,7 @@
 //! `edited`: any model with a change on top that no table of its own can take in: another clock, a key-framed place,
 //! other colours, a fade, a drag of control nodes. Changes on changes are models around models.
 //!
-//! | change | answer at t, from the result inside |
+//! | change | result at t, from the inner result |
 //! |---|---|
 //! | `clock` | that at s = rate·t + offset |
 //! | `path` | μ' = A(t) μ + b(t), Σ' = A Σ Aᵀ, colours turn along; A = scale times rotation |
@@ -9,8 +9,8 @@
 //! | `fade` | opacity times a factor of t |
 //! | `drag` | μ' = M μ + b, Σ' = Q Σ Qᵀ, blended of the node offsets that pull the Gaussian ([`DragSpec`]) |
 //!
-//! Lifespans are the layer's: who gives a model a clock gives the layer's lives the same. Nodes are answered by the
-//! model inside. Gradients pass through to the tables inside; the changes themselves are not learnt.
+//! Lifespans are the layer's: a clock for the model must also be given to the layer's lifespans. Nodes are evaluated by
+//! the model inside. Gradients pass through to the tables inside; the changes themselves are not learnt.
 
 mod color;
 mod drag;
@@ -274,7 +274,7 @@ impl<F: Real> Edited<F> {
         });
     }
 
-    /// Colours of the result `inner` as the change has them at time t; leaves `out` empty where they are the model's
+    /// Colours of the result `inner` after the change at time t; leaves `out` empty where they are the model's
     /// own.
     fn paint(&self, q: &At<'_, F>, t: f64, inner: &Tape<F>, out: &mut Table<F>) {
         if !self.change.paints() {
@@ -365,7 +365,7 @@ impl<F: Real> Edited<F> {
         (d_color, d_weights)
     }
 
-    /// Σ d_out · ∂out/∂t at a fixed answer inside, by central differences.
+    /// Σ d_out · ∂out/∂t at a fixed inner result, by central differences.
     fn d_time(&self, q: &At<'_, F>, own: &Own<F>, d_out: &SplatGrads<'_, F>) -> f64 {
         if !self.change.moves() {
             return 0.0;

@@ -6,7 +6,7 @@
 //! | fusion | state |
 //! |---|---|
 //! | `geodesic` | μ = μₚ + κ(μₒ−μₚ), Σ at κ on the geodesic from Σₚ to Σₒ; κ = 1 − w(1−K), K learnt, one per Gaussian |
-//! | `literal` | K = Σₚ(Σₚ+Σₒ+εI)⁻¹, μ = μₚ + K(μₒ−μₚ), Σ = (I−K)Σₚ, as far as w goes |
+//! | `literal` | K = Σₚ(Σₚ+Σₒ+εI)⁻¹, μ = μₚ + K(μₒ−μₚ), Σ = (I−K)Σₚ, scaled by w |
 //!
 //! w = trust · gate. Trust rises from 0 to 1 over the frame in which the clip has become long enough to predict from;
 //! the gate closes where the innovation δᵀ(Σₚ+Σₒ)⁻¹δ leaves what chance explains, so that a sudden motion is followed
@@ -14,7 +14,7 @@
 //! that many frames back: sequential inference with random access. Opacity and colour are the observation's.
 //!
 //! Gradients: exact, through all of `history`; with `stop_gradient` (the default) earlier results are constants. Nodes
-//! are answered by the model inside.
+//! are evaluated by the inner model.
 //!
 //! Source: Deng et al. 2024 ("Wasserstein 4DGS", arXiv 2412.00333); the scalar gain, the geodesic fusion, the gate's
 //! fading and the baseline are ours.
@@ -64,8 +64,8 @@ pub struct FilteredSpec {
     /// Frames between the two states that the velocity is taken from, 1 (as published) to [`MAX_BASELINE`]: more
     /// predicts more steadily, and later.
     pub baseline: usize,
-    /// Frames before t through which the filter runs, up to [`MAX_HISTORY`]; 0: it predicts from what the model inside
-    /// answers.
+    /// Frames before t through which the filter runs, up to [`MAX_HISTORY`]; 0: it predicts from the results of the
+    /// inner model.
     pub history: usize,
     /// Squared innovation at which the prediction is dropped; 0: never.
     pub gate: f64,
@@ -125,7 +125,7 @@ impl Model for FilteredSpec {
         Ok(Arc::new(Filtered::around(inner, self.clone(), p)?))
     }
 
-    /// Those of the model inside: the filter looks back only.
+    /// Those of the inner model: the filter uses only earlier times.
     fn capabilities(&self) -> Capabilities {
         self.inner.capabilities().unwrap_or_default()
     }
@@ -174,7 +174,7 @@ impl<F: Real> Filtered<F> {
         if x > 0.0 && x < 1.0 { [x, 1.0 / self.spec.frame] } else { [x.clamp(0.0, 1.0), 0.0] }
     }
 
-    /// Whether the model inside answers the query alone.
+    /// Whether the inner model computes the query alone.
     fn passes(&self, q: &At<'_, F>) -> bool {
         self.spec.fusion == Fusion::Off || q.of != Space::Gaussians || self.trust(q.t.0)[0] == 0.0
     }
@@ -184,7 +184,7 @@ impl<F: Real> Filtered<F> {
         At { t: Time(q.t.0 - frames as f64 * self.spec.frame), ..*q }
     }
 
-    /// How many frames earlier a fused query asks in addition to t itself.
+    /// How many frames earlier a fused query reads in addition to t itself.
     fn frames(&self) -> impl Iterator<Item = usize> + use<F> {
         let (baseline, history) = (self.spec.baseline, self.spec.history);
         (1..=history + 1 + baseline).filter(move |&k| k <= history + 1 || k > baseline)
@@ -250,7 +250,7 @@ struct Shared {
     inner: Cache,
 }
 
-/// State that a fused answer keeps for its backward.
+/// State that a fused result keeps for its backward.
 struct Own<F> {
     /// The observation.
     seen: Tape<F>,

@@ -7,7 +7,7 @@
 //!
 //! The canonical positions are not detached: dL/dx has the planes' Jacobian too. The box [low, high] is stretched to
 //! the planes' [0, 1]³, the clip to [0, 1]; points and times outside see the border. Heads start as zero, so the
-//! deformation starts as the identity, whatever the planes are. In a [`Phase`] that rests, it is not even asked.
+//! deformation starts as the identity, whatever the planes are. In a resting [`Phase`] it is not evaluated.
 
 use super::lanes::{Batch, Lane, Work, fill, scatter};
 use super::still::{Still, activate_backward_lanes, activate_lanes};

@@ -1,7 +1,7 @@
 //! Sixteen rows at a time: how models whose rows do not see one another become loops over lanes, which vectorise.
 //!
-//! A [`Work`] sees a [`Batch`] of rows, reads its columns as [`Lane`]s, and writes lanes back. [`fill`] walks the rows
-//! of an answer (compact), [`scatter`] the rows of the layer's own tables. Both run at the best SIMD level of the
+//! A [`Work`] gets a [`Batch`] of rows, reads its columns as [`Lane`]s, and writes lanes back. [`fill`] walks the rows
+//! of a result (compact), [`scatter`] the rows of the layer's own tables. Both run at the best SIMD level of the
 //! machine; since nothing here uses fused multiply-add, every level gives the same bits.
 
 use crate::math::Real;
@@ -98,7 +98,7 @@ impl Span {
 pub(crate) struct Batch {
     /// Rows of the layer's tables.
     pub ids: Span,
-    /// Rows of the compact answer.
+    /// Rows of the compact result.
     pub at: Span,
     /// Which lanes count; the others hold numbers that mean nothing.
     pub live: [bool; BLOCK],
@@ -124,7 +124,7 @@ impl Batch {
         view.data[from..from + W * BLOCK].copy_from_slice(values.as_flattened());
     }
 
-    /// Neighbouring columns of one block of a result, as they are now.
+    /// Neighbouring columns of one block of a result, with their present values.
     #[inline(always)]
     pub(crate) fn lanes<F: Real, const W: usize>(&self, view: &TableMut<'_, F>, col: usize) -> [Lane<F>; W] {
         let from = self.place(view, self.at, col);
@@ -234,7 +234,7 @@ impl<F: Real, W: Work<F, N>, const N: usize> Kernel for Scatter<'_, F, W, N> {
 }
 
 /// All batches of the requested rows among `first..end`, where `first` is that of a block. An iterator, since a closure
-/// would be compiled by itself and for the baseline alone.
+/// would be compiled separately and for the baseline only.
 pub(crate) struct Batches<'a> {
     rows: Rows<'a>,
     /// The next block, or place in the list of rows; and the end of these.

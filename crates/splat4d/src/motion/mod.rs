@@ -1,4 +1,4 @@
-//! Motion models: from parameters and a time to splats. A model never sees a pixel; it is a pure function of its
+//! Motion models: from parameters and a time to splats. A model does not depend on pixels; it is a pure function of its
 //! parameters.
 //!
 //! A model has no hidden state. Sequential ones (state space, filters) scan in [`Motion::prepare`], add to the scan's
@@ -43,7 +43,7 @@ pub use still::Still;
 pub struct At<'a, F = f32> {
     /// The layer's parameters.
     pub p: &'a Params<F>,
-    /// Gaussians, or nodes (which then answer as splats: node losses, node warm-up).
+    /// Gaussians, or nodes (evaluated as splats: node losses, node warm-up).
     pub of: Space,
     /// Which rows.
     pub rows: Rows<'a>,
@@ -152,7 +152,7 @@ pub trait Motion<F: Real = f32>: Any + Send + Sync {
     /// Fills `tape.out` [rows, 10] for one query; random access in t.
     fn at(&self, q: &At<'_, F>, cache: &Cache, tape: &mut Tape<F>);
 
-    /// Where the splats' colour comes from; the layer's SH unless a model states otherwise.
+    /// Source of the splats' colour; the layer's SH unless a model states otherwise.
     fn color<'a>(&self, q: &At<'a, F>, _tape: &'a Tape<F>) -> Color<'a, F> {
         Color::Sh { table: &q.p[SH], rows: q.rows, weights: None, base: true }
     }
@@ -209,21 +209,21 @@ pub trait Motion<F: Real = f32>: Any + Send + Sync {
         None
     }
 
-    /// The table whose first columns are positions and quaternions at t, if all else of the geometry stays as it is.
+    /// The table whose first columns are positions and quaternions at t, if all other geometry is constant.
     fn pose_table(&self, _t: Time) -> Option<Key> {
         None
     }
 
     /// Bytes that training keeps of one query about `rows` Gaussians until its backward, next to the result and its
-    /// gradient: what an estimate of memory must know.
+    /// gradient: for estimates of memory.
     fn scratch_bytes(&self, p: &Params<F>, rows: usize) -> u64;
 
-    /// The same model in a phase of training; tables stay as they are. `None`: the model has no phases.
+    /// The same model in a phase of training; tables are not changed. `None`: the model has no phases.
     fn with_phase(&self, _phase: &Phase) -> Option<Arc<dyn Motion<F>>> {
         None
     }
 
-    /// dμ/dt in scene units per second, [rows, 3]: central differences over ± `VELOCITY_STEP` unless a model knows
+    /// dμ/dt in scene units per second, [rows, 3]: central differences over ± `VELOCITY_STEP` unless a model has
     /// better.
     fn velocity(&self, q: &At<'_, F>, out: &mut Table<F>) {
         central_velocity(self, q, out);
@@ -249,7 +249,7 @@ pub(crate) fn central_velocity<F: Real, M: Motion<F> + ?Sized>(model: &M, q: &At
 /// Half the step of the default velocity: half a frame at 60 frames per second, seconds.
 pub(crate) const VELOCITY_STEP: f64 = 1.0 / 120.0;
 
-/// Calls `f(j, id, tables)` for every asked row, in parallel over runs of table rows, and returns the sum of the
+/// Calls `f(j, id, tables)` for every requested row, in parallel over runs of table rows, and returns the sum of the
 /// results in a fixed order. `tables` are views that hold row `id`; j is the compact row. Models that can, use `lanes`.
 pub fn for_rows<F: Real, const N: usize>(
     tables: [&mut Table<F>; N],

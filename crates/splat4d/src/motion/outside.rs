@@ -14,7 +14,7 @@ pub type MakeMotion = Arc<dyn Fn(&mut Params<f32>) -> Result<Arc<dyn Motion<f32>
 
 static REGISTERED: RwLock<BTreeMap<String, MakeMotion>> = RwLock::new(BTreeMap::new());
 
-/// Makes the model called `name` known to [`build`](super::build), and so to every reader of scenes, for the rest of
+/// Registers the model called `name` with [`build`](super::build), and so to every reader of scenes, for the rest of
 /// the process. A model of that name that was registered before is replaced. Its [`Spec`](super::Spec) is
 /// `Spec::Custom(name)`.
 ///

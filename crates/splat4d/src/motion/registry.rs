@@ -88,12 +88,12 @@ pub struct Slices {
 }
 
 impl Polynomial {
-    /// Whether everything goes along straight lines and nothing turns.
+    /// Whether all motion is linear without rotation.
     pub(crate) fn is_straight(&self) -> bool {
         self.order <= 1 && self.rotation_rates.is_none()
     }
 
-    /// How far a row's mean goes from the centre of its lifespan to `delta` seconds later, scene units.
+    /// Displacement of a row's mean from the centre of its lifespan to `delta` seconds later, scene units.
     pub fn travel<F: Real>(&self, p: &Params<F>, row: usize, delta: f64) -> [f64; 3] {
         let mut out = [0.0; 3];
         let Some(key) = self.velocities else { return out };
@@ -104,7 +104,7 @@ impl Polynomial {
         out
     }
 
-    /// Moves the centre of a row's lifespan by `shift` seconds and leaves its path and its turning as they are, of
+    /// Moves the centre of a row's lifespan by `shift` seconds and keeps its path and rotation, for models of
     /// every order: what it showed at any time it shows still, but for its lifespan. Colours that change with time
     /// begin again at the centre.
     ///
@@ -133,7 +133,7 @@ impl Polynomial {
     }
 }
 
-/// Makes of the list of models `Spec`, the names, and all that is asked of a model by its spec.
+/// Generates `Spec`, the names and all functions of specs from the list of models.
 ///
 /// `models` train by themselves, `wrappers` around another one. An entry names the variant, what binds its payload and
 /// the payload's type, the model's name, and a reference to what implements `Model`.

@@ -2,17 +2,17 @@
 //!
 //! Node k has a rest position p_k, a log radius, a weight logit w_k and hyper coordinates h_k; Gaussian i its canonical
 //! position x_i and hyper coordinates h_i. A [`Trajectory`] gives every node a shift T_k(t) and a rotation R_k(t) about
-//! its own position. With weights a_ik (see `weights`) a Gaussian goes to
+//! its own position. With weights a_ik (see `weights`) a Gaussian moves to
 //!
 //! > x_i(t) = Σ_k a_ik [R_k (x_i − p_k) + p_k + T_k] (linear blend skinning),
 //! > q_i(t) = normalize(Σ_k a_ik s_k u_k) ⊗ q_i,
 //!
 //! where u_k is the unit quaternion of R_k and s_k = ±1 aligns it to the nearest node's. Scales stay. With a motion
-//! mask m_i = sigmoid(`motion_mask`) a Gaussian goes the share m_i of the way: x_i + m_i (x_i(t) − x_i), and likewise
+//! mask m_i = sigmoid(`motion_mask`) a Gaussian moves by the share m_i: x_i + m_i (x_i(t) − x_i), and likewise
 //! for the quaternion, from the identity.
 //!
 //! Nothing is detached (the reference stops the gradient at x and p inside the blend): finite differences hold for
-//! every table. What is not learnt is which nodes are looked at: every Gaussian has a list of the nearest ones,
+//! every table. The choice of nodes is not learnt: every Gaussian has a list of the nearest ones,
 //! refreshed by `Skinned::bind` now and then; among them the weights choose again at every step, continuously.
 
 mod blend;
@@ -41,11 +41,11 @@ pub const MAX_NODES: usize = 1 << 16;
 pub const MAX_NEIGHBOURS: usize = 8;
 /// Most hyper coordinates.
 pub(crate) const MAX_HYPER: usize = 32;
-/// Nodes on a Gaussian's list beyond those that pull it: room for weights to shift between two refreshes.
+/// Nodes on a Gaussian's list beyond those that pull it, so that weights can shift between two refreshes.
 const SPARE_CANDIDATES: usize = 5;
 /// Spread of the nodes' hyper coordinates at the start, in node spacings: enough to break the tie (SC-GS: 1e-2).
 const HYPER_NOISE: f64 = 1e-2;
-/// The motion mask's logit at the start: Gaussians follow their nodes nearly all the way.
+/// The motion mask's logit at the start: Gaussians follow their nodes almost completely.
 const MASK_LOGIT: f64 = 3.0;
 /// Numbers of a frame: a 3 × 4 matrix.
 const FRAME: usize = 12;
@@ -236,7 +236,7 @@ fn start_nodes<F: Real>(t: &mut Table<F>, centers: &[[F; 3]], rng: Rng) {
     }
 }
 
-/// Motion made of a skin and of what drives its nodes. Queries of [`Space::Nodes`] are answered by isotropic splats:
+/// Motion by a skin and a model that drives its nodes. Queries of [`Space::Nodes`] return isotropic splats:
 /// the node's position, its radius, sigmoid(logit) as opacity.
 pub struct Skinned<F: Real> {
     /// Which Gaussian follows which nodes.

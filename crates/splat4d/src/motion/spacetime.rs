@@ -34,7 +34,7 @@ pub struct SpacetimeSpec {
     /// Origin of Δ for Gaussians that have infinite lifespans: the clip's centre, seconds.
     pub origin: f64,
     /// Features for a head (STG's full model), of which spherical harmonics above degree 0 are no part; none: colours
-    /// as they are.
+    /// unchanged.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub features: Option<FeatureSpec>,
 }
@@ -126,7 +126,7 @@ impl Spacetime {
     }
 
     /// The same motion on a clock that runs `rate` times as fast: inside it is rate·t + offset. Changes the model's own
-    /// tables; lives are the layer's.
+    /// tables; lifespans are the layer's.
     pub(crate) fn retimed<F: Real>(&self, rate: f64, offset: f64, p: &mut Params<F>) -> Self {
         let (velocities, rates) = (&mut p[self.velocities], F::of(rate));
         for row in 0..velocities.rows() {
@@ -280,7 +280,7 @@ impl<'a, F: Real> Reader<'a, F> {
         each(|l| F::of(self.t) - center[l])
     }
 
-    /// The learnable rows at Δ: means moved, quaternions turned, all else as it is.
+    /// The learnable rows at Δ: means moved, quaternions turned, all else unchanged.
     #[inline(always)]
     fn moved(&self, batch: &Batch, delta: &Lane<F>) -> [Lane<F>; 11] {
         let mut g: [Lane<F>; 11] = batch.ids.read(self.geometry, 0);

@@ -1,20 +1,20 @@
 //! `ssm`: control nodes driven by a diagonal state-space model (our design on S4D, Gu et al. 2022).
 //!
 //! The clip is cut into M ticks. Every node is a sequence: a clock γ(t) and an impulse at the ends, a learnt embedding,
-//! and what its surroundings look like. A stack of residual blocks (`nn::sequence`) scans the sequence, one scan
+//! and its surroundings. A stack of residual blocks (`nn::sequence`) scans the sequence, one scan
 //! serving every time of a step, and a head that starts at zero gives a shift ρ and a rotation vector θ a tick. Between
-//! ticks both are interpolated (Catmull-Rom); the node goes to p + ρ and turns by exp(θ) about itself. Gaussians follow
-//! by skinning (`motion::skin`).
+//! ticks both are interpolated (Catmull-Rom); the node moves to p + ρ and turns by exp(θ) about itself. Gaussians
+//! follow by skinning (`motion::skin`).
 //!
 //! - `mode`: scans in both directions to reconstruct; the past alone to forecast, with ticks past the clip as
 //!   requested.
 //! - `output`: poses, or their rates, which are composed from tick to tick (drifts, but carries on).
-//! - `equivariance`: none; `frames`: all that the network sees and states is in local frames of the nodes
+//! - `equivariance`: none; `frames`: inputs and outputs of the network are in local frames of the nodes
 //!   (`nn::frames`), so that a turned scene is a turned scene; `vector`: vector neurons (`nn::vector`), which mirror
 //!   exactly, too.
 //!
 //! A node's context (positions, frames, neighbours) is taken when nodes are placed or edited and held
-//! fixed: no gradient goes through it to the nodes' positions.
+//! fixed: no gradient is propagated through it to the nodes' positions.
 
 mod context;
 mod net;
@@ -60,7 +60,7 @@ pub enum Output {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Equivariance {
-    /// None: nodes know where they are.
+    /// None: positions are inputs.
     None,
     /// Translations and rotations, by local frames.
     Frames,
@@ -167,9 +167,9 @@ pub(crate) struct Field {
 
 /// Name of the table of embeddings, \[nodes, D\].
 pub(crate) const EMBEDDINGS: &str = "node_embeddings";
-/// Name of the table of what nodes know of their surroundings.
+/// Name of the table of the nodes' context.
 pub(crate) const CONTEXT: &str = "node_context";
-/// Numbers a node has at a tick of a scan: its pose and the gradient to it, as they are and on their way.
+/// Numbers a node has at a tick of a scan: its pose and the gradient to it, raw and intermediate.
 const TICK: usize = 32;
 /// Spread of the embeddings at the start.
 const EMBEDDING_NOISE: f64 = 0.1;
@@ -382,7 +382,7 @@ impl<F: Real> Trajectory<F> for Field {
         self.net.finish(net, sum, d);
     }
 
-    /// Nodes that came or went change what their neighbours see.
+    /// Added or removed nodes change the context of their neighbours.
     fn on_edit(&self, p: &mut Params<F>, _: &RowEdit) {
         refresh(self.spec.equivariance, p);
     }

@@ -4,7 +4,7 @@
 //! `quats@k`. Between frames, u = (t − t_k)/(t_{k+1} − t_k): μ = (1 − u) μ_k + u μ_{k+1}, and q = (1 − u) q̂_k ± u
 //! q̂_{k+1} with the sign that makes the two quaternions neighbours. Before the first frame and after the last one
 //! nothing moves. On a frame itself, where the slopes of both sides differ, dL/dt is 0 and only that frame is read.
-//! Source: Luiten et al. 2024 (Dynamic 3D Gaussians) §3; what is between frames is ours.
+//! Source: Luiten et al. 2024 (Dynamic 3D Gaussians) §3; interpolation between frames is ours.
 
 #[cfg(test)]
 mod tests;
@@ -137,10 +137,10 @@ impl Tracked {
 
     /// The model with one frame more at second t, where every Gaussian continues as it went: x + (x − x') and
     /// normalize(q̂ ± (q̂ − q̂')), scaled by the durations, no further than `cap` scene units. The first step after
-    /// frame 0 knows no velocity and stays.
+    /// after frame 0 there is no velocity and the state stays.
     ///
     /// Source: Luiten et al. 2024 §3.3 (forward propagation); aligned signs, durations and the cap are ours: the
-    /// overshoot of what bounces is bounded by it. Panics: t is not after the last frame.
+    /// overshoot at a bounce is bounded by it. Panics: t is not after the last frame.
     pub fn propagate<F: Real>(&self, p: &mut Params<F>, t: f64, cap: f64) -> Result<Self> {
         let n = self.pages.len();
         let last = self.spec.times[n - 1];
@@ -156,7 +156,7 @@ impl Tracked {
         Ok(next)
     }
 
-    /// The frames around t and the share of the later one; one frame twice where only one counts.
+    /// The frames around t and the share of the later one; the same frame twice where only one counts.
     fn around(&self, t: f64) -> (usize, usize, f64) {
         let times = &self.spec.times;
         let after = times.partition_point(|&x| x <= t);
@@ -207,7 +207,7 @@ impl<F: Real> Motion<F> for Tracked {
         Spec::Tracked(self.spec.clone())
     }
 
-    /// On a frame, and outside of the clip; what is between two frames is of both.
+    /// On a frame, and outside of the clip; between two frames both count.
     fn pose_table(&self, t: Time) -> Option<Key> {
         let (a, b, _) = self.around(t.0);
         (a == b).then_some(self.pages[a])

@@ -1,8 +1,8 @@
 //! Positional encoding γ_L(p) = [p, sin(2^k p), cos(2^k p)]_{k<L}, without a factor π.
 //!
 //! Source: Mildenhall et al. 2020 (NeRF) §5.1; with the raw input and without π as Yang et al. 2024 (Deformable 3D
-//! Gaussians). Sines of doubled angles come from the angle before, which loses a bit per level: 3e-5 in f32 at level
-//! 10, as much as f32 knows of 2^9·p anyway.
+//! Gaussians). Sines of doubled angles are computed from the previous angle, which loses a bit per level: 3e-5 in f32
+//! at level 10, the precision of 2^9·p in f32.
 
 use crate::math::Real;
 

@@ -4,12 +4,12 @@
 //! channels a level. Sources: Cao and Johnson 2023 (HexPlane); Fridovich-Keil et al. 2023 (K-Planes); Wu et al. 2024
 //! ("4DGaussians"), whose released code multiplies the planes and concatenates the levels.
 //!
-//! Coordinates run over [0, 1]: 0 is the first grid point, 1 the last, and what is outside sees the border and has no
+//! Coordinates run over [0, 1]: 0 is the first grid point, 1 the last, and points outside get the border's value and no
 //! gradient. (The released code sends t in [0, 1] to a grid over [-1, 1] and so never reads half of it; here the whole
 //! grid is time, and half as many time steps are as fine.)
 //!
 //! A plane is one `Space::Fixed` column of H·W·C numbers, `[second axis][first axis][channel]`, so that the channels of
-//! a grid point lie together: a lookup is four short runs of memory. All points of a query have one t, hence a time
+//! a grid point are adjacent: a lookup is four short runs of memory. All points of a query have one t, hence a time
 //! plane is first blended to the [`Lines`] of that t: 2 runs from the first-level cache instead of 4 from memory.
 //!
 //! Gradients of grid points are scattered by one task a plane, over rows in order: the same bits for any number of
@@ -43,7 +43,7 @@ const MAX_RESOLUTION: usize = 4096;
 const MAX_NUMBERS: usize = 1 << 28;
 /// Planes start between these: about 1, so that a product of six is neither lost nor overwhelming.
 const START: [f64; 2] = [0.5, 1.5];
-/// Random grid points along an axis that the first level's planes start from, the second's from twice as many.
+/// Random grid points along an axis for the start of the first level's planes; twice as many for the second's.
 const START_POINTS: usize = 3;
 /// Rows that a task of the backward looks up before they are scattered; 128 rows of 12 planes of 32 channels are 200
 /// kB.
@@ -123,7 +123,7 @@ pub struct Planes {
     keys: Vec<[Key; 6]>,
 }
 
-/// The time planes at one t, and how to go back to them.
+/// The time planes at one t, and the indices for their backward.
 pub struct Lines<F> {
     /// By level: x, y, z; [resolution][channel].
     lines: Vec<[Vec<Lane<F>>; 3]>,
@@ -270,7 +270,7 @@ impl Planes {
 }
 
 /// Fills a plane with bilinear blends of `points` by `points` random numbers per channel. Independent grid points, as
-/// the released code has them, give neighbours unrelated features, and networks train for long before they can separate
+/// in the released code, give neighbours unrelated features, and networks train for long before they can separate
 /// a motion of a region from noise: mutant at 200x200 reached 25.9 dB after 600 steps, and 30.1 dB from smooth planes.
 fn smooth<F: Real>(data: &mut [F], size: [usize; 2], channels: usize, points: usize, stream: Rng) {
     let counts = size.map(|n| points.min(n));

@@ -323,7 +323,7 @@ impl Mlp {
         biases
     }
 
-    /// Whether the last map is zero, so that everything that comes out is; nothing but it has a gradient then.
+    /// Whether the last map is zero, and so are all outputs; only it has a gradient then.
     pub(crate) fn is_zero<F: Real>(&self, p: &Params<F>) -> bool {
         let Map { weight, bias, .. } = self.maps[self.shape.layers];
         [weight, bias].iter().all(|&key| p[key].data().iter().all(|x| *x == F::ZERO))

@@ -17,7 +17,7 @@ pub(crate) const LANES: usize = BLOCK;
 pub(crate) const CHUNK: usize = 16;
 /// Below this |z| the quotients φ and φ' are taken from their series (the terms left out are below 1e-15).
 const SERIES: f64 = 1e-2;
-/// Ā falls to e^-40 at most in a tick: what decays faster is gone anyway, and 0/0 is not met.
+/// Ā falls to e^-40 at most in a tick: faster decay makes no difference, and 0/0 is avoided.
 const STRONGEST_DECAY: f64 = 40.0;
 /// Steps are at most e³ ticks, whatever a file states.
 const LONGEST_LOG_STEP: f64 = 3.0;
@@ -102,9 +102,9 @@ impl<'a, F> Slices<'a, F> {
 /// Direction of a scan.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Direction {
-    /// From the first tick to the last: sees the past.
+    /// From the first tick to the last: uses the past.
     Forward,
-    /// From the last tick to the first: sees the future.
+    /// From the last tick to the first: uses the future.
     Backward,
 }
 
@@ -295,8 +295,8 @@ impl<F: Real> Discrete<F> {
         out
     }
 
-    /// The scan. Shapes: u, y \[rows, ticks\]; `state` \[rows,N\] is what was before the first tick and becomes what
-    /// stands after the last; `marks` gets the states at the start of every chunk, \[rows, chunks, N\].
+    /// The scan. Shapes: u, y \[rows, ticks\]; `state` \[rows,N\] is the state before the first tick and becomes that
+    /// after the last; `marks` gets the states at the start of every chunk, \[rows, chunks, N\].
     pub(crate) fn scan(
         &self,
         way: Direction,
@@ -318,7 +318,7 @@ impl<F: Real> Discrete<F> {
     }
 
     /// The VJP of [`scan`](Self::scan): adds to `d_u` and to the gradient `d`; `d_state` \[rows,N\] is the gradient to
-    /// what stood after the last tick and becomes that to what was before the first.
+    /// the state after the last tick and becomes that to the state before the first.
     #[expect(
         clippy::too_many_arguments,
         reason = "a scan's backward has all that its forward has, and their gradients"

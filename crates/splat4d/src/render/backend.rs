@@ -1,6 +1,6 @@
 //! The seam between a scene and whatever renders it: [`Backend`], implemented by the renderer of the CPU, by the oracle
-//! and (feature `gpu`) by the renderer of the GPU, so that training, evaluation and the command know none of them by
-//! name.
+//! and (feature `gpu`) by the renderer of the GPU, so that training, evaluation and the command name none of them
+//! directly.
 
 use super::compare::{Comparison, Target};
 use super::resident::Resident;
@@ -127,7 +127,7 @@ pub trait Backend<F: Real = f32>: Send {
     /// The device, in a word or two.
     fn name(&self) -> &str;
 
-    /// What happened since the last call that the user should know, in one line: what is rendered elsewhere, and why.
+    /// A message for the user since the last call, one line: what is rendered elsewhere, and why.
     fn notice(&mut self) -> Option<String> {
         None
     }

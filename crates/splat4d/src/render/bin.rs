@@ -75,7 +75,7 @@ impl Footprint {
         }
     }
 
-    /// Number of touched bins that come before bin (x, y), which is one of them.
+    /// Number of touched bins before bin (x, y), which is one of them.
     #[inline(always)]
     pub(crate) fn rank(&self, x: usize, y: usize) -> usize {
         match self.large() {
@@ -165,7 +165,7 @@ pub struct Bins {
     pub keys: Vec<u64>,
     /// The pair of splat i in the bin of rank r has gradient slot `first[i] + r`, wrapping.
     pub first: Vec<u32>,
-    /// Of each chunk of splats and each bin: first the pairs, then where the next of them goes in `staged`.
+    /// Of each chunk of splats and each bin: first the pairs, then the index of the next one in `staged`.
     cursors: Vec<u32>,
     /// Scratch: the next place of each bin.
     next: Vec<u32>,

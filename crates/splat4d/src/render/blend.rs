@@ -1,7 +1,7 @@
 //! Blending one bin of 32² pixels, and the backward pass.
 //!
 //! Its 16 tiles of 8² pixels stay in cache while a batch of splats passes: for each tile the batch's bit map states
-//! which splats can touch it, and for each of these its rows of pixels go through one loop over eight lanes.
+//! which splats can touch it, and for each of these its rows of pixels are processed by one loop over eight lanes.
 //!
 //! α = min(α_max, o·g), g = exp(−½ dᵀ conic d); α < α_min is skipped; a pixel stops before T(1−α) would fall below
 //! T_min. Source: Kerbl et al. 2023; gradients are 0 where α is at its maximum, as in gsplat.
@@ -448,7 +448,7 @@ impl<F: Real> Kernel for Backward<'_, F> {
 struct Back<F> {
     /// Transmittance in front of the splat in hand; negated once per pixel has stopped.
     t: Plane<F>,
-    /// Σ_ch g_ch·(light that is still to come): one number serves all channels and alpha.
+    /// Σ_ch g_ch·(remaining light): one number serves all channels and alpha.
     rest: Plane<F>,
     /// Gradient to the channels.
     g: [Plane<F>; CHANNELS],

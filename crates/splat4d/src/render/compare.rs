@@ -1,8 +1,8 @@
-//! What an image is compared with on a device, and the result.
+//! A comparison of an image on a device, and its result.
 
 use crate::scene::Planes;
 
-/// What an image is compared with, and how: the loss of 3DGS, (1 − λ)·L1 + λ·(1 − SSIM), as plain data.
+/// Truth and weights of a comparison: the loss of 3DGS, (1 − λ)·L1 + λ·(1 − SSIM), as plain data.
 #[derive(Clone, Copy, Debug)]
 pub struct Target<'a, F = f32> {
     /// The truth, [3, h, w].

@@ -7,10 +7,10 @@
 //! splat alone (pixels that had stopped stay stopped). A splat before others of its colour contributes much and changes
 //! little.
 //!
-//! *Sensitivity*: how strongly the image answers to a splat. A pixel's channels depend on its shape through ln α alone,
+//! *Sensitivity*: how strongly the image depends on a splat. A pixel's channels depend on its shape through ln α alone,
 //! with the slope v_c = αT(c − b), and ln α = ln o − ½ dᵀ Q d, d = μ − p, Q the conic. Its gradient to (μ, Q) is a
 //! polynomial s(d) of second degree, so that Σ over pixels and channels of the products of gradients is known from the
-//! moments Σ_p (Σ_c v_c²) dx^i dy^j of degree 2 to 4: twelve sums a splat, exact. Slow and clear: it is meant for
+//! moments Σ_p (Σ_c v_c²) dx^i dy^j of degree 2 to 4: twelve sums per splat, exact. Slow and clear: it is meant for
 //! scores, not for steps.
 
 use super::Renderer;
@@ -123,7 +123,7 @@ impl<F: Real> Renderer<F> {
         self.score_all::<Removal>(Some(shot.background), out);
     }
 
-    /// The strength of the image's answer to each splat: exact sums over its pixels, for splats that stay in front
+    /// The sensitivity of the image to each splat: exact sums over its pixels, for splats that stay in front
     /// of and
     /// behind the same others. Neither head nor further channels are examined: the image is that of the base colours.
     ///
@@ -210,7 +210,7 @@ impl<F: Real> Renderer<F> {
 
 impl<F: Real> Raster<F> {
     /// Sums a score over the pixels of every splat that was prepared, after [`Raster::blend`] of the same pass where
-    /// the score looks at colours. `add` adds a pair of bin and splat to the splat's row of `out`, in the order of its
+    /// the score uses colours. `add` adds a pair of bin and splat to the splat's row of `out`, in the order of its
     /// bins.
     fn score<S: Score<F, NUMBERS>, const NUMBERS: usize, A: Send>(
         &mut self,
@@ -273,7 +273,7 @@ struct Pixel<F> {
     alpha: F,
     /// α T; 0 where the pixel has stopped.
     weight: F,
-    /// α T c, c the splat's colour; only where the score looks at colours.
+    /// α T c, c the splat's colour; only where the score uses colours.
     own: [F; CHANNELS],
     /// α/(1 − α) times what the pixel shows of all that is behind: α T b. As `own`; 0 where the pixel has stopped.
     hidden: [F; CHANNELS],
@@ -285,7 +285,7 @@ struct Pixel<F> {
 
 /// `NUMBERS` sums a splat.
 trait Score<F, const NUMBERS: usize>: Sync {
-    /// Whether it looks at [`Pixel::own`] and [`Pixel::hidden`].
+    /// Whether it uses [`Pixel::own`] and [`Pixel::hidden`].
     const COLORS: bool;
     /// The terms of one pixel.
     fn of(pixel: &Pixel<F>) -> [F; NUMBERS];
@@ -342,8 +342,8 @@ impl<F: Real> Score<F, MOMENTS> for Moments {
     }
 }
 
-/// The score of one bin: a walk as forward's that, for a score of colours, knows at every pixel the light of all that
-/// lies behind each splat.
+/// The score of one bin: a traversal as in the forward pass that, for a score of colours, has at every pixel the light
+/// of all that is behind each splat.
 struct Walk<'a, F, S, const NUMBERS: usize> {
     records: &'a [Record<F>],
     /// As the blend left them.
@@ -458,7 +458,7 @@ impl<F: Real, S: Score<F, NUMBERS>, const N: usize, const NUMBERS: usize> Visit<
     }
 }
 
-/// J M Jᵀ: M the moments of s sᵀ, J the way from (μ, Q) to mean and standard deviations.
+/// J M Jᵀ: M the moments of s sᵀ, J the Jacobian from (μ, Q) to mean and standard deviations.
 fn fisher<F: Real>(
     view: &View<F>,
     (mean, cov, opacity): ([F; 3], [F; 6], F),

@@ -5,10 +5,10 @@
 //! Four stages, each public with its VJP: [`project`] (Gaussian → screen ellipse and the bins it touches), [`shade`]
 //! (colour along the viewing direction), [`bin`] (sorted lists), [`rasterize`] (blending). [`Renderer`] runs them over
 //! one arena that is reused from step to step. [`oracle`] is the slow f64 definition that they are tested against. The
-//! renderer never sees time.
+//! renderer does not depend on time.
 //!
-//! The same bits come out for any number of threads: every floating-point sum has a fixed order, and nothing is ever
-//! added atomically.
+//! The result has the same bits for any number of threads: every floating-point sum has a fixed order, and nothing is
+//! ever added atomically.
 //!
 //! A network in [`Splats::head`](crate::scene::Splats::head) makes colours of blended channels (`head.rs`), with
 //! gradients.
@@ -79,7 +79,7 @@ pub struct RenderConfig {
     pub antialias: Antialias,
     /// Whether the backward pass sums absolute gradients ([`RenderGrads::mean2d_abs`]).
     pub abs_grads: bool,
-    /// Instructions to use; lowered to what the machine has.
+    /// Instructions to use; lowered to those of the machine.
     pub simd: Simd,
 }
 

@@ -167,7 +167,7 @@ fn color<F: Real>(part: &Part<'_, F>, j: usize, direction: [f64; 3], degree: usi
     }
 }
 
-/// Channels of a splat that a head sees in addition to its colour.
+/// Channels of a splat that a head reads in addition to its colour.
 fn further<F: Real>(part: &Part<'_, F>, j: usize) -> [f64; FURTHER] {
     match part.color {
         Color::Direct { table } if table.width() == FEATURES => table.read::<FURTHER>(j, BASE).map(F::f64),

@@ -48,14 +48,14 @@ impl Moves {
     }
 }
 
-/// A table on the CPU, as [`Table::data`](crate::scene::Table::data) has it; nothing where a layer has no such table.
+/// A table on the CPU, as [`Table::data`](crate::scene::Table::data) stores it; empty where a layer has no such table.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct ResidentTable<'a> {
     /// Columns.
     pub width: usize,
     /// Its numbers.
     pub params: &'a [f32],
-    /// First and second moments and step counts, 2·width + 1 columns; nothing where it has not learnt.
+    /// First and second moments and step counts, 2·width + 1 columns; empty where it has not learnt.
     pub moments: &'a [f32],
 }
 
@@ -66,7 +66,7 @@ pub struct ResidentLayer<'a> {
     pub rows: usize,
     /// How they move.
     pub moves: Moves,
-    /// How they live.
+    /// Their lifespans.
     pub life: LifeKind,
     /// See [`KEPT`].
     pub tables: [ResidentTable<'a>; KEPT],
@@ -166,7 +166,7 @@ pub struct ResidentView<'a> {
     pub t: Time,
     /// Colour behind the scene.
     pub background: [f32; 3],
-    /// What it is compared with; a response depends on the camera's number alone.
+    /// Its comparison; a response depends on the camera's number alone.
     pub target: Target<'a>,
     /// Number of the camera, where their colour matrices are kept.
     pub rig: usize,
@@ -202,7 +202,7 @@ pub struct ResidentStepped {
     pub bad: Option<[usize; 3]>,
 }
 
-/// The numbers of a layer, as [`ResidentLayer`] has them.
+/// The numbers of a layer, as in [`ResidentLayer`].
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ResidentNumbers {
     /// Of the tables.
@@ -213,9 +213,9 @@ pub struct ResidentNumbers {
     pub stats: Vec<f32>,
 }
 
-/// Keeps a scene's tables and takes steps on them: evaluate, draw, compare, back, Adam.
+/// Keeps a scene's tables and takes steps on them: evaluate, render, compare, backward, Adam.
 ///
-/// Steps are begun and done later: several may be under way, whose results come in their order. What they come to does
+/// Steps are asynchronous: several may be in flight, and their results are returned in order. The results do
 /// not depend on when it is read.
 pub trait Resident {
     /// Takes over all layers, in place of whatever was kept; steps under way are forgotten. `corrections`: Adam's 1/(1
@@ -230,7 +230,7 @@ pub trait Resident {
     ) -> Result<()>;
 
     /// Begins a step. Returns the results of steps that are done; `None`: an image is too large to be compared in
-    /// one piece, or no
+    /// one buffer, or no
     /// pixel of it counts, and nothing was begun.
     ///
     /// Errors: the device failed, and nothing kept is to be trusted. Panics: nothing is kept.
@@ -247,7 +247,7 @@ pub trait Resident {
     /// The numbers of a layer, with no step under way. Errors: the device failed. Panics: as of `step`.
     fn fetch(&mut self, layer: usize) -> Result<ResidentNumbers>;
 
-    /// The cameras' colour matrices and their moments, in the same way; nothing where none are kept. Errors: as of
+    /// The cameras' colour matrices and their moments, in the same way; empty where none are kept. Errors: as of
     /// `fetch`.
     fn fetch_cameras(&mut self) -> Result<[Vec<f32>; 2]>;
 }

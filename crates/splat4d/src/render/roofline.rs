@@ -77,7 +77,7 @@ fn speed<const LANES: usize, const ROWS: usize>(simd: Simd) -> f64 {
     (SPLATS * LANES * ROWS) as f64 / best
 }
 
-/// The splat that passes the pixels again and again, each time a little lower; one number a lane, as a register has it.
+/// The splat that passes the pixels again and again, each time a little lower; one number per lane.
 #[repr(C, align(64))]
 struct Splat<const LANES: usize> {
     /// Exponent at a pixel: ax + q·dy.

@@ -1,6 +1,6 @@
 //! The feature head: a tiny network that turns nine blended channels of a pixel into its colour.
 //!
-//! Here are its weights and their shapes; what it computes, and how that is rendered, is in `render/head.rs`.
+//! This file defines its weights and their shapes; its function and rendering are in `render/head.rs`.
 //! Source: Li et al. 2024 (Spacetime Gaussians) §4.1 and its released code.
 
 use super::{Key, Params};
@@ -13,7 +13,7 @@ pub(crate) const FEATURES: usize = BASE + FURTHER;
 pub(crate) const BASE: usize = 3;
 /// Those of them that are blended next to the base colour.
 pub const FURTHER: usize = 6;
-/// Numbers that the network sees of a pixel: its further channels, its ray's origin and direction.
+/// Inputs of the network per pixel: its further channels, its ray's origin and direction.
 pub const INPUTS: usize = FURTHER + 6;
 /// Width of the network's hidden layer.
 pub(crate) const HIDDEN: usize = 6;

@@ -7,7 +7,7 @@ use crate::math::Real;
 /// The shape of the envelope σ(t) of a layer's Gaussians. Centres and widths are in seconds, widths as logarithms.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LifeKind {
-    /// σ = 1 forever; no columns.
+    /// σ = 1 at all times; no columns.
     Infinite,
     /// σ = exp(−½u²), u = (t − centre)/width: FreeTimeGS (Wang et al. 2025) and native 4D Gaussians.
     GaussHalf,
@@ -132,7 +132,7 @@ impl LifeKind {
     }
 }
 
-/// Exact interval buckets over a clip: the rows alive at t without a look at the others.
+/// Exact interval buckets over a clip: the rows alive at t without examining the others.
 #[derive(Clone, Debug, Default)]
 pub struct LifeBuckets {
     start: f64,
@@ -143,7 +143,7 @@ pub struct LifeBuckets {
 
 impl LifeBuckets {
     /// Sorts rows with the given spans [from, to] (seconds; from > to: never alive) into `count` buckets over the clip.
-    /// Times outside the clip look into the first or last bucket, which also hold everything beyond.
+    /// Times outside the clip use the first or last bucket, which also contain everything beyond.
     pub(crate) fn new(spans: Vec<[f64; 2]>, clip: [f64; 2], count: usize) -> Self {
         let count = count.max(1);
         let width = ((clip[1] - clip[0]) / count as f64).max(f64::MIN_POSITIVE);

@@ -69,7 +69,7 @@ impl KeyMasks {
         self.words[place] |= 1 << (row % WORD);
     }
 
-    /// The key times on both sides of t: twice the same one on a key and outside of all.
+    /// The key times on both sides of t: the same one twice on a key and outside the range.
     pub fn keys_at(&self, t: f64) -> [usize; 2] {
         let last = self.times.len() - 1;
         let after = self.times.partition_point(|k| *k < t);

@@ -15,7 +15,7 @@ pub enum Space {
     Nodes,
 }
 
-/// Where a new row came from. All but `Kept` start with zero moments and statistics.
+/// Origin of a new row. All but `Kept` start with zero moments and statistics.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Born {
     /// The row itself.
@@ -35,7 +35,7 @@ pub struct RowEdit {
     pub space: Space,
     /// For every new row, the old row it copies.
     pub parent: Vec<u32>,
-    /// For every new row, how it came about.
+    /// The origin of every new row.
     pub born: Vec<Born>,
 }
 
@@ -103,7 +103,7 @@ pub struct ParamInfo {
     pub trainable: bool,
 }
 
-/// An array as it came from a file, waiting to be claimed by [`Params::entry`].
+/// An array from a file, to be claimed by [`Params::entry`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct LoadedArray {
     /// Column group's name.
@@ -185,7 +185,7 @@ impl<F: Real> Params<F> {
         Ok(key)
     }
 
-    /// A `Fixed` table of one column of `numbers` rows, which lie one after the other: a weight, a grid. The table and
+    /// A `Fixed` table of one column of `numbers` rows, which are stored contiguously: a weight, a grid. The table and
     /// its column group share the name.
     ///
     /// Errors: the loaded array has another shape.
@@ -233,7 +233,7 @@ impl<F: Real> Params<F> {
         Ok(Key(self.tables.len() as u32 - 1))
     }
 
-    /// Arrays that came from a file and that no table has claimed.
+    /// Arrays from a file that no table has claimed.
     pub(crate) fn unclaimed(&self) -> &[LoadedArray] {
         &self.loaded
     }
@@ -288,7 +288,7 @@ impl<F: Real> Params<F> {
         *own = table;
     }
 
-    /// Gathers every table of the edit's space. Models mend what copying alone cannot in `Motion::on_edit`.
+    /// Gathers every table of the edit's space. Models correct what copying alone cannot in `Motion::on_edit`.
     pub fn apply(&mut self, edit: &RowEdit) {
         for (info, table) in self.infos.iter().zip(&mut self.tables) {
             if info.space == edit.space {
@@ -378,7 +378,7 @@ impl<F: Real> Grads<F> {
         self.tables.get_disjoint_mut(keys.map(|k| k.0 as usize)).expect("keys of one layer must be distinct")
     }
 
-    /// As [`of`](Self::of) for a number of keys that only the model's sizes give. Panics: a key occurs twice.
+    /// As [`of`](Self::of) for a number of keys that depends on the model's sizes. Panics: a key occurs twice.
     pub fn many(&mut self, keys: &[Key]) -> Vec<&mut Table<F>> {
         let mut found: Vec<Option<&mut Table<F>>> = keys.iter().map(|_| None).collect();
         for (i, table) in self.tables.iter_mut().enumerate() {

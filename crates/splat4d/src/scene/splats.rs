@@ -1,4 +1,4 @@
-//! [`Splats`]: the scene at one time, activated: all the renderer ever sees.
+//! [`Splats`]: the scene at one time, activated: the renderer's input.
 
 use super::head::HeadWeights;
 use super::rows::Rows;
@@ -12,7 +12,7 @@ pub const COV: usize = 3;
 /// Column of the opacity in [`Part::out`].
 pub const SPLAT_OPACITY: usize = 9;
 
-/// Where a part's colour comes from.
+/// Source of a part's colour.
 #[derive(Clone, Copy, Debug)]
 pub enum Color<'a, F = f32> {
     /// Spherical harmonics, borrowed from the parameters: splat j has row `rows.id(j)`.
@@ -23,7 +23,7 @@ pub enum Color<'a, F = f32> {
         rows: Rows<'a>,
         /// Optional weights [splats, blocks] of blocks of coefficients (time-dependent SH).
         weights: Option<&'a Table<F>>,
-        /// Whether the table is the layer's own SH, whose gradient goes straight to `Grads`.
+        /// Whether the table is the layer's own SH, whose gradient is added directly to `Grads`.
         base: bool,
     },
     /// One colour a splat.

@@ -1,4 +1,4 @@
-//! [`Table`]: everything that has a row per Gaussian (or per node, or one row forever) lives in one of these.
+//! [`Table`]: the container of everything with a row per Gaussian, per node, or a single row.
 //!
 //! Rows are stored in blocks `[row/16][column][16]`: a block is one AVX-512 register (or two AVX2 ones) a column, and a
 //! range of rows is one slice. A table of one column is therefore contiguous, so that a matrix product can read it.

@@ -120,7 +120,7 @@ impl File<'_> {
         Ok((buffer.get(begin..end).ok_or_else(outside)?, index(&view["byteStride"])))
     }
 
-    /// Meshes and where the default scene's nodes place them; all meshes as they are where there are no nodes.
+    /// Meshes and where the default scene's nodes place them; all meshes unplaced where there are no nodes.
     fn placed(&self) -> Result<Vec<(usize, Sim3)>> {
         let nodes = self.json["nodes"].as_array().map_or(&[][..], Vec::as_slice);
         let scene = &self.json["scenes"][index(&self.json["scene"]).unwrap_or(0)]["nodes"];
@@ -146,7 +146,7 @@ impl File<'_> {
         Ok(out)
     }
 
-    /// The Gaussians of a primitive; scales and opacities are as they are stored.
+    /// The Gaussians of a primitive; scales and opacities as stored.
     fn gaussians(&self, attributes: &Value) -> Result<Params> {
         let of = |name: &str| &attributes[format!("{EXTENSION}:{name}")];
         let means = self.numbers(&attributes["POSITION"], 3, "POSITION", usize::MAX)?;
@@ -225,7 +225,7 @@ impl File<'_> {
     }
 }
 
-/// Says something that several meshes may share.
+/// Adds a remark that several meshes may share.
 fn warnings_once(warnings: &mut Warnings, text: Option<String>) {
     let mut one = Warnings::default();
     text.into_iter().for_each(|text| one.say(text));

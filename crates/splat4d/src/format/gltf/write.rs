@@ -12,7 +12,7 @@ use crate::{Error, Result};
 use serde_json::{Map, Value, json};
 use std::borrow::Cow;
 
-/// Points (glTF 2.0, 3.7.2.1): what programs without the extension draw.
+/// Points (glTF 2.0, 3.7.2.1): what programs without the extension render.
 const POINTS: u32 = 0;
 /// Target of buffer views of attributes (glTF 2.0, 5.11.5).
 const ARRAY_BUFFER: u32 = 34962;

@@ -54,7 +54,7 @@ pub(super) struct Columns {
 /// The words of a block, word by word: word k of Gaussian i is [k][i]; zero behind the last Gaussian.
 pub(super) type Words = [[u32; BLOCK_GAUSSIANS]; PAGE_WORDS];
 
-/// Words Gaussian by Gaussian, as a page has them. `rows` are at most a block.
+/// Words Gaussian by Gaussian, as in a page. `rows` are at most a block.
 #[inline(always)]
 pub(super) fn turn_over(words: &Words, rows: &mut [[u32; PAGE_WORDS]]) {
     for (i, row) in rows.iter_mut().enumerate() {

@@ -1,4 +1,4 @@
-//! Layers of pages as a reader would see them, without the way through a file: for training against the numbers
+//! Layers of pages as a reader decodes them, without a file: for training against the numbers
 //! that will be rendered (straight-through quantisation).
 
 use super::block::Words;
@@ -19,7 +19,7 @@ pub struct Coder {
 
 impl Coder {
     /// Writes into `shown` what a reader would see of `layer`, a page whose rows are in the file's order: of the blocks
-    /// of 256 rows for which `wanted` holds; other rows stay as they are. A block's ranges are those of all its rows.
+    /// of 256 rows for which `wanted` holds; other rows are not changed. A block's ranges are those of all its rows.
     /// Above degree 0 colours are those of the palette's entries `labels`; without a palette they stay, and `labels`
     /// may be empty.
     ///

@@ -7,8 +7,8 @@ use crate::{Error, Result};
 pub(crate) const LEAST_DEPTH: u32 = 2;
 
 /// Bits that the writer uses of the codes of docs/format.md, "Page"; what is below them carries nothing, so that
-/// deflate removes it. A reader need not know: ranges are stretched a little, so that the largest code in use is their
-/// end.
+/// deflate removes it. Readers are not affected: ranges are stretched a little, so that the largest code in use is
+/// their end.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct Depths {
     /// Of 16, each axis of the mean.

@@ -27,7 +27,7 @@ impl<F: Read + Write + Seek> Growing<F> {
         Ok(growing)
     }
 
-    /// Goes on with a file. Errors: it is no file that grows, or damaged; the file's.
+    /// Continues a file. Errors: not a growing file, or damaged; those of the file.
     pub fn open(mut file: F) -> Result<Self> {
         let index = read_index(&mut file)?;
         if index.version[0] != GROWING[0] {
@@ -36,7 +36,7 @@ impl<F: Read + Write + Seek> Growing<F> {
         Ok(Self { file, index })
     }
 
-    /// What it holds so far.
+    /// Its present content.
     pub fn index(&self) -> &Index {
         &self.index
     }
@@ -51,7 +51,8 @@ impl<F: Read + Write + Seek> Growing<F> {
     /// `gaussians` is counted. `sync` is called before the header names what was added: until then the file is what it
     /// was.
     ///
-    /// Errors: `part` is no whole file; metadata out of range; the file's. After an error the file is what it was.
+    /// Errors: `part` is not a complete file; metadata out of range; the file's. After an error the file is what it
+    /// was.
     pub fn append(
         &mut self,
         part: &[u8],
@@ -102,7 +103,7 @@ impl<F: Read + Write + Seek> Growing<F> {
         self.put(&header)
     }
 
-    /// Writes the header in one go.
+    /// Writes the header at once.
     fn put(&mut self, header: &[u8; HEADER_BYTES]) -> Result<()> {
         self.file.seek(SeekFrom::Start(0)).map_err(unwritten)?;
         self.file.write_all(header).and_then(|()| self.file.flush()).map_err(unwritten)
@@ -150,8 +151,8 @@ pub fn finish(source: &mut (impl Read + Seek), meta: Meta, poster: Option<&[u8]>
 
 /// What the first image needs: the first tier of its pages, what colours them, the rest of them; then time continues.
 /// Palettes
-/// come before the first page that names them, masks behind their page, labels behind everything. Equal ones stand by
-/// their bytes, so that who added what when does not show.
+/// come before the first page that names them, masks behind their page, labels behind everything. Equal ones are
+/// ordered by their bytes, so that the order of additions does not change the file.
 fn order(index: &Index) -> Vec<usize> {
     let start = index.meta.clip[0];
     let holds = |e: &Entry| e.span[0] <= start && start < e.span[1];
@@ -191,7 +192,7 @@ fn order(index: &Index) -> Vec<usize> {
     order
 }
 
-/// The index of a file, wherever it lies. Errors: not a playback file, damage, the file's.
+/// The index of a file, at any position. Errors: not a playback file, damage, those of the file.
 fn read_index(file: &mut (impl Read + Seek)) -> Result<Index> {
     let mut header = [0; HEADER_BYTES];
     file.seek(SeekFrom::Start(0)).and_then(|_| file.read_exact(&mut header)).map_err(unread)?;

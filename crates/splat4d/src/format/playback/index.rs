@@ -22,7 +22,7 @@ pub(super) const NO_PALETTE: u32 = u32::MAX;
 /// Bytes of masks before their key times, and most of these (docs/format.md, "Masks").
 pub(super) const MASK_HEAD: usize = 8;
 pub(super) const MAX_KEYS: usize = 65_535;
-/// Flag of an entry: who does not know the kind refuses the file.
+/// Flag of an entry: readers that do not support the kind refuse the file.
 const REQUIRED: u32 = 1;
 
 /// The kind of a section.
@@ -40,7 +40,7 @@ pub enum Kind {
     Features,
     /// An image.
     Poster,
-    /// Where the file comes from.
+    /// The file's provenance.
     Provenance,
     /// Something newer, which is skipped.
     Other([u8; 4]),
@@ -93,12 +93,12 @@ impl Codec {
     }
 }
 
-/// One section, as the table has it.
+/// One section of the table.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Entry {
     /// Kind of its contents.
     pub kind: Kind,
-    /// Whether who does not know the kind must refuse the file.
+    /// Whether readers that do not support the kind must refuse the file.
     pub required: bool,
     /// First byte in the file.
     pub offset: u64,
@@ -140,7 +140,7 @@ pub struct Index {
 /// The fixed header.
 struct Header {
     version: [u16; 2],
-    /// Where the index lies: behind the header, but in files that grow.
+    /// Position of the index: behind the header, except in growing files.
     index_at: u64,
     index_bytes: usize,
     file_len: u64,
@@ -161,12 +161,12 @@ impl Index {
         Ok(Self::place(prefix)?.end as usize)
     }
 
-    /// Whether a file's first bytes say that it is of a clip that is not finished.
+    /// Whether a file's first bytes mark its clip as unfinished.
     pub fn grows(header: &[u8]) -> bool {
         header.get(..10).is_some_and(|h| h[..8] == MAGIC && h[8..] == GROWING[0].to_le_bytes())
     }
 
-    /// The bytes of the file in which its index lies, by its first [`HEADER_BYTES`].
+    /// The bytes of the file that contain its index, by its first [`HEADER_BYTES`].
     ///
     /// Errors: not a playback file, a newer major version, a damaged header.
     pub fn place(header: &[u8]) -> Result<Range<u64>> {
@@ -349,7 +349,7 @@ impl Index {
         out
     }
 
-    /// The header of a file whose index lies `at`.
+    /// The header of a file whose index is at `at`.
     fn header(&self, at: u64, index: &[u8]) -> [u8; HEADER_BYTES] {
         let mut out = [0; HEADER_BYTES];
         out[..8].copy_from_slice(&MAGIC);
@@ -412,7 +412,7 @@ impl Header {
 }
 
 impl Entry {
-    /// An optional section of these bytes as they are, wherever it will be.
+    /// An optional section of exactly these bytes, at any position.
     pub(super) fn plain(kind: Kind, bytes: &[u8]) -> Self {
         let length = u32::try_from(bytes.len()).expect("a section has less than 4 GiB");
         Self {

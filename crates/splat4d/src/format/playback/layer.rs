@@ -22,7 +22,7 @@ use std::sync::{Arc, LazyLock};
 
 /// Half-width of Gaussians that have infinite lifespans, seconds: thirty years, in whose middle f32 is exact.
 const FOR_EVER: f64 = 1e9;
-/// Half-width zero as a logarithm can say it, seconds: less than any frame notices.
+/// Half-width zero as a logarithm can express it, seconds: far less than a frame.
 const INSTANT: f64 = 1e-9;
 /// A half-width in a layer counts as one of those two within this factor: an f32 logarithm is not exact.
 const ABOUT: f64 = 1.001;
@@ -66,13 +66,13 @@ fn constants() -> &'static Constants {
 /// Tables of a page's layer, in the order in which [`keys`] names them.
 pub(super) const TABLES: usize = 5;
 
-/// Geometry, colours, lives, velocities, rotation rates. Panics: the layer is none that a page gives.
+/// Geometry, colours, lifespans, velocities, rotation rates. Panics: the layer is none that a page gives.
 pub(super) fn keys(layer: &Layer<f32>) -> [Key; TABLES] {
     let found = page_keys(layer);
     found.unwrap_or_else(|| panic!("only a layer that moves and lives as those of a page can be one: {layer:?}"))
 }
 
-/// Whether a page could hold the layer as it is: its Gaussians are primitives already.
+/// Whether a page could hold the layer exactly: its Gaussians are already primitives.
 pub(crate) fn is_page(layer: &Layer<f32>) -> bool {
     page_keys(layer).is_some() && layer.span.iter().all(|t| t.is_finite())
 }
@@ -89,7 +89,7 @@ fn page_keys(layer: &Layer<f32>) -> Option<[Key; TABLES]> {
 }
 
 impl Page {
-    /// The page as a layer that is seen during its span; coefficients come from its palette, where it has one.
+    /// The page as a layer that is visible during its span; coefficients come from its palette, where it has one.
     ///
     /// Errors: a Gaussian's label is not in the palette. Panics: the page has a palette and none is given.
     pub(crate) fn layer(&self, palette: Option<&Palette>) -> Result<Layer<f32>> {
@@ -351,7 +351,7 @@ fn angular([w, x, y, z]: [f64; 4], [a, b, c, d]: [f64; 4]) -> [f64; 3] {
 /// The Gaussians of a page's layer as primitives: the inverse of [`Page::layer`], in the layer's order. Importance is
 /// 1.
 ///
-/// Panics: the layer moves or lives otherwise than those of a page.
+/// Panics: the layer's motion or lifespan is not that of a page.
 pub(crate) fn primitives(layer: &Layer<f32>) -> Vec<super::Primitive> {
     let [.., velocities, rates] = keys(layer);
     let p = &layer.params;

@@ -1,7 +1,7 @@
 //! The playback file `.s4d`: a dynamic scene, small, readable in parts, checked. docs/format.md is its specification.
 //!
 //! [`write()`] takes a [`Draft`] (floats, sorted into time spans by the baker), orders, quantises and packs it.
-//! [`Index::parse`] reads the start of a file, `decode_page` and `decode_palette` any section by itself, and
+//! [`Index::parse`] reads the start of a file, `decode_page` and `decode_palette` any section alone, and
 //! [`read()`] a whole file as a scene of one layer per page.
 
 mod block;
@@ -54,7 +54,7 @@ pub const OLD_EXTENSION: &str = "splat4d";
 pub const MEDIA_TYPE: &str = "application/vnd.s4d";
 /// First bytes of a playback file.
 pub const MAGIC: [u8; 8] = *b"\x89S4D\r\n\x1a\n";
-/// The version that this library knows: major, minor. A file states the least that has all it holds.
+/// The version of this library: major, minor. A file states the lowest version that has all of its content.
 pub(crate) const VERSION: [u16; 2] = [1, 2];
 /// The version of a file with masks and without labels.
 const MASKED: [u16; 2] = [1, 1];
@@ -122,7 +122,7 @@ pub struct Node {
     pub primitives: Vec<Primitive>,
 }
 
-/// All that goes into a playback file.
+/// Content of a playback file.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Draft {
     /// About the scene; `gaussians` is counted by the writer.

@@ -11,7 +11,7 @@ use crate::format::quant::{MORTON_BITS, morton};
 /// Place 3, first and last second 2, logarithm of the size 1.
 const FEATURES: usize = 6;
 /// A spread of the whole span in time counts as much as this many standard deviations of all places: a block that is
-/// dead is not even examined, one out of sight is seldom.
+/// dead is skipped, one out of sight is examined rarely.
 const TIME_WEIGHT: f64 = 4.0;
 /// A factor e in size counts as much as this many standard deviations of all places.
 const SIZE_WEIGHT: f64 = 0.35;

@@ -23,7 +23,7 @@ pub(super) const FOR_EVER: u32 = 255;
 const REACH: f64 = 3.0;
 /// Logarithms of a header are within ± this (docs/format.md), so that squares of what they represent fit an f32.
 pub(super) const MAX_LOG: f64 = 40.0;
-/// A scale below this share of the Gaussian's largest is raised to it: 1/1000 of what is seen is never seen, and the
+/// A scale below this share of the Gaussian's largest is raised to it: 1/1000 of a visible size is invisible, and the
 /// block's range of scales would pay for it.
 pub(super) const THINNEST: f64 = 1e-3;
 /// Places of a block header (docs/format.md, "Page").
@@ -148,7 +148,7 @@ pub(super) fn page_of(headers: &[Header], words: &[[u32; PAGE_WORDS]]) -> Vec<u8
     out
 }
 
-/// Scales as they are written: positive, and none far below the largest.
+/// Scales as written: positive, and none far below the largest.
 pub(super) fn scales(p: &Primitive) -> [f64; 3] {
     let scales = p.scales.map(f64::from);
     let largest = scales[0].max(scales[1]).max(scales[2]);

@@ -1,5 +1,5 @@
 //! A playback file taken apart into layers that can be changed, and put together again: the same pages, rows in the
-//! same order, labels and palette as they are.
+//! same order, labels and palette unchanged.
 
 use super::block::turn_over;
 use super::coder::{Encode, Rows};

@@ -85,7 +85,7 @@ impl Palette {
         self.ranges[degree_of_plane(plane) - 1] * SHARES[usize::from(self.codes[plane * self.entries + entry])]
     }
 
-    /// Coefficient `plane` of entries in turn. Panics: there is no such entry or plane.
+    /// Coefficient `plane` of consecutive entries. Panics: there is no such entry or plane.
     pub(super) fn values(&self, plane: usize, entries: &[u16], mut each: impl FnMut(usize, f32)) {
         let codes = &self.codes[plane * self.entries..(plane + 1) * self.entries];
         let range = self.ranges[degree_of_plane(plane) - 1];

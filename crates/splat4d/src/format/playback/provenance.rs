@@ -1,4 +1,4 @@
-//! Where a file comes from: an optional section of JSON, which readers that do not know it skip.
+//! Provenance of a file: an optional section of JSON, which readers without support skip.
 
 use super::index::{broken, crc};
 use super::write::GENERATOR;
@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 /// Most bytes of the section (docs/format.md, "Provenance").
 const MOST_BYTES: usize = 1 << 20;
 
-/// Where a file comes from. What is not known is left out.
+/// Provenance of a file. Unknown fields are left out.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Provenance {
@@ -21,7 +21,7 @@ pub struct Provenance {
     /// Hash of the capture's names, poses and times, 16 hexadecimal digits.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub capture: Option<String>,
-    /// Edits that were made, in order, as docs/edit.md has them.
+    /// Edits that were made, in order, as in docs/edit.md.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub edits: Vec<serde_json::Value>,
     /// The maker's own words: whom it shows, who may use it.

@@ -1,4 +1,4 @@
-//! What docs/format.md asks of writers and readers need not check: [`strict`] lists how a file deviates from it.
+//! Requirements of docs/format.md on writers that readers need not check: [`strict`] lists how a file deviates from it.
 
 use super::index::{broken, raw_entry};
 use super::page::{Header, at, seen_widths};

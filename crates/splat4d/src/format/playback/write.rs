@@ -26,7 +26,7 @@ const SMALLEST_TIER: usize = 4096;
 pub(super) const GENERATOR: &str = concat!("splat4d ", env!("CARGO_PKG_VERSION"));
 /// Bytes of a palette's ranges, before its planes.
 const RANGE_BYTES: usize = 12;
-/// A poster up to this size comes before everything else; a larger one would only delay the first image.
+/// A poster up to this size is placed before everything else; a larger one would only delay the first image.
 const SMALL_POSTER: usize = 64 << 10;
 /// The palette takes a Gaussian's importance for at least and at most this many times the mean.
 const WEIGHTS: [f32; 2] = [0.01, 100.0];
@@ -312,7 +312,7 @@ fn entry(kind: Kind) -> Entry {
     Entry::plain(kind, &[])
 }
 
-/// How many bytes come before a section's byte planes, and how many a plane has.
+/// Bytes before a section's byte planes, and bytes per plane.
 fn runs(entry: &Entry) -> (usize, usize) {
     let count = entry.count as usize;
     match entry.kind {

@@ -30,15 +30,15 @@ pub(super) struct Columns {
 
 /// The 3D filter of Mip-Splatting, and of Gaussian Opacity Fields, which took it over.
 const FILTER: &str = "filter_3D";
-/// Properties that change what a Gaussian looks like, and which method writes them. Sources: the methods' `save_ply`.
+/// Properties that change the appearance of a Gaussian, and which method writes them. Sources: the methods' `save_ply`.
 const KERNELS: [(&str, &str); 2] =
     [("beta", "Deformable Beta Splatting"), ("shape", "Generalized Exponential Splatting")];
 /// How properties begin from which a network makes the Gaussians, and which methods write them.
 const NETWORKS: [(&str, &str); 2] =
     [("f_anchor_feat", "anchors of Scaffold-GS or a method built on it"), ("f_offset", "anchors of Scaffold-GS")];
 
-/// The properties of Gaussians. Errors: some are missing (the message names what the file holds in their place); spherical
-/// harmonics above degree 3.
+/// The properties of Gaussians. Errors: some are missing (the message names what the file holds in their place);
+/// spherical harmonics above degree 3.
 pub(super) fn of(vertex: &Element) -> Result<Columns> {
     let all = |names: [&str; 3]| names.iter().all(|n| vertex.find(n).is_some());
     let rgb = [RGB_NAMES, SHORT_RGB_NAMES].into_iter().find(|names| !all(DC_NAMES) && all(*names));

@@ -88,7 +88,7 @@ fn span(clip: [f64; 2]) -> f64 {
     if clip[1] > clip[0] { clip[1] - clip[0] } else { 1.0 }
 }
 
-/// Writes a moving scene. Errors: it moves in a way that the format cannot say and may not be fitted; the sink's.
+/// Writes a moving scene. Errors: the format cannot express its motion, and fitting is not allowed; the sink's.
 fn write_ftgs(scene: &Scene<f32>, options: &WriteOptions, out: &mut impl Write) -> Result<Warnings> {
     let mut warnings = Warnings::default();
     let fps = if scene.fps > 0.0 { scene.fps } else { DEFAULT_FPS };

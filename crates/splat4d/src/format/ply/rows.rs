@@ -3,7 +3,7 @@
 use super::header::{Element, Encoding, Header, Kind, Scalar, broken};
 use crate::Result;
 
-/// The rows of an element; every row is known to be there.
+/// The rows of an element; every row is known to exist.
 pub(super) struct Rows<'a> {
     count: usize,
     body: Body<'a>,

@@ -128,7 +128,7 @@ fn unpack(x: &[f64; WIDTH]) -> Moving {
     }
 }
 
-/// Writes a moving scene. Errors: it moves in a way that the format cannot say, or lives so and may not be fitted; the
+/// Writes a moving scene. Errors: the format cannot express its motion or lifespans, and fitting is not allowed; the
 /// sink's.
 pub fn write_stg(scene: &Scene<f32>, options: &WriteOptions, out: &mut impl Write) -> Result<Warnings> {
     let mut warnings = Warnings::default();
@@ -185,7 +185,7 @@ mod tests {
         }
     }
 
-    /// A text file as the paper's code names things, without normals.
+    /// A text file with the names of the paper's code, without normals.
     #[test]
     fn a_foreign_file_is_read() {
         let names = names();

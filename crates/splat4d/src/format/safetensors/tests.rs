@@ -111,7 +111,7 @@ fn mutants_are_read_or_refused() {
     assert!(0 < read && read < 1000, "{read} of 1000 mutants were readable");
 }
 
-/// One bit anywhere: the file is refused, or states what it said.
+/// One changed bit anywhere: the file is refused, or its content is unchanged.
 #[test]
 fn a_flipped_bit_is_found_by_the_checksums() {
     let whole = sample();

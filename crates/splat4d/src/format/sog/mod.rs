@@ -40,7 +40,7 @@ pub const DIALECT: Dialect = Dialect {
 
 /// The version this library reads.
 pub(crate) const VERSION: u64 = 2;
-/// The file that states what the others are.
+/// The file that describes the others.
 pub const META: &str = "meta.json";
 /// Most Gaussians that are believed, a byte of the files: real ones take eight bytes and more each.
 const PER_BYTE: usize = 1;
@@ -91,7 +91,7 @@ fn count_of(meta: &Value, bytes: usize) -> Result<usize> {
     Ok(count)
 }
 
-/// Names of the images that a `meta.json` speaks of: what a folder's reader must fetch.
+/// Names of the images that a `meta.json` names, which a folder's reader must fetch.
 ///
 /// Errors: not JSON, or another version.
 pub fn files_of(meta: &[u8]) -> Result<Vec<String>> {

@@ -28,7 +28,7 @@ const BOOK_ROUNDS: usize = 40;
 /// Half of the codes of a part of a quaternion.
 const HALF: f32 = 127.5;
 
-/// Writes a zipped scene. Says what was left out. Errors: no Gaussians; the sink's.
+/// Writes a zipped scene. Returns what was left out. Errors: no Gaussians; the sink's.
 pub(super) fn write(params: &Params, out: &mut dyn Write) -> Result<Warnings> {
     let mut warnings = Warnings::default();
     let mut rows = sound_rows(params, &mut warnings);
@@ -156,8 +156,8 @@ impl Book {
     }
 }
 
-/// 256 rising numbers: the cell with the largest sum of squares is cut at its mean, until there are so many. Lone numbers far from
-/// the others get a cell of their own, which Lloyd's algorithm would not give them.
+/// 256 rising numbers: the cell with the largest sum of squares is cut at its mean, until there are so many. Lone
+/// numbers far from the others get a cell of their own, which Lloyd's algorithm would not give them.
 fn cells(sorted: &[f32]) -> Vec<f32> {
     let mut sums = vec![[0.0f64; 2]];
     for x in sorted {

@@ -2,10 +2,10 @@
 //!
 //! Six streams, one value after the other through all Gaussians: positions (24-bit fixed point), opacities (u8), base
 //! colours (u8, ½ + 0.15·f_dc), log scales (u8, b/16 − 10), rotations, spherical harmonics (u8, (b − 128)/128,
-//! coefficient-major as our tables). Versions 2 and 3 are one gzip stream: header of 16 bytes, then the streams; version
-//! 4 has a plain header of 32 bytes, extensions, a table of contents and a zstd frame a stream. Version 2 stores the
-//! quaternion's x, y, z; later ones its smallest three parts. World axes: what an extension names, else as in .ply
-//! (`axes.rs`).
+//! coefficient-major as our tables). Versions 2 and 3 are one gzip stream: header of 16 bytes, then the streams;
+//! version 4 has a plain header of 32 bytes, extensions, a table of contents and a zstd frame a stream. Version 2
+//! stores the quaternion's x, y, z; later ones its smallest three parts. World axes: what an extension names, else as
+//! in .ply (`axes.rs`).
 //!
 //! Source: github.com/nianticlabs/spz (MIT), README and extensions/README.
 
@@ -41,7 +41,8 @@ pub(crate) const DIALECT: Dialect = Dialect {
 
 /// The versions this library reads and writes.
 pub(crate) const VERSIONS: std::ops::RangeInclusive<u32> = 2..=4;
-/// First version that names its axes when it is written: readers of version 2 (spz-js 1.2) refuse bytes behind the streams.
+/// First version that names its axes when it is written: readers of version 2 (spz-js 1.2) refuse bytes behind the
+/// streams.
 const NAMES_AXES: u32 = 3;
 /// First bytes of a version 4 file, and of the header inside older ones.
 pub(crate) const MAGIC: [u8; 4] = *b"NGSP";
@@ -125,7 +126,8 @@ pub fn read(bytes: &[u8]) -> Result<(Params, SpzInfo, Warnings)> {
     Ok((params, info, warnings))
 }
 
-/// Writes a file of the given version that names its axes, where `up` is along one. Says what was clipped or left out.
+/// Writes a file of the given version that names its axes, where `up` is along one. Returns what was clipped or left
+/// out.
 ///
 /// Errors: the sink's; no Gaussians (readers refuse such files). Panics: the version is not one of 2 to 4.
 pub(crate) fn write(params: &Params, version: u32, up: [f64; 3], out: &mut impl Write) -> Result<Warnings> {

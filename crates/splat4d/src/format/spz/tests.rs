@@ -5,7 +5,7 @@ use crate::scene::GEOMETRY;
 use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use std::io::Read;
 
-/// The body of one Gaussian of degree 1 as the specification has it; `rotation` as the version stores it.
+/// The body of one Gaussian of degree 1 as specified; `rotation` as stored by the version.
 fn body(rotation: &[u8]) -> Vec<u8> {
     let mut b = Vec::new();
     // x = 1.5, y = -0.25, z = 2048 − 1/4096, in steps of 1/4096.

@@ -2,9 +2,9 @@
 //! such a layer (`.usdz`).
 //!
 //! `positions`, `orientations` (w first in text), `scales` (lengths) and `opacities` (alpha) are **activated**;
-//! `radiance:sphericalHarmonicsCoefficients` are (degree + 1)² colours a Gaussian, Gaussian after Gaussian, with the signs
-//! of 3DGS. Every array may have time samples, between which programs interpolate: one row is one Gaussian at all times,
-//! with opacity 0 while it does not live. Transforms of parents place the field. `upAxis` is Y or Z.
+//! `radiance:sphericalHarmonicsCoefficients` are (degree + 1)² colours a Gaussian, Gaussian after Gaussian, with the
+//! signs of 3DGS. Every array may have time samples, between which programs interpolate: one row is one Gaussian at all
+//! times, with opacity 0 while it is not alive. Transforms of parents place the field. `upAxis` is Y or Z.
 //! Sources: openusd.org, "usda" grammar of the User Guides, usdVol schemas, usdz specification 1.3.
 
 mod lexer;

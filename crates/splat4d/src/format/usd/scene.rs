@@ -1,4 +1,4 @@
-//! Fields of Gaussians as a scene: static ones as they are, animated ones as segments between their time samples.
+//! Fields of Gaussians as a scene: static ones unchanged, animated ones as segments between their time samples.
 
 use super::lexer::Value;
 use super::stage::{Attribute, Prim, Stage};
@@ -20,7 +20,8 @@ use std::sync::Arc;
 
 /// Up in stages with z up.
 const Z_UP: [f64; 3] = [0.0, 0.0, 1.0];
-/// A segment begins this share of a frame before its time sample, so that rounding of times does not choose the one before.
+/// A segment begins this share of a frame before its time sample, so that rounding of times does not choose the one
+/// before.
 const EARLY: f64 = 1e-6;
 /// Most time samples of a field.
 const MOST_TIMES: usize = 100_000;
@@ -222,7 +223,7 @@ impl<'a> Field<'a> {
         Ok(layers)
     }
 
-    /// Positions and rotations that move, all else as it is.
+    /// Positions and rotations that move, all else unchanged.
     fn tracked(&self, first: Params, warnings: &mut Warnings) -> Result<Layer<f32>> {
         let mut params = first;
         let spec = TrackedSpec { times: self.times.clone(), foreground: false };

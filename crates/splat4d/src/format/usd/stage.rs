@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 
 /// Deepest nesting of prims that is followed.
 const DEEPEST: usize = 64;
-/// Time codes a second where the file does not say it (USD's fallback).
+/// Time codes per second where the file does not state it (USD's fallback).
 const CODES_PER_SECOND: f64 = 24.0;
 /// Words that may be before the type of a property.
 const QUALIFIERS: [&str; 7] = ["custom", "uniform", "varying", "config", "prepend", "append", "add"];

@@ -14,7 +14,7 @@ use std::time::Instant;
 
 /// Frames that are under way at most, as on a screen with three images.
 const FRAMES: usize = 3;
-/// The step of which the frames are a view, as far as room for pairs goes.
+/// The step that the frames belong to, for the capacity for pairs.
 const VIEW: u32 = 1;
 
 /// What is filmed.
@@ -97,7 +97,7 @@ impl GpuRenderer {
 }
 
 impl Tables {
-    /// Writes what is asked at a time, and nothing by which anything would learn.
+    /// Writes the queries at a time, without rules of learning.
     fn write_asks(&self, gpu: &crate::gpu::Gpu, t: Time, alpha_min: f64) {
         let mut out = vec![0u8; self.pages.len() * at::ALL * UNIFORM_STRIDE as usize];
         let mut first_splat = 0;

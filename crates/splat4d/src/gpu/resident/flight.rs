@@ -1,11 +1,11 @@
 //! Steps under way: begun without a wait, and done some steps later, when the GPU has written their record
 //! (record.wgsl).
 //!
-//! Where a view has more pairs than there is room for, the GPU stops: nothing that follows is applied, neither of that
-//! step nor of those behind it, which may have been begun already. Who reads the record gives more room, or cuts images
-//! into more bands, and
-//! begins again from that very view on. A step is a function of what it was begun with, so that neither the room nor
-//! the moment at
+//! If a view has more pairs than fit, the GPU stops: nothing later is applied, neither of that
+//! step nor of later ones, which may already be in flight. The reader of the record enlarges the buffers, or cuts
+//! images into more bands, and
+//! starts again from that view. A step is a function of its inputs, so that neither the buffer size nor
+//! the time at
 //! which its record is read changes a bit.
 
 use super::{ResidentPass, STEP_WORDS, Tables, VIEW_WORDS};
@@ -70,7 +70,7 @@ pub(in crate::gpu) struct Flights {
     done: Vec<ResidentStepped>,
     /// Memory of records that are not in use.
     spare: Vec<Grown>,
-    /// Steps that were begun again for lack of room.
+    /// Steps that were restarted because buffers were too small.
     #[cfg(test)]
     pub again: usize,
 }
@@ -126,7 +126,7 @@ impl GpuRenderer {
         Ok(std::mem::take(&mut self.flights.done))
     }
 
-    /// Waits for all work, whatever came of it.
+    /// Waits for all work, whatever its result.
     pub(super) fn forget_flights(&mut self) -> Result<()> {
         self.flights.done.clear();
         if self.flights.under_way.is_empty() {
@@ -292,7 +292,7 @@ impl GpuRenderer {
         Back { frame: self.frame(), kernels, pairs }
     }
 
-    /// Waits for the oldest step, which is begun again while there is too little room for it.
+    /// Waits for the oldest step, which is restarted while its buffers are too small.
     fn land(&mut self) -> Result<()> {
         loop {
             let Some(flight) = self.flights.under_way.pop_front() else { return Ok(()) };
@@ -315,7 +315,7 @@ impl GpuRenderer {
         }
     }
 
-    /// More room, then a step from a view on that had so many pairs, and all steps behind it.
+    /// Enlarges buffers, then restarts a step from the view with this many pairs, and all later steps.
     fn begin_anew(&mut self, step: Begun, view: usize, pairs: usize) -> Result<()> {
         let mut steps = vec![step];
         self.gpu.wait()?;
@@ -361,7 +361,7 @@ impl GpuRenderer {
         self.gpu.queue.write_buffer(self.buffers.counts.get(), 4 * count::STOP as u64, &zeros);
     }
 
-    /// What the GPU has written of a step.
+    /// The GPU's record of a step.
     fn read_record(&self, flight: &Flight) -> Result<Record> {
         self.gpu.wait_for(&flight.work)?;
         let lost = |e: wgpu::MapRangeError| {

@@ -39,7 +39,7 @@ fn params<F: Real>(spec: &Native4dSpec) -> (Params<F>, Key, Arc<dyn Motion<F>>) 
     (p, own, motion)
 }
 
-/// The motion as kernels know it.
+/// The motion as in the kernels.
 fn moves<F: Real>(motion: &dyn Motion<F>) -> Moves {
     let Slices { speed, floor, ceiling, harmonics, period, .. } = motion.slices().expect("it is of slices");
     Moves::Sliced { speed, floor, ceiling, harmonics, period }
@@ -164,7 +164,7 @@ fn kept(r: &mut GpuRenderer, ties: Option<&ResidentTies>) -> Result<Params<f32>>
     Ok(p)
 }
 
-/// Begins a step that sees these cameras, with losses on rows and noise: steps that are done.
+/// Begins a step on these cameras, with losses on rows and noise: steps that are done.
 fn begun(r: &mut GpuRenderer, number: usize, cameras: &[Camera], rate: f64) -> Result<Vec<ResidentStepped>> {
     let truth = |camera: &Camera| {
         let mut truth = Planes::new(3, camera.height, camera.width);
@@ -231,7 +231,7 @@ fn tunings_change_no_bit() {
     }
 }
 
-/// Images of few pairs, then of more than there was room for, at a first view and at a later one.
+/// Images of few pairs, then of more than fit, at a first view and at a later one.
 fn far_and_near() -> [Vec<Camera>; 3] {
     let [far, near] = [camera([0.0, 0.0, -80.0], 16, 16), camera([0.0, 0.0, -4.0], 150, 110)];
     [vec![far.clone(), far.clone()], vec![far.clone(), near.clone()], vec![near, far]]
@@ -315,7 +315,7 @@ fn a_device_that_is_lost_under_way_is_an_error() {
     assert!(tried(&mut r, &one(&camera)).is_err(), "it is told");
 }
 
-/// Something that is asked of a renderer.
+/// A request to a renderer.
 type Asked<'a> = &'a dyn Fn(&mut GpuRenderer) -> Result<()>;
 
 #[test]

@@ -7,7 +7,7 @@ use frame::RECORD_BYTES;
 
 /// Largest difference of a pair's sum from the same sum in f64, of the root of the mean square of all pairs' sums.
 const RECORD: f64 = 1e-3;
-/// Largest relative difference of a gradient, as a vector, where both draw the same lists: roundings.
+/// Largest relative difference of a gradient, as a vector, where both render the same lists: rounding.
 const VECTOR: f64 = 1e-4;
 /// Of the whole chain, where a splat at the α cut-off may be rendered by one side only.
 const CHAIN: f64 = 2e-3;
@@ -96,7 +96,7 @@ fn named(d: &RenderGrads<f32>, d_sh: &[Option<Table<f32>>]) -> Vec<(String, Vec<
     out
 }
 
-/// Asserts that both go back alike. Returns the worst relative difference.
+/// Asserts equal gradients. Returns the worst relative difference.
 fn compare(r: &mut GpuRenderer, shot: &Shot<'_>, grads: &ImageGrads<'_, f32>, what: &str) -> f64 {
     let (_, d, d_sh) = back(r, shot, grads);
     let mut cpu = Renderer::new(r.config);

@@ -1,4 +1,4 @@
-//! Comparing on the GPU: value and gradient against the definition in f64, then all of it against the way through the
+//! Comparing on the GPU: value and gradient against the definition in f64, then the whole against the
 //! CPU.
 
 use super::*;

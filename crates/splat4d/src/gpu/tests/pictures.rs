@@ -21,7 +21,7 @@ fn psnr(a: &[f32], b: &[f32]) -> f64 {
     -10.0 * (sum / a.len() as f64).log10()
 }
 
-/// Asserts that both draw the same, and returns the PSNR.
+/// Asserts equal renders, and returns the PSNR.
 fn compare(r: &mut GpuRenderer, shot: &Shot<'_>, what: &str) -> (f64, RenderStats) {
     let mut image = Image::default();
     r.render(shot, &mut image).expect("it is drawn");

@@ -1,4 +1,4 @@
-//! Which queries are one, and that the way there and back is that of the motion models.
+//! Which queries are merged, and that forward and backward equal those of the motion models.
 
 use super::*;
 use crate::math::Rng;

@@ -34,7 +34,8 @@ pub const MAX_HARMONICS: usize = 2;
 pub(crate) const COLUMNS: [(&str, usize); 3] = [("time_means", 1), ("log_time_scales", 1), ("right_quats", 4)];
 /// Its name.
 pub const TABLE: &str = "native4d";
-/// The parts of a split live shorter by this factor: Kerbl et al. 2023 divide scales by 1.6, Yang et al. 2024 all four.
+/// The parts of a split have lifespans shorter by this factor: Kerbl et al. 2023 divide scales by 1.6, Yang et al. 2024
+/// all four.
 const SPLIT_SHRINK: f64 = 1.6;
 /// The shortest lifespan within the number range, seconds.
 pub(crate) const SHORTEST: f64 = 1e-6;
@@ -57,7 +58,7 @@ pub struct Native4dSpec {
     pub harmonics: usize,
     /// T of those blocks, seconds.
     pub period: f64,
-    /// Whether the parts of a split also are apart in time, along the parent's path, and live shorter.
+    /// Whether the parts of a split also are apart in time, along the parent's path, and have shorter lifespans.
     pub split_time: bool,
 }
 
@@ -116,8 +117,8 @@ pub fn set_velocity(spec: &Native4dSpec, params: &mut Params<f32>, row: usize, v
 }
 
 impl Native4d {
-    /// New Gaussians are static and live for a second around t = 0. With harmonics, the layer's SH table grows by their
-    /// blocks, which start at zero.
+    /// New Gaussians are static and alive for a second around t = 0. With harmonics, the layer's SH table grows by
+    /// their blocks, which start at zero.
     ///
     /// Errors: numbers of the spec out of their ranges; loaded arrays of the wrong shape.
     pub(crate) fn new<F: Real>(spec: Native4dSpec, p: &mut Params<F>) -> Result<Self> {
@@ -137,7 +138,7 @@ impl Native4d {
     }
 }
 
-/// Makes room for `blocks` blocks of SH coefficients. A table of one block differs from one of several by its width: 1,
+/// Allocates `blocks` blocks of SH coefficients. A table of one block differs from one of several by its width: 1,
 /// 4, 9 and 16 coefficients are no whole number of blocks of one another, but for one block.
 fn widen<F: Real>(p: &mut Params<F>, blocks: usize) -> Result<()> {
     let (rows, width) = (p.len(), p[SH].width());
@@ -232,8 +233,8 @@ impl<F: Real> Motion<F> for Native4d {
         d_time
     }
 
-    /// The parts of a split are apart in time as a Gaussian of four dimensions does: δt ~ N(0, Σ_tt), and the mean goes
-    /// along its path; a split adds what lies across it.
+    /// The parts of a split are apart in time as a Gaussian of four dimensions does: δt ~ N(0, Σ_tt), and the mean
+    /// moves along its path; a split adds what lies across it.
     fn on_edit(&self, p: &mut Params<F>, edit: &RowEdit, rng: &Rng) {
         if edit.space != Space::Gaussians || !self.spec.split_time {
             return;

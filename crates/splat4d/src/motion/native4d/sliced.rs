@@ -29,7 +29,7 @@ pub(crate) struct Sliced {
 }
 
 impl Sliced {
-    /// A row as it is rendered: floors and ceilings applied.
+    /// A row for rendering: lower and upper bounds applied.
     pub(crate) fn of<F: Real>(spec: &Native4dSpec, p: &Params<F>, own: Key, row: usize) -> Self {
         let g = p[GEOMETRY].read::<11>(row, 0).map(Real::f64);
         let o = p[own].read::<OWN>(row, 0).map(Real::f64);

@@ -93,7 +93,7 @@ fn the_reference_writes_the_same_rotation_with_reversed_axes() {
     }
 }
 
-/// The Gaussian of four dimensions as it is defined: mean and covariance.
+/// The four-dimensional Gaussian by its definition: mean and covariance.
 fn whole(g: &[f64; 11], own: &[f64; OWN]) -> ([f64; 4], [[f64; 4]; 4]) {
     let l = quat::normalize([g[QUAT], g[QUAT + 1], g[QUAT + 2], g[QUAT + 3]]).0;
     let r = quat::normalize([own[2], own[3], own[4], own[5]]).0;

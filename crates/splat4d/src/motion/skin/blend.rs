@@ -1,7 +1,7 @@
 //! Linear blend skinning of a cloud at one time, and its VJP.
 //!
 //! A node's rigid motion is sixteen numbers, one register or two: R (9, rows), c = p + T − R p (3), and R's unit
-//! quaternion (4). A Gaussian blends the numbers of its nodes and goes to M x + c with the blend; it is node by node
+//! quaternion (4). A Gaussian blends the numbers of its nodes and moves to M x + c with the blend; it is node by node
 //! only that sums are made, and all else is done for sixteen Gaussians at a time.
 
 use super::tasks::{sum_parts, task_rows};
@@ -113,7 +113,7 @@ struct Moved<F> {
     /// The nodes' frames, blended, and the signs by which their quaternions were aligned.
     blend: [Lane<F>; FRAME],
     signs: [[F; super::MAX_NEIGHBOURS]; BLOCK],
-    /// How far they would go without a mask.
+    /// Their displacement without a mask.
     away: [Lane<F>; 3],
     /// The quaternions that turn them, and the norms of what those were made from.
     unit: [Lane<F>; 4],

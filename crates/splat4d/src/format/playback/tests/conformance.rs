@@ -162,7 +162,7 @@ fn newer() -> Vec<u8> {
     bytes
 }
 
-/// The set: names, what each has, and bytes.
+/// The set: names, contents and bytes.
 fn set() -> Vec<(&'static str, &'static str, Vec<u8>)> {
     let plain = |draft: &Draft| bytes_of(draft, &WriteConfig::default()).0;
     let coarse =

@@ -1,4 +1,4 @@
-//! Feature channels in the file: there and back, skipped by who does not know them, and damaged.
+//! Feature channels in the file: round trip, skipped by readers without support, and damaged.
 
 use super::hostile::survive;
 use super::*;

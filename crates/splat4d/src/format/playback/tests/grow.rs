@@ -1,4 +1,4 @@
-//! Files that grow: what is there plays at any time, and what is finished is a file like any other, in whatever order
+//! Files that grow: the present part plays at any time, and a finished file is like any other, in whatever order
 //! it was added.
 
 use super::*;

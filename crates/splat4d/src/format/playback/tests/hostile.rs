@@ -100,7 +100,7 @@ fn bytes_of_headers_and_tables_are_each_tried() {
     }
 }
 
-/// The sample with some bytes of entry `i` replaced, checksums mended.
+/// The sample with some bytes of entry `i` replaced, checksums corrected.
 pub(super) fn with_entry(sample: &[u8], i: usize, at: usize, bytes: &[u8]) -> Vec<u8> {
     let mut m = sample.to_vec();
     let first = table(sample) + 64 * i + at;

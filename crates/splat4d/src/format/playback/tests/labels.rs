@@ -1,4 +1,4 @@
-//! Labels in the file: there and back, skipped by who does not know them, and damaged.
+//! Labels in the file: round trip, skipped by readers without support, and damaged.
 
 use super::hostile::{reseal, survive};
 use super::*;

@@ -1,4 +1,4 @@
-//! Masks in the file: there and back, rendered, and damaged.
+//! Masks in the file: round trip, rendered, and damaged.
 
 use super::hostile::{reseal, survive, with_entry};
 use super::*;
