@@ -216,7 +216,7 @@ pub struct ResidentNumbers {
 /// Keeps a scene's tables and takes steps on them: evaluate, render, compare, backward, Adam.
 ///
 /// Steps are asynchronous: several may be in flight, and their results are returned in order. The results do
-/// not depend on when it is read.
+/// not depend on the time of reading.
 pub trait Resident {
     /// Takes over all layers, in place of whatever was kept; steps under way are forgotten. `corrections`: Adam's 1/(1
     /// − β₁ⁿ) and 1/(1 − β₂ⁿ) by step count n, the last for all that follow.
