@@ -1,6 +1,6 @@
 //! Numbers of Gaussians as training images blend them, and the backward pass: what is learnt next to images while
 //! shapes, places
-//! and colours stay as they are ([`labels`](crate::labels), [`features`](crate::features)).
+//! and colours are not changed ([`labels`](crate::labels), [`features`](crate::features)).
 
 use crate::capture::Capture;
 use splat4d::layers::{Evaluation, Scene};
@@ -49,8 +49,8 @@ impl Blended {
         self.renderer.render(&shot, &mut self.image);
     }
 
-    /// The VJP of [`draw`](Self::draw): `give` hears, for every splat, of its layer and row, its number, the gradients
-    /// to all columns and the columns.
+    /// The VJP of [`draw`](Self::draw): `give` is called for every splat with its layer and row, its number, the
+    /// gradients to all columns and the columns.
     pub(crate) fn back(
         &mut self,
         scene: &Scene<f32>,

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-/// Reports the progress of long work, and what the user should know.
+/// Reports the progress of long work, and messages for the user.
 pub struct Progress<'a>(pub &'a mut dyn FnMut(&Event));
 
 impl Progress<'_> {
@@ -12,13 +12,13 @@ impl Progress<'_> {
         (self.0)(&Event::Phase { name: name.to_owned(), done, total });
     }
 
-    /// Something the user should know: what, and what to do.
+    /// A message for the user: what happened, and what to do.
     pub fn warn(&mut self, message: String) {
         (self.0)(&Event::Warning { message });
     }
 }
 
-/// One piece of news. Serialised (with `type`) it is what `--json` prints, a line each.
+/// One event. `--json` prints it serialised (with `type`), one per line.
 #[derive(Clone, Debug, serde::Serialize)]
 #[serde(tag = "type", rename_all = "snake_case")]
 #[non_exhaustive]
@@ -27,7 +27,7 @@ pub enum Event {
     Phase {
         /// Name of the work in progress.
         name: String,
-        /// Done so far.
+        /// Finished.
         done: usize,
         /// To do in all; 0 when not known.
         total: usize,
@@ -59,7 +59,7 @@ pub enum Event {
         /// Estimated peak memory of training, bytes.
         memory_estimate: u64,
     },
-    /// The run was given another length, because it would have ended at another time than was asked for.
+    /// The run was given another length, because it would not have ended at the requested time.
     Replanned {
         /// Steps taken.
         iteration: usize,
@@ -84,7 +84,7 @@ pub enum Event {
         psnr: f64,
         /// Gaussians now.
         gaussians: usize,
-        /// Seconds of training so far.
+        /// Seconds of training.
         seconds: f64,
         /// Seconds that are left, estimated.
         seconds_left: f64,
@@ -100,7 +100,7 @@ pub enum Event {
     Chosen {
         /// Its name.
         motion: String,
-        /// One sentence on what the capture is.
+        /// One sentence about the capture.
         why: String,
     },
     /// The number that `densify.max_cap = 0` has become.
@@ -118,7 +118,7 @@ pub enum Event {
         #[serde(serialize_with = "crate::path_text::lossy")]
         path: PathBuf,
     },
-    /// Something the user should know.
+    /// A message for the user.
     Warning {
         /// The finding and its remedy.
         message: String,

@@ -1,10 +1,10 @@
-//! Feature channels of a trained scene, learnt from images of features while all else stays as it is.
+//! Feature channels of a trained scene, learnt from images of features with all else fixed.
 //!
 //! A Gaussian has D numbers f_i. A pixel shows F = Σ w_i f_i / Σ w_i, w_i = α_i T_i, and the loss is ½ Σ_pixels |F −
 //! F*|² over the pixels that are known and show something, plus ½ ε Σ |f_i|². With shapes fixed F is linear in f, so
-//! that the loss has one minimum, which conjugate gradients come near in few rounds without any rate (Hestenes and
-//! Stiefel 1952), each channel by itself: a round renders every image once, forth and back. Few rounds also keep what
-//! pixels hardly see from growing.
+//! that the loss has one minimum, which conjugate gradients approach in few rounds without a learning rate (Hestenes
+//! and Stiefel 1952), each channel alone: a round renders every image once, forward and backward. Few rounds also keep
+//! what pixels hardly see from growing.
 //!
 //! Features of Gaussians as blended channels: Feature 3DGS (Zhou et al. 2024), which learns them by steps next to
 //! colours.
@@ -21,9 +21,9 @@ use splat4d::scene::{Planes, Table};
 
 /// Rounds by default.
 pub const ROUNDS: usize = 8;
-/// Most images of a round, evenly chosen: more say the same again.
+/// Most images of a round, evenly chosen: more add no information.
 pub const MOST_PICTURES: usize = 240;
-/// ε, weight in pixels of features that are 0: what no image shows has none.
+/// ε, weight in pixels of features that are 0: Gaussians that no image shows have none.
 const PRIOR: f64 = 1e-3;
 
 /// How well features are learnt.

@@ -1,4 +1,4 @@
-//! Labels of a trained scene, learnt from masks of labels in its training images while all else stays as it is.
+//! Labels of a trained scene, learnt from masks of labels in its training images with all else fixed.
 //!
 //! A Gaussian has a probability of each label, p_i. A pixel shows P = Σ w_i p_i / Σ w_i, w_i = α_i T_i, and the
 //! cross-entropy −Σ_pixels ln P_y, y the pixel's label, is made least by expectation and maximisation: p_ik becomes the
@@ -21,7 +21,7 @@ use splat4d::scene::{Planes, Table};
 
 /// Rounds by default: the cross-entropy of the bundled capture then changes by less than a percent a round.
 pub const ROUNDS: usize = 4;
-/// Most images of a round, evenly chosen: more say the same again.
+/// Most images of a round, evenly chosen: more add no information.
 pub const MOST_PICTURES: usize = 240;
 /// Weight in pixels of the even vote that every Gaussian has: what no image shows keeps no label.
 const PRIOR: f64 = 1e-3;
@@ -163,7 +163,7 @@ pub fn best(extra: &Planes<f32>, p: usize) -> Option<usize> {
     (extra.plane(count)[p] >= SEEN).then(|| (0..count).max_by(likelier)).flatten()
 }
 
-/// Draws the blended probabilities of a frame's view.
+/// Renders the blended probabilities of a frame's view.
 fn draw(work: &mut Blended, scene: &Scene<f32>, capture: &Capture, frame: usize) {
     work.draw(scene, capture, frame, |instant| label_columns(scene, instant).expect("the scene has labels"));
 }

@@ -79,13 +79,13 @@ impl Recipe {
     }
 
     /// The largest number of Gaussians, of the least that small captures have: what grows or shrinks with many
-    /// Gaussians goes by it. At least 1, and 1 for scenes that move, for which nothing else was measured.
+    /// Gaussians is divided by it. At least 1, and 1 for dynamic scenes, for which other values were not measured.
     pub(crate) fn crowd(&self) -> f64 {
         let many = self.run.motion == still::NAME && self.densify.max_cap > LEAST;
         if many { self.densify.max_cap as f64 / LEAST as f64 } else { 1.0 }
     }
 
-    /// Lets schedules that stand as they follow from the length follow from another one: what a run saved of them is
+    /// Lets schedules with the default for their length follow another length: what a run saved of them is
     /// set back, what was chosen otherwise stays.
     #[must_use]
     pub fn unresolved(&self) -> Self {

@@ -56,7 +56,7 @@ pub enum Range {
 }
 
 impl Range {
-    /// Whether a number lies in it.
+    /// Whether a number is in it.
     pub(crate) fn holds(self, x: f64) -> bool {
         x.is_finite()
             && match self {
@@ -73,7 +73,7 @@ impl Range {
 }
 
 impl std::fmt::Display for Range {
-    /// Stands behind "It must be".
+    /// Follows "It must be".
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::NotNegative => write!(f, "zero or a positive number"),

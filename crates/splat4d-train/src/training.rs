@@ -1,5 +1,5 @@
 //! Training from a program: a capture becomes a run folder, and the run is measured, in a few calls. The command's
-//! verbs `train` and `eval` stand on the same functions of [`train`](crate::run) and [`eval`](crate::eval).
+//! verbs `train` and `eval` use the same functions of [`train`](crate::run) and [`eval`](crate::eval).
 
 use crate::Result;
 use crate::capture::{Capture, ImageStore};

@@ -16,7 +16,7 @@ pub enum Aspect {
     NotFound,
     /// Files, keys or lines that are there and not used.
     NotRead,
-    /// What the capture does not state, and what was taken for it.
+    /// Assumptions about what the capture does not state.
     Assumed,
     /// A check that could not run, and why.
     NotChecked,
@@ -40,7 +40,7 @@ impl Aspect {
 /// One sentence or two, with numbers.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Remark {
-    /// What it is about.
+    /// Its subject.
     pub aspect: Aspect,
     /// How bad it is.
     pub severity: Severity,

@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 
 /// Every how many images one is held out where no rig and no convention states otherwise (LLFF's habit).
 const HOLD_EVERY: usize = 8;
-/// White: what transparent pixels are composited on by default (the papers' choice for D-NeRF).
+/// White: the default background of transparent pixels (the papers' choice for D-NeRF).
 const WHITE: [f32; 3] = [1.0; 3];
 
 /// Checks what a reader found and makes a capture of it.
@@ -131,7 +131,7 @@ fn unread_clouds(take: &mut RawCapture) {
     }
 }
 
-/// Points nearer than this share of all that a training camera sees may be wrong ones.
+/// Points nearer than this share of all points of a training camera may be outliers.
 const STRAY_POINTS: f64 = 0.01;
 /// Of the distance of the nearest points: Gaussians in front of them are still rendered.
 const BEFORE_POINTS: f64 = 0.5;
@@ -183,7 +183,7 @@ fn finish(raw: RawFrame, downscale: usize) -> Frame {
     }
 }
 
-/// The flows of all frames, each with the frame of its camera that comes next.
+/// The flows of all frames, each with the next frame of its camera.
 fn flows(frames: &mut [RawFrame]) -> Vec<Option<FlowFile>> {
     let numbers: BTreeMap<(usize, usize), usize> =
         frames.iter().enumerate().map(|(i, f)| ((f.camera, f.index), i)).collect();
@@ -248,7 +248,7 @@ fn rigs(take: &RawCapture) -> Vec<Rig> {
     take.cameras.iter().zip(fixed).map(|(name, fixed)| Rig { name: name.clone(), fixed }).collect()
 }
 
-/// Two fixed cameras with one pose are a slip of the hand: a copied matrix. Photos may be taken twice from one place,
+/// Two fixed cameras with one pose are a mistake, such as a copied matrix. Photos may be taken twice from one place,
 /// but what is measured then was learnt.
 fn check_poses(take: &mut RawCapture, cameras: &[Rig]) -> Result<()> {
     let mut first: BTreeMap<usize, &RawFrame> = BTreeMap::new();
@@ -282,7 +282,7 @@ fn check_poses(take: &mut RawCapture, cameras: &[Rig]) -> Result<()> {
     Ok(())
 }
 
-/// What training and measuring share is reported, not refused: published data sets do it.
+/// Images used for both training and evaluation are reported, not refused: published data sets do it.
 fn warn_of_shared(shared: usize, warnings: &mut Vec<String>) {
     if shared > 0 {
         warnings.push(format!(
@@ -360,7 +360,7 @@ fn skip_missing(take: &mut RawCapture, options: &CaptureOptions) -> Result<()> {
     Ok(())
 }
 
-/// Takes out frames that are listed twice: with one image, pose, time and purpose.
+/// Removes frames that are listed twice: with one image, pose, time and purpose.
 fn skip_repeated(take: &mut RawCapture) {
     let mut earlier: BTreeMap<&Path, Vec<usize>> = BTreeMap::new();
     let mut repeated = BTreeSet::new();
@@ -391,7 +391,7 @@ fn skip_repeated(take: &mut RawCapture) {
     take.frames.retain(|_| kept.next().unwrap_or(true));
 }
 
-/// Says which frames have one image and different poses: one of them shows something else.
+/// Reports frames with one image and different poses, of which one must be wrong.
 fn shared_images(take: &mut RawCapture) {
     let mut first: BTreeMap<&Path, usize> = BTreeMap::new();
     let mut twice = Vec::new();
@@ -498,7 +498,7 @@ fn fit_pictures(take: &mut RawCapture, options: &CaptureOptions) -> Result<(bool
     Ok((alpha, upright, unsure))
 }
 
-/// Says what was done with EXIF orientations of COLMAP's images, and of those whose sizes decide.
+/// Reports how EXIF orientations were applied to COLMAP's images, and to those whose sizes decide.
 fn report_orientation(take: &mut RawCapture, as_stored: usize, by_size: [usize; 2]) {
     let all = take.frames.len();
     let mut say = |n: usize, what: &str| {

@@ -29,7 +29,7 @@ impl Convention {
     /// NeRF's files: camera to world, OpenGL axes.
     pub(crate) const NERF: Self = Self { world_to_camera: false, opengl: true, quaternions: false };
 
-    /// `cam_from_world` in OpenCV axes of a pose as it is written.
+    /// `cam_from_world` in OpenCV axes of a pose as written.
     fn read(self, mut pose: Se3) -> Se3 {
         if self.world_to_camera {
             if self.opengl {

@@ -1,5 +1,5 @@
-//! Depth maps on disk: 16-bit grey PNG, `.npy` or OpenEXR; z along the camera's axis in scene units, or known up to a scale
-//! and a shift only, as networks predict it from a single image.
+//! Depth maps on disk: 16-bit grey PNG, `.npy` or OpenEXR; z along the camera's axis in scene units, or known up to a
+//! scale and a shift only, as networks predict it from a single image.
 //!
 //! In memory a map is that of the pinhole view, [height, width], and 0 where nothing is known.
 
@@ -97,7 +97,7 @@ pub(super) fn reduce(map: &[f32], width: usize, height: usize, k: usize) -> Vec<
     out
 }
 
-/// A map as its file has it, in scene units where it is metric.
+/// A map as stored, in scene units where it is metric.
 struct Map {
     width: usize,
     height: usize,

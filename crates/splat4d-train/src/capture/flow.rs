@@ -2,8 +2,8 @@
 //! 64 v + 32768, u right and v down in pixels, and blue is not zero where they are known; `.flo` (Baker et al. 2007,
 //! Middlebury) and `.npy`, as networks write them.
 //!
-//! A frame's file states where each of its pixels goes by the next frame of its camera. In memory all keep KITTI's code, for
-//! the pinhole view.
+//! A frame's file contains the displacement of its pixels to the next frame of its camera. In memory all keep KITTI's
+//! code, for the pinhole view.
 
 use super::json;
 use super::lens::Distortion;
@@ -32,7 +32,7 @@ pub struct FlowFile {
     pub path: PathBuf,
     /// The number, in `Capture::frames`, of the frame at which the pixels arrive: the next one of the same camera.
     pub to: usize,
-    /// Whether it is flow of the view, from this program, and not of the image as it is stored.
+    /// Whether it is flow of the view, from this program, and not of the stored image.
     pub of_view: bool,
 }
 

@@ -1,5 +1,5 @@
 //! Exports of capture programs and telephones: Metashape, RealityScan, Polycam, Record3D. Each is a file that states
-//! where poses and images are; what is common to them is here. They were built from public documentation and synthetic
+//! where poses and images are; shared code is here. They were built from public documentation and synthetic
 //! samples.
 
 mod metashape;
@@ -31,7 +31,7 @@ struct Export {
     read: fn(&Path, &Path, &CaptureOptions) -> Result<RawCapture>,
 }
 
-/// In the order in which they are searched for: those that are recognized by their content come last.
+/// In the order in which they are searched for: those that are recognised by their content are last.
 const EXPORTS: [Export; 4] = [polycam::EXPORT, record3d::EXPORT, metashape::EXPORT, realityscan::EXPORT];
 
 /// Reads the export in a folder, or that a file is. `None`: it is none.
@@ -62,7 +62,7 @@ struct Shot {
 /// What an export states in addition to its shots.
 struct Said {
     kind: CaptureKind,
-    /// What its poses are, as its program writes them.
+    /// Convention of its poses.
     convention: Convention,
     fps: Option<f64>,
     points: Option<PointCloud>,
@@ -204,7 +204,7 @@ fn only_points(root: &Path, notes: &mut Vec<String>) -> Result<Option<PointCloud
     }
 }
 
-/// Says how many images of an export have no pose.
+/// Reports how many images of an export have no pose.
 fn without_pose(count: usize, of: usize, warnings: &mut Vec<String>) {
     if count > 0 {
         warnings.push(format!("{count} of {of} images have no pose and are left out: they were not aligned."));

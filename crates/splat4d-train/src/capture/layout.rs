@@ -76,7 +76,7 @@ pub(super) fn read(path: &Path, options: &CaptureOptions) -> Result<RawCapture> 
     Ok(take)
 }
 
-/// Says which of several COLMAP models was read.
+/// Reports which of several COLMAP models was read.
 fn remark_models(take: &mut RawCapture, path: &Path, marker: &str, unread: &[&str]) {
     // One model as two files.
     let unread: Vec<&&str> =
@@ -139,7 +139,7 @@ pub(super) fn is_capture(folder: &Path) -> bool {
     READERS.iter().any(|(marker, _)| is_there(folder, &names, marker)) || foreign::is_there(folder)
 }
 
-/// Says which of several layouts was read, why, and how to choose another.
+/// Reports which of several layouts was read, why, and how to choose another.
 fn remark(take: &mut RawCapture, path: &Path, marker: &str, others: &[&str]) {
     // Files of one family describe the same images, and a model next to poses was asked for its points.
     let family = [transforms::TRAIN, transforms::ALL];

@@ -1,6 +1,6 @@
 //! Lens distortion, forwards and backwards, on normalised image coordinates (x/z, y/z).
 //!
-//! Radial polynomials fold back beyond some radius; rays beyond it never reach the sensor, so both directions say
+//! Radial polynomials fold back beyond some radius; rays beyond it never reach the sensor, so both directions return
 //! `None` there instead of inventing a pixel.
 
 use splat4d::scene::Lens;

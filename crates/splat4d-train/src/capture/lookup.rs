@@ -2,8 +2,8 @@
 //!
 //! Captures travel between programs and systems. Names then differ from the files by slashes, letter case, ending,
 //! Unicode normal form (macOS decomposes umlauts) and leading folders (absolute paths of another machine). The exact
-//! name goes first; else the one file that fits is taken, and one remark counts such names. Several files that fit are
-//! an error.
+//! name has priority; else the one file that fits is taken, and one remark counts such names. Several files that fit
+//! are an error.
 
 mod twins;
 
@@ -22,7 +22,7 @@ pub(super) use twins::Twins;
 /// What names of folders have in which other programs keep masks, whatever white means there.
 const MASK_WORDS: [&str; 3] = ["mask", "matte", "segment"];
 
-/// Folders in which images usually lie, below that of the capture.
+/// Folders that usually contain images, below that of the capture.
 const IMAGE_FOLDERS: [&str; 3] = ["images", "input", "image"];
 /// How names of folders begin that hold other things than images, though their files may be called like these.
 const NO_IMAGES: [&str; 5] = ["depth", "normal", "seg", "flow", "."];
@@ -66,7 +66,7 @@ struct Listing {
     stems: BTreeMap<String, Vec<String>>,
 }
 
-/// Looks files up below a capture's folder.
+/// Finds files below a capture's folder.
 pub(super) struct Lookup {
     root: PathBuf,
     /// The folder of images that the user chose.
@@ -79,7 +79,7 @@ pub(super) struct Lookup {
     bare: RefCell<BTreeMap<PathBuf, Vec<String>>>,
 }
 
-/// A name as all its spellings have it: composed (NFC) and in lower case.
+/// A name's canonical form: composed (NFC) and in lower case.
 pub(super) fn fold(name: &str) -> String {
     if name.is_ascii() { name.to_ascii_lowercase() } else { name.nfc().collect::<String>().to_lowercase() }
 }
@@ -383,7 +383,7 @@ impl Lookup {
         add(Way::Unicode, a != b && fold(a) == fold(b) && a.to_lowercase() != b.to_lowercase());
     }
 
-    /// Says in one remark which names were not exact.
+    /// Reports in one remark which names were not exact.
     pub(super) fn report(&self, account: &mut Account) {
         let bare = self.bare.borrow();
         if let Some((file, others)) = bare.iter().next() {
@@ -446,7 +446,7 @@ pub(super) fn unreadable(image: &Path) -> Option<PathBuf> {
     images.next().map(|name| folder.join(name))
 }
 
-/// Whether a name is that of a folder in which images usually lie.
+/// Whether a name is that of a folder that usually contains images.
 pub(super) fn is_image_folder(name: &str) -> bool {
     IMAGE_FOLDERS.contains(&name) || reduction(name).is_some()
 }

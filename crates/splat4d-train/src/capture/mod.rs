@@ -82,7 +82,7 @@ use std::sync::Arc;
 type Reader = fn(&Path, &Path, &CaptureOptions) -> Result<RawCapture>;
 
 /// The list of layouts: a reader is its file, its name in [`CaptureKind`] and an entry here. Marker files (or folders)
-/// in the order in which they are looked for, with their readers.
+/// in search order, with their readers.
 const READERS: &[(&str, Reader)] = &[
     ("capture.json", own::read),
     (transforms::TRAIN, transforms::read),
@@ -152,9 +152,9 @@ pub struct Frame {
     pub upright: bool,
     /// The foreground mask file (white = foreground).
     pub mask: Option<PathBuf>,
-    /// How far away what its pixels show is.
+    /// Its depth map.
     pub depth: Option<DepthFile>,
-    /// Where its pixels go.
+    /// Its optical flow.
     pub flow: Option<FlowFile>,
     /// The mask of labels: its values number [`Capture::labels`].
     pub labels: Option<PathBuf>,
@@ -167,7 +167,7 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// Whether it is known where its pixels go.
+    /// Whether its optical flow is known.
     pub fn has_flow(&self) -> bool {
         self.flow.is_some()
     }
@@ -397,7 +397,7 @@ impl Capture {
         times
     }
 
-    /// Adds points to its own, and renders as near as they come; `near`: as [`CaptureOptions::near`].
+    /// Adds points to its own, and lowers the near plane to the nearest; `near`: as [`CaptureOptions::near`].
     pub(crate) fn add_points(&mut self, mut more: PointCloud, near: f64) {
         let points = self.points.get_or_insert_default();
         points.points.append(&mut more.points);
@@ -460,7 +460,7 @@ pub fn is_metadata(path: &Path) -> bool {
     layout::is_metadata(path)
 }
 
-/// Whether a folder holds a capture, by the files in it; whether they can be read is not said.
+/// Whether a folder holds a capture, by the files in it; they need not be readable.
 pub fn is_folder(path: &Path) -> bool {
     path.is_dir() && layout::is_capture(path)
 }

@@ -34,7 +34,7 @@ struct Folder {
     images: Vec<PathBuf>,
 }
 
-/// Whether this looks like an N3DV take rather than a single-camera LLFF folder.
+/// Whether this is probably an N3DV take and not a single-camera LLFF folder.
 pub(super) fn applies(root: &Path) -> bool {
     !folders(root).is_empty() || !videos(root).is_empty()
 }

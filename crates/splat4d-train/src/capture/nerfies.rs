@@ -2,9 +2,9 @@
 //! `scene.json`, `points.npy`, and images in `rgb/1x` or smaller.
 //!
 //! A camera file holds `orientation` (world to camera, OpenCV axes), `position` (its centre), `focal_length`,
-//! `pixel_aspect_ratio`, `principal_point`, `radial_distortion`, `tangential_distortion` and `image_size` [width, height] of
-//! the images at 1x. `scene.json` brings the world to about a unit: x becomes (x − center)·scale, cameras and points
-//! alike.
+//! `pixel_aspect_ratio`, `principal_point`, `radial_distortion`, `tangential_distortion` and `image_size` [width,
+//! height] of the images at 1x. `scene.json` brings the world to about a unit: x becomes (x − center)·scale, cameras
+//! and points alike.
 
 use super::account::Severity;
 use super::account::{Account, Aspect, first_names};
@@ -73,7 +73,7 @@ struct Lists {
 }
 
 impl Lists {
-    /// From `dataset.json`, and DyCheck's `splits/train.json` and `splits/val.json`, which go first.
+    /// From `dataset.json`, and DyCheck's `splits/train.json` and `splits/val.json`, which have priority.
     fn read(root: &Path, marker: &Path, account: &mut Account) -> Result<Self> {
         let list = |path: &Path, key: &str| -> Result<Vec<String>> {
             let value = json::read(path)?;

@@ -11,8 +11,8 @@ impl Capture {
     /// [`future`](Self::future), whatever its purpose was. `near`: as [`CaptureOptions::near`](super::CaptureOptions).
     ///
     /// A frame is observed where its time is at most first + share · (last − first) of the training and held-out
-    /// frames. With later images go what belongs to them: initial points with later times, and optical flow into the
-    /// future. A capture's own points without times are taken at their word. Errors: one time, a share that leaves
+    /// frames. Removing later images also removes their priors: initial points with later times, and optical flow into
+    /// the future. A capture's own points without times are taken at their word. Errors: one time, a share that leaves
     /// nothing.
     pub(crate) fn observe(&mut self, share: f64, near: f64) -> Result<()> {
         let place = |e: Error| e.at(format!("{} (capture.observe = {share})", self.root.display()));

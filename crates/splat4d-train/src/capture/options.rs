@@ -1,4 +1,4 @@
-//! Options of a capture in addition to where it lies.
+//! Options of a capture next to its path.
 
 use super::convention::Poses;
 use crate::settings::{Value, choices, settings};
@@ -11,7 +11,7 @@ use std::sync::Arc;
 /// A lens: size, orientation and intrinsics of its images, in hundredths of a pixel.
 pub(super) type Lens100 = Vec<i64>;
 
-/// What the lenses of a capture recorded, as far as they were looked at.
+/// Image areas that the lenses of a capture recorded, as far as examined.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Lenses(pub(super) BTreeMap<Lens100, Option<Arc<Vec<u8>>>>);
 
@@ -76,13 +76,14 @@ impl Value for Option<HoldOut> {
     }
 }
 
-/// Default of `capture.near`: a camera that is mounted in a wall looks through the wall's own splats, and haze in
-/// front of places where no training camera stands costs nothing. PanopticSports basketball, four minutes, held-out
-/// cameras: 27.1 dB with 0.05 (Kerbl et al. 2023 draw nothing nearer than 0.2 units, about that share), 28.1 with this.
+/// Default of `capture.near`: a camera that is mounted in a wall is behind the wall's own splats, and haze in
+/// front of places where no training camera is costs nothing. PanopticSports basketball, four minutes, held-out
+/// cameras: 27.1 dB with 0.05 (Kerbl et al. 2023 render nothing nearer than 0.2 units, about that share), 28.1 with
+/// this.
 const NEAR: f64 = 0.2;
 
 choices! {
-    /// What images are that state no times.
+    /// How to interpret images without times.
     pub enum Sequence {
         /// By their names: a film where they are numbered like its frames, else photos.
         Auto = "auto",
@@ -170,7 +171,7 @@ settings! {
         /// Near distance of cameras, of the extent; less if the capture's points are nearer, a quarter of it without
         /// points.
         near: f64 = NEAR => below_one().unit("extents");
-        /// Share of the clip that training sees; later frames only score forecasts. 1: all.
+        /// Share of the clip for training; later frames only score forecasts. 1: all.
         observe: f64 = 1.0 => share();
         /// Folder of images instead of the capture's, such as "images_4"; empty: the capture's.
         images: Text = Text::default();
@@ -199,13 +200,13 @@ settings! {
 /// How a capture is read. `CaptureOptions::default()` follows the data set's own conventions.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CaptureOptions {
-    /// Images become means of k×k boxes; 1 leaves them as they are. Rows and columns that fill no box are cut off.
+    /// Images become means of k×k boxes; 1 keeps them. Rows and columns that fill no box are cut off.
     pub downscale: usize,
     /// Held-out frames; `None` follows the data set's convention.
     pub hold_out: Option<HoldOut>,
     /// Frames per second; `None` takes what the capture states, else 30. Scales the clock of D-NeRF captures too.
     pub fps: Option<f64>,
-    /// What images are that state no times.
+    /// How to interpret images without times.
     pub sequence: Sequence,
     /// The background of transparent pixels, sRGB from 0 to 1; `None` takes the capture's own, else white.
     pub background: Option<[f32; 3]>,
@@ -219,7 +220,7 @@ pub struct CaptureOptions {
     pub near: f64,
     /// The folder of images below the capture's, in place of the one that the capture names.
     pub images: Option<String>,
-    /// What poses are written as where it is not what the layout states.
+    /// Convention of the poses if it is not that of the layout.
     pub poses: Poses,
     /// Whose pixels poses and intrinsics describe.
     pub exif: Exif,
@@ -233,9 +234,9 @@ pub struct CaptureOptions {
     pub max_missing: f64,
     /// Only images with these frame numbers are listed, so that memory does not grow with the capture; empty: all. What
     /// they
-    /// are for (training, held out) is what it is in the whole capture.
+    /// are for (training, held out) is as in the whole capture.
     pub frames: Vec<Range<usize>>,
-    /// What is known of the lenses already, from another part of the capture; else images are looked at.
+    /// Known properties of the lenses, from another part of the capture; else images are examined.
     pub lenses: Lenses,
 }
 

@@ -108,7 +108,7 @@ fn view(frame: &RawFrame, turn: &[[f64; 3]; 3], size: [usize; 2]) -> RawFrame {
     RawFrame { mask: frame.mask.clone(), split: frame.split, ..RawFrame::new(place, source, frame.image.clone()) }
 }
 
-/// The camera of the stored image, as far as its size goes: of a panorama the whole of it.
+/// The camera of the stored image, by its size: of a panorama the whole of it.
 pub(super) fn stored(source: &Camera) -> Camera {
     match source.lens {
         Lens::Equirectangular { size: [width, height], .. } => Camera { width, height, ..source.clone() },

@@ -18,7 +18,7 @@ pub(super) struct Header {
     pub stored: (usize, usize),
     /// Whether there is an alpha channel.
     pub alpha: bool,
-    /// What EXIF states is to be done with the pixels.
+    /// Orientation of the pixels from EXIF.
     orientation: Orientation,
 }
 

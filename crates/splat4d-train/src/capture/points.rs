@@ -35,7 +35,7 @@ pub(super) fn white_of(colors: impl Iterator<Item = f32>) -> f32 {
     if 2 * above > all { 255.0 } else { 1.0 }
 }
 
-/// Names that MeshLab, VisualSFM and others give to colours, and what they are otherwise called.
+/// Names that MeshLab, VisualSFM and others give to colours, and the usual names.
 const COLOR_PREFIX: &[u8] = b" diffuse_";
 /// Bytes in which the header of a cloud ends: few properties are usual.
 const HEADER: usize = 1 << 14;
@@ -108,7 +108,7 @@ impl PointCloud {
         }
     }
 
-    /// All of it as a binary .ply file, from which it comes back bit by bit; `comment`: lines for its header.
+    /// All of it as a binary .ply file, which restores it exactly; `comment`: lines for its header.
     pub fn to_ply(&self, comment: &str) -> Vec<u8> {
         let mut out = format!(
             "ply\nformat binary_little_endian 1.0\n{comment}\nelement vertex {}\nproperty double x\nproperty double y\n\
@@ -125,7 +125,7 @@ impl PointCloud {
     }
 
     /// Thins the cloud to at most `max_points`: the finest voxel grid that leaves few enough cells, and the mean of
-    /// position and colour in each. The same cloud always gives the same result; small clouds come back unchanged.
+    /// position and colour in each. The same cloud always gives the same result; small clouds are returned unchanged.
     /// Points of different time stay apart (a cell holds one time, taken from its first point, per time value).
     pub(crate) fn voxel_downsample(&self, max_points: usize) -> Self {
         let n = self.points.len();

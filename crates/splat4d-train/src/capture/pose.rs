@@ -91,7 +91,7 @@ pub(super) fn check_size(width: usize, height: usize) -> Result<()> {
         .remedy(format!("Sides must be 1 to {MAX_SIDE} pixels, at most {MAX_PIXELS} in all.")))
 }
 
-/// Whether two cameras are at one place and look the same way.
+/// Whether two cameras have one position and one orientation.
 pub(super) fn same_pose(a: &Camera, b: &Camera) -> bool {
     let (p, q) = (&a.cam_from_world, &b.cam_from_world);
     let turn = p.rotation.iter().flatten().zip(q.rotation.iter().flatten()).map(|(x, y)| (x - y).abs());

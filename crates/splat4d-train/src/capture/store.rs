@@ -28,14 +28,14 @@ pub struct Picture {
     /// [1, height, width] part of the pixel that the original image covers, where undistortion left borders. Colour
     /// there is meaningless; losses and measurements must leave those pixels out.
     pub valid: Option<Planes<f32>>,
-    /// [1, height, width] the depth of what pixels show, 0 where it is not known, and what kind of depth it is.
+    /// [1, height, width] depths of pixels, 0 where unknown, and their kind.
     pub depth: Option<(Planes<f32>, DepthKind)>,
-    /// [3, height, width] where its pixels go by the next frame of its camera: u right, v down in pixels, and 1 where
+    /// [3, height, width] optical flow to the next frame of its camera: u right, v down in pixels, and 1 where
     /// they are known.
     pub flow: Option<Planes<f32>>,
 }
 
-/// A loaded image as it is kept: planes of 8 or 16 bits.
+/// A loaded image in memory: planes of 8 or 16 bits.
 #[derive(PartialEq)]
 pub struct StoredPicture {
     width: usize,
@@ -79,7 +79,7 @@ impl StoredPicture {
         self.weights_into(self.valid.as_deref(), out)
     }
 
-    /// Writes the depth as [1, height, width] and states what kind it is; `None` (and `out` untouched) if there is
+    /// Writes the depth as [1, height, width] and returns its kind; `None` (and `out` untouched) if there is
     /// none.
     pub(crate) fn depth_into(&self, out: &mut Planes<f32>) -> Option<DepthKind> {
         let (values, kind) = self.depth.as_ref()?;
@@ -162,8 +162,8 @@ impl std::fmt::Debug for StoredPicture {
 
 /// A cache of decoded images that never exceeds its byte budget.
 ///
-/// The least recently used image goes first. Images in use by callers (their `Arc`s) and the one being decoded are
-/// not counted; an image larger than the whole budget is handed out without being kept.
+/// The least recently used image is evicted first. Images in use by callers (their `Arc`s) and the one being decoded
+/// are not counted; an image larger than the whole budget is handed out without being kept.
 pub struct ImageStore {
     shared: Arc<Shared>,
     worker: Mutex<Option<JoinHandle<()>>>,
@@ -243,13 +243,13 @@ impl ImageStore {
         self.shared.lock().bytes
     }
 
-    /// Most bytes of images kept at any time so far; at most the budget.
+    /// Peak bytes of images in memory; at most the budget.
     #[cfg(test)]
     pub(crate) fn peak_bytes(&self) -> usize {
         self.shared.lock().peak
     }
 
-    /// How many images were decoded so far.
+    /// Number of decoded images.
     #[cfg(test)]
     pub(crate) fn decoded(&self) -> usize {
         self.shared.lock().loads

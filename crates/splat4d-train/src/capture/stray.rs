@@ -1,5 +1,5 @@
-//! What a folder holds that is no capture, and the way from there to one: archives, captures above and below, files under
-//! other names, images and videos without poses.
+//! Content of a folder that is not a capture, and how to make one of it: archives, captures above and below, files
+//! under other names, images and videos without poses.
 
 use super::account::first_names;
 use super::{colmap, lookup, rig, sequence};
@@ -7,7 +7,7 @@ use crate::path_text::in_command;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-/// Where the videos of a rig often lie.
+/// Usual folders of a rig's videos.
 const VIDEO_FOLDER: &str = "videos";
 const VIDEO_ENDINGS: &[&str] = &["mp4", "mov", "mkv", "avi", "webm"];
 const ARCHIVE_ENDINGS: &[&str] = &["zip", "7z", "rar", "tar", "tgz", "gz", "r3d"];
@@ -21,11 +21,11 @@ const CHECKPOINTS: &str = "nerfstudio_models";
 const SCENE_ENDINGS: &[&str] = &["ply", "spz", "splat", "splatv", "sog", "ksplat", "glb", "s4d", "pt", "ckpt"];
 /// Bytes of a JSON file in which its keys are searched for.
 const HEAD: u64 = 1 << 16;
-/// Folders that are looked into for a capture.
+/// Folders that are searched for a capture.
 const MOST_FOLDERS: usize = 100;
 
-/// What to do with a folder that is no capture, which the user called `named`, by what it holds. `None`: it holds nothing
-/// that is known.
+/// What to do with a folder that is no capture, which the user called `named`, by what it holds. `None`: it holds
+/// nothing that is known.
 pub(super) fn advice(root: &Path, named: &Path, is_capture: &dyn Fn(&Path) -> bool) -> Option<String> {
     let names = rig::file_names(root);
     let folders = || names.iter().map(|n| root.join(n)).filter(|p| p.is_dir()).take(MOST_FOLDERS);

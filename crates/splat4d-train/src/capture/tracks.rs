@@ -80,7 +80,7 @@ impl Tracks {
         })
     }
 
-    /// A place as the view of its frame has it, pixels; `None`: no ray ends there.
+    /// A position in the pixels of its frame's view; `None`: no ray ends there.
     pub(crate) fn in_view(&self, place: [f32; 2], source: &Camera, view: &Camera) -> Option<[f64; 2]> {
         let (a, b) = (&source.intrinsics, &view.intrinsics);
         let [x, y] =

@@ -18,9 +18,9 @@ use splat4d::render::Antialias;
 use splat4d::scene::Camera;
 use std::sync::Arc;
 
-/// Fine-tuning begins where a run's rates were after this share of it: what pruning left has its place already.
+/// Fine-tuning begins where a run's rates were after this share of it: the remaining Gaussians are already in position.
 const REWIND: f64 = 0.8;
-/// Rates that training keeps constant fall to this share of themselves, so that the scene comes to rest.
+/// Rates that training keeps constant fall to this share of themselves, so that the scene converges.
 const REST: f64 = 0.1;
 /// Rates of fine-tuning through the file, of those with which training ended.
 const FILE_RATES: f64 = 0.5;
@@ -86,13 +86,13 @@ fn host_stage(prepared: &Prepared, steps: usize) -> Result<Stage> {
     Ok(stage)
 }
 
-/// A rate of training as fine-tuning has it.
+/// A rate of training, converted for fine-tuning.
 fn settling(rate: Rate, share: f64) -> Rate {
     let start = share * rate.at(REWIND);
     Rate { start, end: (share * rate.end).min(start * REST) }
 }
 
-/// The loss that lets Gaussians fade that no view asks for.
+/// The loss that lets Gaussians fade that no view needs.
 fn fading(settings: &Compression) -> Option<Box<dyn ParamLoss<f32>>> {
     let weight = settings.opacity_reg;
     (weight > 0.0).then(|| Box::new(MeanOpacity { weight }) as Box<dyn ParamLoss<f32>>)

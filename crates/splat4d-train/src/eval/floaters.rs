@@ -1,15 +1,15 @@
-//! Floaters: Gaussians that hang before few cameras. They are recognized by what their removal does to every image.
+//! Floaters: Gaussians in front of few cameras. They are recognised by the effect of their removal on every image.
 //!
 //! With L = Σ over pixels and channels of (I − T)² between render I and truth T, and r_i the part of the render that is
 //! lost without Gaussian i, removing it alone changes L by
 //!
 //! > Δ_i = Σ (I − r_i − T)² − Σ (I − T)² = Σ r_i² − 2 Σ r_i (I − T) = removal_i − o_i ∂L/∂o_i,
 //!
-//! because r_i is linear in the opacity o_i: two numbers that the renderer knows. A training camera *supports* a
+//! because r_i is linear in the opacity o_i: two numbers from the renderer. A training camera *supports* a
 //! Gaussian that it would miss. A floater is seen, supported by a small share of the cameras that see it, not missed by
 //! held-out cameras, and all images together are better without it. That much holds for some Gaussians of every scene,
 //! whose images are never quite right, so that it must also matter to a camera. What removing the Gaussian gains there
-//! is −Δ; what removing as much as is best of what it shows would gain, were there more of it, is
+//! is −Δ; the gain from removing the best amount of it, if there were more, is
 //!
 //! > max_a Σ (I − T)² − Σ (I − T − a r)² = (Σ r (I − T))² / Σ r² = (Σ r² − Δ)² / (4 Σ r²),
 //!
@@ -50,7 +50,7 @@ pub struct Support {
     pub seen: u32,
     /// Training cameras that would miss it.
     pub missed: u32,
-    /// How much it matters to the training camera that sees it to which it matters most, in squared error; zero where
+    /// Its largest effect on any training camera that sees it, in squared error; zero where
     /// no camera is better without it.
     pub matters: f64,
     /// Σ Δ over held-out images; below zero they are better without it.

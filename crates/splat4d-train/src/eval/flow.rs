@@ -21,7 +21,7 @@ pub(crate) const WITHIN: [f64; 3] = [1.0, 3.0, 5.0];
 pub struct FlowError {
     /// Images that were measured.
     pub pictures: usize,
-    /// Whether they were held out; else no held-out image knows its flow, and those of training stand in.
+    /// Whether they were held out; else no held-out image has flow, and training images are used.
     pub held: bool,
     /// Mean end-point error, pixels.
     pub mean: f64,
@@ -29,7 +29,7 @@ pub struct FlowError {
     pub median: f64,
     /// Mean end-point error of pixels that move by more than half a pixel; `None`: none does.
     pub moving: Option<f64>,
-    /// Mean length of their known flow: the error of saying that nothing moves.
+    /// Mean length of their known flow: the error of predicting no motion.
     pub length: Option<f64>,
     /// Share of all pixels within 1, 3 and 5 pixels.
     pub within: [f64; 3],
@@ -37,8 +37,8 @@ pub struct FlowError {
     pub drawn: f64,
 }
 
-/// Measures a scene on the held-out views that know their flow, or where there are none on those of training. `None`:
-/// none knows its flow.
+/// Measures a scene on the held-out views with known flow, or else on those of training. `None`:
+/// none has flow.
 ///
 /// Errors: a file of flow that cannot be read.
 pub fn flow_error(scene: &Scene<f32>, capture: &Capture) -> Result<Option<FlowError>> {

@@ -48,7 +48,7 @@ const FOCAL: usize = 7;
 /// (docs/refine.md).
 pub const SURE: f64 = 1.0 / 3.0;
 
-/// What is asked.
+/// The query.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Question {
     /// How the scene is rendered.
@@ -164,7 +164,7 @@ impl Search<'_> {
         Ok(out)
     }
 
-    /// Renders what a candidate sees, in an image so many times smaller.
+    /// Renders a candidate's view, in an image reduced by this factor.
     fn draw(&mut self, candidate: &Candidate, times: usize, depth: bool) -> Result<&Image<f32>> {
         self.scene.at(Time(candidate.time), &mut self.instant);
         let splats = self.scene.splats(&self.instant);
@@ -178,7 +178,7 @@ impl Search<'_> {
         Ok(Compared::of(&self.draw(candidate, times, false)?.color, picture))
     }
 
-    /// Moves a candidate to where it sees what the image shows.
+    /// Moves a candidate to the pose that fits the image.
     fn follow(&mut self, candidate: &mut Candidate, picture: &Planes<f32>, times: usize) -> Result<()> {
         let sizes = self.sizes(candidate, times)?;
         let asked: Vec<usize> = (0..UNKNOWN).filter(|&k| sizes[k] > 0.0).collect();
@@ -218,7 +218,7 @@ impl Search<'_> {
         Ok(())
     }
 
-    /// How far each number goes for what is seen to move by [`DIFFERENCE`] pixels; 0: it is not searched for.
+    /// Change of each parameter that moves the image by [`DIFFERENCE`] pixels; 0: the parameter is fixed.
     fn sizes(&mut self, candidate: &Candidate, times: usize) -> Result<[f64; UNKNOWN]> {
         let drawn = self.draw(candidate, times, true)?;
         let solid = |(alpha, depth): (&f32, &f32)| (*alpha > SOLID).then(|| depth / alpha);

@@ -168,7 +168,7 @@ fn add_notes(to: &mut Map<String, Value>, notes: Map<String, Value>) {
 pub struct Conditions {
     /// `test`, `val` or `train`.
     pub split: &'static str,
-    /// What transparent pixels are composited on, sRGB from 0 to 1, in renders and truth; null: images have no alpha.
+    /// Background of transparent pixels, sRGB from 0 to 1, in renders and truth; null: images have no alpha.
     pub background: Option<[f32; 3]>,
     /// Instructions of the kernels: `scalar`, `avx2`, `avx512` or `neon`. Levels round differently.
     pub simd: &'static str,

@@ -1,5 +1,5 @@
 //! Evaluation of a scene on a capture: every held-out view is rendered and compared with its image, a few training
-//! views too; scores, images and a summary are written as 3DGS users know them.
+//! views too; scores, images and a summary are written in the files of 3DGS.
 //!
 //! | file | content |
 //! |---|---|
@@ -45,7 +45,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 const TRAIN_VIEWS: usize = 24;
 /// A mean difference of the channels as large as this is the last colour of an error image.
 const ERROR_FULL: f32 = 0.25;
-/// What renders: figures are the CPU renderer's, which defines what others draw.
+/// The renderer: figures are the CPU renderer's, which defines the result of the others.
 const DEVICE: &str = "CPU";
 /// Mask values above this are foreground.
 const FOREGROUND: f32 = 0.5;
@@ -97,8 +97,8 @@ pub struct EvalOptions {
     pub train_views: usize,
     /// The views that are measured.
     pub measured: Measured,
-    /// Where results and images go in their files: `None` for the held-out views on the run's own background, which are
-    /// what a run is judged by; otherwise the name of an entry, such as `val` or `test-black`.
+    /// Prefix of results and images in their files: `None` for the held-out views on the run's own background, which
+    /// are what a run is judged by; otherwise the name of an entry, such as `val` or `test-black`.
     pub place: Option<String>,
     /// How held-out views are aligned, to be measured a second time (`PSNR-aligned`); `None`: not.
     pub align: Option<Align>,

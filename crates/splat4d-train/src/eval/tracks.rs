@@ -1,9 +1,9 @@
-//! 3D error of tracks against known ones: captures that were rendered come with the true paths of points of their
+//! 3D error of tracks against known ones: rendered captures contain the true paths of points of their
 //! surfaces.
 //!
 //! `truth/tracks.npy` holds float32 [frames, points, 3], world positions. Every point at the first frame is a query, as
 //! in benchmarks of point tracking: the few Gaussians nearest to it then carry it on by their mean displacement, and
-//! the error is its distance to the truth at all later frames. Next to it stands the error of the nearest Gaussian
+//! the error is its distance to the truth at all later frames. The error of the nearest Gaussian is reported next to it
 //! itself, its
 //! distance at the first frame included (the median trajectory error of Luiten et al. 2024). Times at which none of a
 //! point's Gaussians is alive are not counted, but the share that is counted is reported.
@@ -163,7 +163,7 @@ mod tests {
     fn points_are_carried_by_the_gaussians_that_were_nearest_at_first() {
         let mut params = Params::new(3, 1, &[]);
         let times = vec![0.0, 0.1, 0.2];
-        // The last one is faint and is in the way.
+        // The last one is faint and occludes.
         for (r, o) in [(0, 3.0), (1, 3.0), (2, -3.0)] {
             params[GEOMETRY].write(r, 0, [r as f32, 0.0, 0.0, 1.0]);
             params[GEOMETRY].set(r, OPACITY, o);

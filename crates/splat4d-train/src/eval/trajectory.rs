@@ -1,4 +1,4 @@
-//! Where cameras were found, against where they are known to be: absolute and relative trajectory error, and clocks.
+//! Estimated against known camera poses: absolute and relative trajectory error, and clocks.
 
 use super::run::merge;
 use crate::capture::Capture;
@@ -53,7 +53,7 @@ impl TrajectoryError {
 /// knows. Fixed cameras have one pose, of moving ones every image has its own. Neighbours for the relative error are
 /// images of one moving camera, and fixed cameras in the capture's order.
 ///
-/// Errors: fewer than three cameras have a truth, or stand in different places.
+/// Errors: fewer than three cameras have a ground truth, or differ in position.
 pub fn trajectory_error(found: &Capture, truth: &Capture) -> Result<TrajectoryError> {
     let mut known: BTreeMap<(&str, usize), usize> = BTreeMap::new();
     for (i, frame) in truth.frames.iter().enumerate() {

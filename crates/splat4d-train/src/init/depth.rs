@@ -1,6 +1,7 @@
 //! Points that depth maps show: pixels of training images, unprojected. A point through which an image of another time
-//! sees what is farther away belongs to something that moves: it lives about its time, and begins with the velocity
-//! that optical flow and the depth at both of its ends determine ([`super::scene_flow`]). All others are static.
+//! sees what is farther away belongs to something that moves: its lifespan is around its time, and it begins with the
+//! velocity that optical flow and the depth at both of its ends determine ([`super::scene_flow`]). All others are
+//! static.
 
 use super::map::Map;
 use super::{Seeds, scene_flow};
@@ -14,9 +15,9 @@ use std::f64::consts::TAU;
 const VIEWS: usize = 100;
 /// Points per requested one that are static.
 const CANDIDATES: usize = 4;
-/// Pixels of an image of which is asked whether they move, at most.
+/// Pixels of an image that are tested for motion, at most.
 const ASKED: usize = 20_000;
-/// As a share of the requested points, those on dynamic regions that are alive at a time: lives are as wide as that
+/// As a share of the requested points, those on dynamic regions that are alive at a time: lifespans are as wide as that
 /// takes, within bounds in times between times. Shorter ones leave holes between times; over longer ones velocities
 /// change.
 const ALIVE_SHARE: f64 = 0.15;

@@ -1,4 +1,4 @@
-//! Points between the points: where a capture brings few, every camera sees surfaces that continue from one to the
+//! Points between the points: if a capture has few, every camera sees surfaces that continue from one to the
 //! next.
 //!
 //! Structure from motion finds points where there is texture. Gaussians that have to spread from there over plain walls

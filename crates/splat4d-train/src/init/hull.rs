@@ -17,14 +17,14 @@ const CANDIDATES: usize = 40;
 const ROUNDS: u64 = 4;
 /// The next round's box is this much larger on every side than what was kept.
 const MARGIN: f64 = 0.05;
-/// A point may be outside this share of the silhouettes that see it: masks have ragged edges, and what moves has holes
-/// where it looks like what is behind it (0.25 gave more ghosts: 0.3 dB less where nothing moves).
+/// A point may be outside this share of the silhouettes that see it: masks have ragged edges, and moving objects have
+/// holes where they resemble the background (0.25 gave more ghosts: 0.3 dB less in static regions).
 const MISSES: f64 = 0.05;
 const MOVING_MISSES: f64 = 0.15;
 /// Points of dynamic regions, of those that are requested: all of them took Gaussians away from the static background
-/// (0.4 dB less there, as good where things move).
+/// (0.4 dB less there, no gain in dynamic ones).
 const MOVING_SHARE: f64 = 0.3;
-/// What moves is grown by so many pixels, since it hides the edges of what is behind it.
+/// Moving regions are dilated by this many pixels, because they hide the edges behind them.
 const GROWN: usize = 1;
 /// Cameras that must see something move for its hull to be more than a cone: of four the hull was worse than nothing.
 const MOVING_CAMERAS: usize = 5;
@@ -171,8 +171,8 @@ struct Silhouettes<'a> {
     shown: &'a Shown<'a>,
 }
 
-/// Carves one time in rounds: each looks only in the box of what the last one kept, so that a small object in a large
-/// volume still gets its points.
+/// Carves one time in rounds: each searches only the box of the points that the last one kept, so that a small object
+/// in a large volume still gets its points.
 fn carve_moment(silhouettes: &Silhouettes<'_>, volume: &Volume, wanted: usize, rng: Rng) -> Result<Seeds> {
     let mut low = volume.center.map(|c| c - volume.radius);
     let mut high = volume.center.map(|c| c + volume.radius);
@@ -204,7 +204,7 @@ fn carve_moment(silhouettes: &Silhouettes<'_>, volume: &Volume, wanted: usize, r
     Ok(out)
 }
 
-/// The images' votes so far on one point.
+/// The images' votes on one point.
 #[derive(Clone, Default)]
 struct Votes {
     views: usize,

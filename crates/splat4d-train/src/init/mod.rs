@@ -114,9 +114,9 @@ settings! {
     }
 }
 
-/// Initial Gaussians where [`InitSettings::count`] is 0: what small captures are tuned for (docs/suite.md). A static
-/// scene of many Gaussians has a third of them at once: a real room at half size gains 0.3 dB by half of them in the
-/// same steps, at an eighth more time (studies/records/2026-11-27-real-size.md).
+/// Initial Gaussians where [`InitSettings::count`] is 0: the number that small captures are tuned for (docs/suite.md).
+/// A static scene of many Gaussians starts with a third of them: a real room at half size gains 0.3 dB by half of them
+/// in the same steps, at an eighth more time (studies/records/2026-11-27-real-size.md).
 pub(crate) const COUNT: usize = 10_000;
 
 /// Where the first Gaussians are.
@@ -171,7 +171,7 @@ impl Value for Source {
 
 /// A random colour would have to be unlearnt; grey is the least wrong.
 const UNKNOWN_COLOR: [f32; 3] = [0.5; 3];
-/// A lifespan this many clips wide is practically forever: at the clip's ends σ is still above 0.96.
+/// A lifespan this many clips wide is practically infinite: at the clip's ends σ is still above 0.96.
 const LONG_LIFE_CLIPS: f64 = 2.0;
 /// One keyframe of initial points about every so many frames.
 const FRAMES_PER_KEYFRAME: usize = 5;
@@ -257,8 +257,8 @@ pub fn seeds(
     Ok(out)
 }
 
-/// Initial points for Gaussians that live through the whole clip: those of its middle, where what moves is on average
-/// nearest to where it will be.
+/// Initial points for Gaussians that are alive during the whole clip: those of its middle, where moving objects are on
+/// average nearest to where it will be.
 pub(crate) fn one_moment(
     plan: &TrainContext,
     settings: &InitSettings,

@@ -1,4 +1,4 @@
-//! Features: places that look alike from other cameras, and what they look like (Lowe 2004, SIFT).
+//! Features: image positions that can be recognised from other cameras, and their descriptors (Lowe 2004, SIFT).
 //!
 //! Extrema of differences of Gaussians over place and scale, refined below the pixel; histograms of gradients around
 //! them, turned by the main gradient. Square roots of histograms are compared (Arandjelović and Zisserman 2012), as
@@ -21,7 +21,7 @@ pub struct Feature {
     pub pixel: [f64; 2],
     /// How much it differs from what is around it.
     pub contrast: f32,
-    /// What it looks like.
+    /// Its descriptor.
     pub descriptor: [u8; NUMBERS],
 }
 

@@ -12,9 +12,9 @@
 //! d_x = ⟨w ∂S/∂⟨x⟩⟩ + 2x ⟨w ∂S/∂⟨xx+yy⟩⟩ + y ⟨w ∂S/∂⟨xy⟩⟩
 //! ```
 //!
-//! Only the sum of the two variances occurs, so four moments do (x, y, xx+yy, xy), not five. Four rows at a time go
+//! Only the sum of the two variances occurs, so four moments do (x, y, xx+yy, xy), not five. Four rows at a time pass
 //! through the stages: products → vertical means → horizontal means and S's derivatives → vertical means → horizontal
-//! means and the gradient. Products and derivatives live in rings of 16 rows, which stay in the second-level cache.
+//! means and the gradient. Products and derivatives are in rings of 16 rows, which stay in the second-level cache.
 //! The loops are plain ones over a row, because LLVM vectorises those reliably, and blocks of lanes it does not.
 //!
 //! A windowed sum is eleven loads, five additions and six multiply-adds, so loads are what it waits for: scratch rows
@@ -34,7 +34,7 @@ const C2: f64 = 9e-4;
 
 /// Passes run over whole AVX2 registers of f32, so that no loop has a scalar rest.
 const LANES: usize = 8;
-/// Rows that go through the pipeline together; a vertical pass then loads 14 rows for 44 products.
+/// Rows that pass the pipeline together; a vertical pass then loads 14 rows for 44 products.
 const GROUP: usize = 4;
 /// Rows a group's window spans.
 const SPAN: usize = GROUP + TAPS - 1;

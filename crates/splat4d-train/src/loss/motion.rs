@@ -241,8 +241,8 @@ pub(crate) fn isometry<F: Real>(
         })
 }
 
-/// Velocity: mean over edges of ‖v_i − v_j‖², (scene units)², v = x − x⁰ the way from one time to the next: neighbours
-/// move alike. Edges count alike, whatever the graph's weights say.
+/// Velocity: mean over edges of ‖v_i − v_j‖², (scene units)², v = x − x⁰ the displacement from one time to the next:
+/// neighbours move alike. Edges count alike, independent of the graph's weights.
 pub(crate) fn velocity<F: Real>(
     graph: &Graph<F>,
     [now, before]: [&[[F; 3]]; 2],

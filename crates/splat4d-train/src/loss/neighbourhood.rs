@@ -19,7 +19,7 @@ const FALLOFF: f64 = 1.0;
 /// every layer that moves, over random neighbourhoods of those alive at the view's time.
 ///
 /// Neighbours are those of the raw means, searched again every 200 steps and after every edit of rows; an edge counts
-/// only where both of its ends are alive. Which neighbourhoods a step looks at is a function of seed and step.
+/// only where both of its ends are alive. The neighbourhoods of a step are a function of seed and step.
 pub(crate) struct Neighbourhood<F> {
     weights: LossSettings,
     /// 1/extent

@@ -124,7 +124,7 @@ impl<F: Real> Photometric<F> {
     }
 }
 
-/// The sum of weights, strip by strip of `length` numbers; `sums` has room for one a strip.
+/// The sum of weights, strip by strip of `length` numbers; `sums` holds one per strip.
 fn total<F: Real>(weight: &[F], length: usize, sums: &mut [[f64; 3]]) -> f64 {
     const LANES: usize = 8;
     weight.par_chunks(length).zip(&mut *sums).for_each(|(strip, sum)| {

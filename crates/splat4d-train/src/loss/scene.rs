@@ -40,7 +40,7 @@ fn over_active<F: Real>(
     loss
 }
 
-/// weight · mean opacity (3DGS as MCMC): makes room for relocation.
+/// weight · mean opacity (3DGS as MCMC): frees Gaussians for relocation.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct MeanOpacity {
     /// λ
@@ -125,7 +125,7 @@ impl<F: Real> ParamLoss<F> for MeanScale {
 }
 
 /// weight · mean over Gaussians and views of o·stopgrad[σ(t)] (FreeTimeGS §3.4): against opaque long-lived blockers.
-/// The gradient goes to the opacity alone.
+/// Only the opacity has a gradient.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct LivingOpacity {
     /// λ_reg

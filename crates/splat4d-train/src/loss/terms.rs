@@ -1,4 +1,4 @@
-//! The contracts of losses that do not look at an image: on splats at several times, and on raw parameters; and of what
+//! The contracts of losses without images: on splats at several times, and on raw parameters; and of what
 //! may be between parameters and images, a [`Codec`].
 
 use crate::Result;
@@ -66,7 +66,7 @@ pub trait ParamLoss<F: Real>: Send + Sync {
     fn name(&self) -> &str;
     /// The loss; adds to one `Grads` a layer.
     fn eval(&self, scene: &Scene<F>, info: &StepInfo, d: &mut [Grads<F>]) -> f64;
-    /// The same as a device knows it; none: the CPU must take it.
+    /// The same for a device; none: the CPU must compute it.
     fn kept(&self) -> Option<ResidentLoss> {
         None
     }
@@ -85,7 +85,7 @@ pub trait ParamLoss<F: Real>: Send + Sync {
 }
 
 /// A codec between the parameters that learn and the images they are judged by: a file that will hold them
-/// coarsely. Images are rendered from what its reader would see, and the gradient goes to the parameters as if there
+/// coarsely. Images are rendered from the decoded values, and the gradient is passed to the parameters as if there
 /// were no difference (the straight-through estimator: Bengio et al. 2013).
 pub trait Codec<F: Real>: Send + Sync {
     /// Its name, in messages.

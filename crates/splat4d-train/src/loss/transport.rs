@@ -5,11 +5,11 @@
 //! |---|---|
 //! | temporal | ½ (D(a, b) + D(b, c)): small motion |
 //! | second | D(c, P(b, a)), P at constant velocity (log and exp): steady motion, fast or slow, costs nothing |
-//! | align | D(o, F) between the model's own answer o and the state F that the filter makes of it (`align.rs`) |
+//! | align | D(o, F) between the model's own result o and the state F that the filter makes of it (`align.rs`) |
 //!
 //! D = (‖Δμ‖² + m·B²)/extent² with B² the covariances' part of W₂², or ‖Δμ‖²/extent² alone in the linear variant. The
 //! multiplier m is needed because motion is 10² to 10⁴ times what shapes change (squared). Frames are those around a
-//! view's own, so that one of three answers is there anyhow, in a share of the steps whose terms weigh that much more.
+//! view's own, so that one of three results already exists, in a share of the steps whose terms weigh that much more.
 //!
 //! Source: Deng et al. 2024 ("Wasserstein 4DGS"); second order and normalisation are ours.
 
@@ -85,7 +85,7 @@ pub(crate) struct TransportConfig {
     pub clip: [f64; 2],
     /// Seconds between frames.
     pub frame: f64,
-    /// Share of the steps that are looked at, above 0.
+    /// Share of the steps in which it is computed, above 0.
     pub every: f64,
     /// Share of the stage after which the loss begins.
     pub start: f64,

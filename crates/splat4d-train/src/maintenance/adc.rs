@@ -2,9 +2,9 @@
 //! transparent. Source: Kerbl et al. 2023 §5.2 and appendix B; the clone's opacity as revised by Bulò 2024.
 //!
 //! Gaussians with a lifespan and a path of their own that leave their own place within that life are split in time
-//! instead: the two halves follow the same path one after the other. What turns or speeds up needs shorter lives, which
-//! parts next to each other do not bring. Gaussians of four dimensions (Yang et al. 2024) split in time as well, at
-//! random.
+//! instead: the two halves follow the same path one after the other. Rotation and acceleration need shorter lifespans,
+//! which parts next to each other do not bring. Gaussians of four dimensions (Yang et al. 2024) split in time as well,
+//! at random.
 //!
 //! The original also removes Gaussians larger than a tenth of the extent. The extent is the spread of the cameras, and
 //! a wall before a forward-facing rig needs larger ones: removal cost 1.3 dB in a kitchen, 0.3 to 1.6 dB on four other
@@ -27,7 +27,7 @@ use splat4d::scene::{Born, GEOMETRY, LIFE, LifeKind, RowEdit, Space, Table};
 /// A split's parts are this much smaller than their parent, in space or in time.
 const SPLIT_SHRINK: f64 = 1.6;
 /// How far from the centre of the parent's life those of a split in time begin, in widths of the parent's: with
-/// [`SPLIT_SHRINK`] mean and variance of the two lives together are the parent's, √(1 − 1/1.6²).
+/// [`SPLIT_SHRINK`] mean and variance of the two lifespans together are the parent's, √(1 − 1/1.6²).
 const TIME_SHIFT: f64 = 0.78;
 /// Address of the random numbers of [`retime`]; those of splits are addressed by row.
 const RETIME: u64 = u64::MAX;
@@ -101,7 +101,7 @@ impl Maintenance for Adc {
 }
 
 impl Adc {
-    /// The share of the room below the cap that may be taken now: of what was there at first a share (1 − x)² is left
+    /// The share of the free number below the cap that may be used now: of the initial one a share (1 − x)² is left
     /// when the share x of the time until the cap has passed.
     fn share(&self, at: &At) -> f64 {
         let Every { first, last, interval } = self.steps;
@@ -121,7 +121,7 @@ impl Adc {
 }
 
 impl AdcSettings {
-    /// How far from the centre of a row's lifespan those of its halves lie, seconds; 0: it is not split in time.
+    /// How far from the centre of a row's lifespan those of its halves lie, seconds; 0: no split in time.
     fn part(&self, scene: &Scene<f32>, layer: usize, row: usize, size: f64) -> f64 {
         let Layer { motion, params, life, .. } = &scene.layers[layer];
         let Some(path) = motion.polynomial().filter(|_| *life != LifeKind::Infinite && self.split_in_time > 0.0) else {
@@ -211,7 +211,7 @@ fn shorten(layer: &mut Layer<f32>, row: usize, shift: f64, [first, last]: [f64; 
     layer.params[LIFE].set(row, LOG_WIDTH, (shift.abs() / TIME_SHIFT / SPLIT_SHRINK).ln() as f32);
 }
 
-/// Draws the centre of every clone's life from the clip, uniformly.
+/// Draws the centre of every clone's lifespan from the clip, uniformly.
 fn retime(life: &mut Table, edit: &RowEdit, [first, last]: [f64; 2], rng: Rng) {
     if life.width() == 0 {
         return;

@@ -1,10 +1,11 @@
 //! Removal of floaters: Gaussians that hang right before a camera that does not see them, and that one camera alone
 //! sees.
 //!
-//! One camera's images carry no information about depth, so that what it alone sees drifts along its rays, and some of
-//! it comes to rest
-//! between the other cameras, where it veils every view from there. What it showed is learnt again where others see it,
-//! or farther away. What is before the camera that sees it may be there, and stays; so does all that two cameras see.
+//! One camera's images carry no information about depth, so that Gaussians that it alone sees drift along its rays, and
+//! some of them stay
+//! between the other cameras, where they veil every view. Their content is learnt again where others see it,
+//! or farther away. A Gaussian in front of the camera that sees it may be correct and is kept, as are those that two
+//! cameras see.
 
 use super::{At, Change, Context, DensifySettings, Every, Maintenance, RunOrder};
 use crate::Result;
@@ -33,7 +34,7 @@ settings! {
 /// Of fewer places most of a scene is seen from one alone: nothing is removed (of four real cameras it cost 0.4 to 1.5
 /// dB).
 const FEWEST: usize = 8;
-/// Moments, evenly over the clip, at which Gaussians are looked at; each counts where it is most visible.
+/// Times, evenly over the clip, at which Gaussians are examined; each counts where it is most visible.
 const MOMENTS: usize = 5;
 
 /// Rows in a task.

@@ -1,8 +1,8 @@
-//! Guided sampling: where images are worst and there are too few Gaussians to mend them, new ones are put along the
+//! Guided sampling: where images are worst and Gaussians are too few, new ones are placed along the
 //! rays
 //! of the worst patches. It finds what no initial point represented, far backgrounds above all.
 //!
-//! Source: Li et al. 2024 (STG) §4.2 and its released settings: of the views that were looked at the two worst; patches
+//! Source: Li et al. 2024 (STG) §4.2 and its released settings: of the examined views the two worst; patches
 //! of 16 pixels of which 85 % are among the worst 40 % of the pixels, a border of 10 % left out; every second pixel;
 //! depths between 0.7 and 7.5 times the largest seen, with 5 % of jitter; opacity 0.1.
 
@@ -20,7 +20,7 @@ use splat4d::render::{Antialias, Image, RenderConfig, Shot};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Born, Camera, GEOMETRY, LIFE, Planes, RowEdit, SH, Space, Time};
 
-/// Views that are looked at each time.
+/// Views that are examined each time.
 const LOOKS: usize = 24;
 /// Views in which Gaussians are added.
 const WORST_VIEWS: usize = 2;
@@ -62,7 +62,7 @@ settings! {
     }
 }
 
-/// A view that was looked at.
+/// An examined view.
 struct ViewError {
     frame: usize,
     error: f64,

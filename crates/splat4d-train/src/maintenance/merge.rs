@@ -1,4 +1,4 @@
-//! Too many Gaussians in one place: near pairs become one (merging), or the fainter of a pair goes (spatial-proximity
+//! Too many Gaussians in one place: near pairs are merged, or the fainter of a pair is removed (spatial-proximity
 //! pruning). Pairs are mutual nearest neighbours, so that no row takes part twice.
 
 use super::{At, Change, Context, Maintenance, RunOrder, covariances, logit, opacity};
@@ -19,7 +19,7 @@ pub enum Pair {
     None,
     /// One Gaussian with the pair's mean, covariance (moments), colour and joint opacity.
     Merge,
-    /// The fainter one goes, the other stays as it is.
+    /// The fainter one is removed, the other unchanged.
     Prune,
 }
 
@@ -43,7 +43,7 @@ impl Choice for Pair {
         &[("none", Self::None), ("merge", Self::Merge), ("prune", Self::Prune)];
 }
 
-/// Largest difference of base colours (in SH coefficients, each channel) of a pair that is one thing.
+/// Largest difference of base colours (in SH coefficients, each channel) of a pair to merge.
 const SAME_COLOR: f32 = 0.15;
 /// Largest ratio of a pair's standard deviations.
 const SAME_SIZE: f64 = 2.0;

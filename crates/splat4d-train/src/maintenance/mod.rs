@@ -162,7 +162,7 @@ impl std::ops::AddAssign for Change {
     }
 }
 
-/// All that an operation may know in addition to the learner.
+/// Inputs of an operation next to the learner.
 #[derive(Clone, Copy)]
 pub struct Context<'a> {
     /// Where in the stage.
@@ -212,7 +212,7 @@ pub enum RunOrder {
 
 /// Something that is done to a learner between steps.
 ///
-/// `run` takes `&mut self`: what an operation remembers from time to time is its own, and goes into checkpoints by
+/// `run` takes `&mut self`: an operation's state between calls is its own, and is saved in checkpoints by
 /// [`state`](Self::state).
 pub trait Maintenance: Send + Sync {
     /// Its name, which is its own among the operations of a stage that remember anything: checkpoints use it.
@@ -243,7 +243,7 @@ pub trait Maintenance: Send + Sync {
     }
 
     /// About how many Gaussians there are after a place in the stage, of `count` and at most `cap`: what an estimate of
-    /// time goes by.
+    /// time passes.
     fn grown(&self, _at: &At, count: f64, _cap: f64) -> f64 {
         count
     }
@@ -259,7 +259,7 @@ pub trait Maintenance: Send + Sync {
         Vec::new()
     }
 
-    /// Takes back what [`state`](Self::state) gave; nothing from a checkpoint that does not know the operation.
+    /// Restores the result of [`state`](Self::state); empty from a checkpoint without the operation.
     fn restore(&mut self, _state: &[u32]) {}
 }
 

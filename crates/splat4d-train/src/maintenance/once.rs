@@ -6,7 +6,7 @@ use crate::Result;
 use crate::train_state::TrainState;
 use splat4d::layers::Scene;
 
-/// A change of the scene before one step of a stage. Done twice it must be as if it had been done once: it is repeated
+/// A change of the scene before one step of a stage. It must be idempotent: it is repeated
 /// where a run is resumed at that very step.
 pub(crate) struct Once<C> {
     /// The number of the step, from 0.

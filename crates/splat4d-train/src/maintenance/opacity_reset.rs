@@ -1,5 +1,5 @@
-//! Opacity reset: every so many steps all opacities are lowered, so that what the images do not ask for stays faint and
-//! is pruned. Source: Kerbl et al. 2023 §5.2.
+//! Opacity reset: every so many steps all opacities are lowered, so that Gaussians that images do not need stay faint
+//! and are pruned. Source: Kerbl et al. 2023 §5.2.
 
 use super::{At, Change, Context, DensifySettings, Every, Maintenance, RunOrder, Strategy, logit};
 use crate::Result;

@@ -1,4 +1,4 @@
-//! `--motion auto`: looks at the capture, and takes the first program that states why it suits.
+//! `--motion auto`: examines the capture and selects the first program that states why it suits.
 
 use super::{Method, TrainContext};
 use crate::Result;
@@ -37,7 +37,7 @@ pub struct CaptureStats {
 }
 
 impl CaptureStats {
-    /// Looks at the training frames of a capture.
+    /// Examines the training frames of a capture.
     pub(crate) fn of(plan: &TrainContext, frames: &dyn Frames) -> Result<Self> {
         let looks = plan.times > 1 && plan.fixed_cameras > 0;
         Ok(Self {

@@ -29,15 +29,15 @@ settings! {
 settings! {
     /// Learning rates of parameters that all Gaussians have.
     pub struct RateSettings {
-        /// Rate of positions at the start, of the extent; 0: 0.002, and less in proportion if `densify.max_cap` is above
-        /// 30,000.
+        /// Rate of positions at the start, of the extent; 0: 0.002, and less in proportion if `densify.max_cap` is
+        /// above 30,000.
         position_init: f64 = 0.0 => any().unit("extents");
         /// Rate of positions at the end, of the extent; 0: 0.00005, and less in the same way.
         position_final: f64 = 0.0 => any().unit("extents");
         /// Share to which rates without a final value (colour, opacity, scale, rotation, lifespan) decay.
         decay: f64 = 1.0 => positive();
-        // Colours, scales and rotations learn two to five times as fast as in Kerbl et al. 2023, whose runs have 30,000 steps; chosen
-        // on seven captures together with the fall at the end (studies/records/2026-11-27-rates.md).
+        // Colours, scales and rotations learn two to five times as fast as in Kerbl et al. 2023, whose runs have 30,000
+        // steps; chosen on seven captures together with the fall at the end (studies/records/2026-11-27-rates.md).
         /// Share of the steps at the end over which all rates fall to a tenth; 0: they do not.
         settle: f64 = 0.15 => share();
         /// Rate of base colour; higher SH degrees learn 20 times more slowly.
@@ -51,21 +51,22 @@ settings! {
     }
 }
 
-/// Rates of positions at the start and at the end for up to [`LEAST`] Gaussians, of the extent. Kerbl et al. 2023 use 1.6e-4
-/// and 1.6e-6 for runs of 30,000 steps; ours are several times shorter. Stated before and not measured against them.
+/// Rates of positions at the start and at the end for up to [`LEAST`] Gaussians, of the extent. Kerbl et al. 2023 use
+/// 1.6e-4 and 1.6e-6 for runs of 30,000 steps; ours are several times shorter. Stated before and not measured against
+/// them.
 const POSITIONS: [f64; 2] = [2e-3, 5e-5];
 /// Lowest share of them, with many Gaussians: the rate of Kerbl et al. 2023, who have some millions.
 const FINEST: f64 = 0.08;
 
 impl RateSettings {
-    /// A rate that falls to `decay` of itself over the stage.
+    /// A rate that decays by the factor `decay` over the stage.
     pub(crate) fn falling(&self, rate: f64) -> Rate {
         Rate { start: rate, end: rate * self.decay }
     }
 
-    /// Rates of positions at the start and at the end, of the extent. More Gaussians are smaller and lie closer, and the
-    /// steps of the few throw them about: a real room with 70,000 gains 0.4 dB with a third of the rates, an object with 90,000
-    /// neither gains nor loses (studies/records/2026-11-26-real-size.md).
+    /// Rates of positions at the start and at the end, of the extent. More Gaussians are smaller and denser, and the
+    /// rates of fewer ones are too high for them: a real room with 70,000 gains 0.4 dB with a third of the rates, an
+    /// object with 90,000 neither gains nor loses (studies/records/2026-11-26-real-size.md).
     pub(super) fn positions(&self, cap: usize) -> [f64; 2] {
         let share = (LEAST as f64 / cap.max(1) as f64).clamp(FINEST, 1.0);
         let [start, end] = POSITIONS.map(|rate| rate * if cap == 0 { 1.0 } else { share });
@@ -104,7 +105,8 @@ impl Choice for Option<LifeKind> {
 macro_rules! common_settings {
     ($($table:ident: $settings:ty,)*) => {
         /// The tables of settings that every motion model is trained with, resolved;
-        /// [`still::stage`](super::still::stage) makes a stage of them. What one model alone needs is its method's own.
+        /// [`still::stage`](super::still::stage) makes a stage of them. Settings of a single model belong to its
+        /// method.
         #[derive(Clone, Debug, Default, PartialEq)]
         pub struct CommonSettings {
             /// Colours of Gaussians and cameras.

@@ -9,13 +9,14 @@ use splat4d::motion::deform::{Deform, DeformSpec, Input};
 use splat4d::nn::HashShape;
 use splat4d::scene::Params;
 
-/// Hidden layers and width of the large trunk, and the layer behind which its input stands again (Yang et al. 2024).
+/// Hidden layers and width of the large trunk, and the layer after which its input is appended again (Yang et al.
+/// 2024).
 const LARGE: (usize, usize, usize) = (8, 256, 4);
 /// Levels of places with the large trunk, at least (Yang et al. 2024).
 const LARGE_X_LEVELS: usize = 10;
 /// Grids learn so much faster than networks: an entry is met by few Gaussians.
 const GRID_SPEEDUP: f64 = 50.0;
-/// Canonical positions start so much slower than the recipe's, which suit Gaussians that live for a moment: a cloud
+/// Canonical positions start with this share of the recipe's rate, which suits short-lived Gaussians: a cloud
 /// that is seen at every time has to settle. Chosen next to other settings in runs of 400 steps; not measured alone.
 const CANONICAL_SLOWDOWN: f64 = 4.0;
 /// Share of the iterations until the noise on time is zero: 20,000 of 40,000 (Yang et al. 2024).

@@ -1,6 +1,6 @@
 //! `filtered`: any program with a temporal filter around its model, and the transport losses on any model.
 //!
-//! The inner program's stages stay as they are; the filter is there from the start, switched off, and is switched on in
+//! The inner program's stages are not changed; the filter is there from the start, switched off, and is switched on in
 //! the middle of whichever stage runs by then, so that no schedule notices. Hooks of the inner program see its own
 //! model: the filter is taken off around them. At the end the filter is disabled and the network kept, unless the
 //! recipe states otherwise: the filter has then taught the model to move steadily, and playing costs no more than
@@ -57,7 +57,7 @@ impl Choice for Predictor {
     const NAMES: &'static [(&'static str, Self)] = &Self::ALL;
 }
 
-/// The program with a filter and transport losses around it; as it is where both are off.
+/// The program with a filter and transport losses around it; unchanged if both are off.
 pub(crate) fn wrap(inner: Box<dyn Method>, filter: &FilterSettings, transport: &TransportSettings) -> Box<dyn Method> {
     if filter.fusion == Fusion::Off && transport.metric.is_none() {
         return inner;

@@ -4,7 +4,7 @@
 //! capture.
 
 /// The list of methods: how a motion model is trained is its file and an entry here, which names its table of settings
-/// and makes it from the recipe `r`. `auto` asks them in this order.
+/// and makes it from the recipe `r`. `auto` tries them in this order.
 macro_rules! methods {
     // Tables of settings, between those before and after in the recipe.
     (tables $then:ident { $($before:tt)* } { $($after:tt)* }) => {
@@ -80,7 +80,7 @@ use splat4d::scene::{LifeKind, Params};
 use std::ops::Range;
 use std::sync::Arc;
 
-/// The capture and the wishes of the user, as far as a program may know them.
+/// The capture and the user's settings, as far as programs may depend on them.
 #[derive(Clone, Debug, Default)]
 pub struct TrainContext {
     /// Settings that every motion model is trained with, resolved.
@@ -150,7 +150,7 @@ const SETTLED: f64 = 0.1;
 /// A group of this layer is one of every layer that has its columns.
 pub(crate) const EVERY: usize = usize::MAX;
 
-/// A learnable group: one column group of one table. What no group names is frozen.
+/// A learnable group: one column group of one table. Columns without a group are frozen.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Group {
     /// The layer, or `EVERY`.
@@ -161,7 +161,7 @@ pub struct Group {
     pub part: Option<(usize, usize)>,
     /// How fast.
     pub rate: Rate,
-    /// Frozen for so many steps of the stage (networks and fine grids that come in later).
+    /// Frozen for this many steps of the stage (networks and fine grids that start later).
     pub from: usize,
     /// The rate rises linearly over so many of its first steps; 0: all at once.
     pub warm_up: usize,
@@ -221,7 +221,7 @@ pub struct Stage {
     pub groups: Vec<Group>,
     /// The part of the stage, in shares of it, over which all rates fall linearly to a tenth; empty: they do not.
     ///
-    /// A step sees one image, and moves parameters towards that image alone. At full rates a run therefore ends some
+    /// A step uses one image, and moves parameters towards that image alone. At full rates a run therefore ends some
     /// tenths of a decibel short of what it has learned; small rates from the start would learn less.
     pub settling: Range<f64>,
     /// Losses over several times.
@@ -236,7 +236,7 @@ pub struct Stage {
     pub sh_interval: usize,
     /// Steps of earlier stages that count for it.
     pub sh_from: usize,
-    /// The first so many steps see images at half size: coarse things first, and four times faster.
+    /// The first steps, this many, use images at half size: coarse structure first, and four times faster.
     pub half_size_steps: usize,
     /// Lower bound of log life widths, by layer; learnt values are lifted to it.
     pub min_log_life: Option<f64>,
@@ -244,11 +244,11 @@ pub struct Stage {
     pub time_noise: TimeNoise,
     /// Losses on images, after the run's own.
     pub pictures: Vec<Box<dyn ImageTerm>>,
-    /// Whether the cameras' exposures stay as they are.
+    /// Whether the cameras' exposures are frozen.
     pub freeze_exposure: bool,
     /// The codec between the parameters and the images; none: nothing.
     pub codec: Option<Arc<dyn Codec<f32>>>,
-    /// The phase in which it puts the models of all layers; none: as they are.
+    /// The phase that it sets for the models of all layers; none: unchanged.
     pub phase: Option<Phase>,
     /// Before the first step.
     pub start: Option<Hook>,
@@ -345,30 +345,30 @@ pub struct InitialMotion {
 pub trait Method: Send + Sync {
     /// The model that training starts with.
     fn spec(&self, plan: &TrainContext) -> Spec;
-    /// Makes it, and in `params` its tables: how a model from outside the library comes to be.
+    /// Constructs it, and its tables in `params`: the constructor of a model from outside the library.
     fn build(&self, plan: &TrainContext, params: &mut Params) -> Result<Arc<dyn Motion>> {
         build(&self.spec(plan), params)
     }
     /// The lifespan its Gaussians have: the recipe's. Where it leaves the choice to the model, those of a cloud that
-    /// lasts ([`one_moment`](Self::one_moment)) may come and go before fixed cameras, which see that a place is empty
-    /// before something comes there (docs/models.md); a camera that moves sees every place at few times, and lifespans
-    /// gain nothing. Others, and those whose future is to be predicted, are there forever.
+    /// lasts ([`one_moment`](Self::one_moment)) may appear and vanish with fixed cameras, which see that a place is
+    /// empty before an object appears there (docs/models.md); a camera that moves sees every place at few times, and
+    /// lifespans gain nothing. Others, and those whose future is to be predicted, are there forever.
     fn life(&self, plan: &TrainContext) -> LifeKind {
         let lasting = self.one_moment(plan) && plan.fixed_cameras > 0 && !plan.predicted;
         plan.common.life.kind.unwrap_or(if lasting { LifeKind::Interval } else { LifeKind::Infinite })
     }
-    /// The plan of the initial points: the whole clip, or what of it is learnt first.
+    /// The plan of the initial points: the whole clip, or its part that is learnt first.
     fn first(&self, plan: &TrainContext) -> TrainContext {
         plan.clone()
     }
     /// Fills what the model's own tables start with, row by row.
     fn init(&self, _plan: &TrainContext, _beginnings: &[InitialMotion], _params: &mut Params) {}
-    /// Says before training, and not after an hour, that the model cannot work on a capture.
+    /// Reports before training, and not after an hour, that the model cannot work on a capture.
     fn check(&self, _plan: &TrainContext) -> Result<()> {
         Ok(())
     }
-    /// Whether all Gaussians live through the whole clip, so that training should start from one time's cloud and not
-    /// from the clouds of many times together.
+    /// Whether all Gaussians are alive during the whole clip, so that training should start from one time's cloud and
+    /// not from the clouds of many times together.
     fn one_moment(&self, _plan: &TrainContext) -> bool {
         false
     }

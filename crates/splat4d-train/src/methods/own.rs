@@ -26,8 +26,8 @@ pub struct OwnMotion {
 static OWN: RwLock<BTreeMap<&'static str, Arc<OwnMotion>>> = RwLock::new(BTreeMap::new());
 
 impl OwnMotion {
-    /// Makes the model known to training and to every reader of scenes, for the rest of the process: `run.motion` may be its
-    /// name. A model of that name that was registered before is replaced.
+    /// Registers the model with training and every reader of scenes, for the rest of the process: `run.motion` may be
+    /// its name. A model of that name that was registered before is replaced.
     ///
     /// Errors: a name that is taken or cannot be written; a share outside [0, 1); rates that are not finite.
     pub fn register(self) -> Result<()> {

@@ -73,7 +73,7 @@ pub(crate) fn groups(c: &CommonSettings, extent: f64) -> Vec<Group> {
     groups
 }
 
-/// Lets a stage learn its Gaussians' lives: birth and death, for any model.
+/// Lets a stage learn its Gaussians' lifespans: birth and death, for any model.
 pub(crate) fn learn_life(stage: &mut Stage, plan: &TrainContext, life: LifeKind) {
     let c = &plan.common;
     if life != LifeKind::Infinite {

@@ -1,10 +1,10 @@
 //! Who writes into a folder: a lock of the operating system, and a record of the owner with a heartbeat.
 //!
-//! On one machine the lock decides: the system releases it when its process ends, however that happens, so that neither a
-//! reused process number nor a clock that was set plays a part. A lock that is free although the record names another
-//! machine may only mean that the file system does not share locks; then the heartbeat decides. Its age is measured by the
-//! folder's own clock, and where that states "long ago" or "in the future" the record is watched for some beats before it is
-//! taken over: a clock that jumps makes no owner dead.
+//! On one machine the lock decides: the system releases it when its process ends, however that happens, so that neither
+//! a reused process number nor a clock that was set plays a part. A lock that is free although the record names another
+//! machine may only mean that the file system does not share locks; then the heartbeat decides. Its age is measured by
+//! the folder's own clock, and where that states "long ago" or "in the future" the record is watched for some beats
+//! before it is taken over: a clock that jumps makes no owner dead.
 
 use super::date::rfc3339;
 use super::{STATE, cannot_write, check_plain, temporary};
@@ -23,12 +23,12 @@ const LOCK: &str = "lock";
 const RECORD: &str = "owner.json";
 /// Time between two heartbeats.
 const BEAT: Duration = Duration::from_secs(5);
-/// An owner on another machine whose heart has not beaten for so long is taken for dead: a dozen beats, so that a busy file
-/// server is not.
+/// An owner on another machine whose heart has not beaten for so long is taken for dead: a dozen beats, so that a busy
+/// file server is not.
 const DEAD: Duration = Duration::from_secs(60);
 /// So long a record is watched before it is taken over: three beats.
 const WATCH: Duration = Duration::from_secs(15);
-/// Time between two looks at a record that is watched, or at a lock that is waited for.
+/// Interval between reads of a record that is watched, or at a lock that is waited for.
 const LOOK: Duration = Duration::from_millis(100);
 
 /// The owner of a folder, as its record states it.
@@ -42,9 +42,9 @@ pub struct Standing {
     pub host: String,
     /// UTC.
     pub since: String,
-    /// An identifier of the machine as long as it runs; empty where the system does not say.
+    /// An identifier of the machine as long as it runs; empty where the system does not report it.
     machine: String,
-    /// Heartbeats so far, always as many digits, so that the record never changes its length.
+    /// Number of heartbeats, always with as many digits, so that the record never changes its length.
     beat: String,
 }
 
@@ -99,7 +99,7 @@ pub(super) struct Patience {
 }
 
 impl Owner {
-    /// Makes the folder's state and takes the folder; the inner error is who has it; `None`: its record cannot be read.
+    /// Makes the folder's state and takes the folder; the inner error is its owner; `None`: its record cannot be read.
     ///
     /// Errors: the folder cannot be written.
     pub(crate) fn take(folder: &Path, command: &str) -> Result<Result<Self, Option<Standing>>> {
@@ -156,12 +156,13 @@ impl Owner {
         Ok(Ok(Self { record, standing, lock: Some(lock), done, heart: Some(heart) }))
     }
 
-    /// The same; that another process has it is an error that states who.
+    /// The same; another owner is an error that names it.
     pub fn of(folder: &Path, command: &str) -> Result<Self> {
         Self::take(folder, command)?.map_err(|who| in_use(folder, who.as_ref()))
     }
 
-    /// Waits for the folder while `go_on` returns true for its owner. Errors: the folder cannot be written; it is in use.
+    /// Waits for the folder while `go_on` returns true for its owner. Errors: the folder cannot be written; it is in
+    /// use.
     pub fn wait(folder: &Path, command: &str, go_on: &mut dyn FnMut(Option<&Standing>) -> bool) -> Result<Self> {
         loop {
             match Self::take(folder, command)? {
@@ -172,7 +173,7 @@ impl Owner {
         }
     }
 
-    /// Gives the folder back and removes all that states that it was ever owned: while the lock is held, so that no other process has it.
+    /// Releases the folder and removes all traces of ownership while the lock is held, so that no other process has it.
     pub(super) fn remove(mut self, folder: &Path) {
         self.rest();
         discard(&folder.join(STATE));
@@ -266,7 +267,7 @@ fn pulse(file: &mut File, mut standing: Standing, (done, changed): &(Mutex<bool>
     }
 }
 
-/// Whether the owner of another machine, or of one that was restarted since, lives.
+/// Whether the owner on another machine, or on one that was restarted since, is running.
 fn lives(state: &Path, record: &Path, before: &Standing, patience: Patience) -> bool {
     let fresh = |age: Option<Duration>| age.is_some_and(|age| age <= patience.dead);
     if fresh(age(record, now(state))) {

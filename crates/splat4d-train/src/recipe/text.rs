@@ -49,7 +49,7 @@ impl Recipe {
         Ok(recipe)
     }
 
-    /// Applies one `key=value`, as `--set` takes it. Strings need no quotes. Errors leave the recipe as it is.
+    /// Applies one `key=value`, as `--set` takes it. Strings need no quotes. Errors do not change the recipe.
     pub fn set(&mut self, assignment: &str) -> Result<()> {
         let (key, text) = assignment.split_once('=').ok_or_else(|| {
             Error::input(format!("`{assignment}` is not of the form key=value"))
@@ -152,8 +152,8 @@ impl Recipe {
         Ok(())
     }
 
-    /// The recipe in the names and the order that it had before it had tables, byte for byte: what checkpoints know it
-    /// by, so that runs of then continue. Settings that came later count where they are not at their default.
+    /// The recipe in the names and the order that it had before it had tables, byte for byte: the identity that
+    /// checkpoints store so that old runs continue. Settings that came later count where they are not at their default.
     pub fn flat_toml(&self) -> String {
         let mut text: String =
             FLAT.iter().map(|(flat, key)| line(flat, &self.get(key).expect("FLAT names settings"))).collect();

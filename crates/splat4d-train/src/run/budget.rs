@@ -1,5 +1,5 @@
 //! [`Budget`]: a run that is to end on time. Before the first step its length follows from steps that were timed; while
-//! it goes, the machine may turn out to be slower or faster than then, and what is left is planned again.
+//! runs, the machine may be slower or faster than then, and the remaining steps are planned again.
 //!
 //! A new plan is one row of `run.replans` and depends on the clock; all else follows from the rows
 //! ([`Pace`](crate::step::pace::Pace)), so that a run that repeats or continues with them gives the same bits.
@@ -10,13 +10,13 @@ use crate::step::replans::ScheduleChange;
 use crate::step::trainer::{Position, Trainer};
 use serde::{Deserialize, Serialize};
 
-/// Looks at the clock in a whole run. A change of speed is seen within one of them and taken for lasting after some:
+/// Clock readings in a whole run. A change of speed is detected within one interval and treated as lasting after some:
 /// what the last ones miss is less than a tenth of the time ([`tests`] holds it on machines that turn slower and
 /// faster).
 const LOOKS: f64 = 32.0;
 /// Of the time, what the end may be off before a run is planned again.
 const TOLERANCE: f64 = 0.015;
-/// Weight of what was measured since the last look in the machine's speed: one busy time is not taken for the rest.
+/// Weight of the measurement since the last reading in the machine's speed: one busy time is not taken for the rest.
 const NEWEST: f64 = 0.5;
 /// Steps of the schedule that a step may represent, and steps that may represent one of the schedule: with fewer the
 /// scene would be taken apart by rates and densifications meant for many.
@@ -33,7 +33,7 @@ pub(crate) struct Budget {
     pub minutes: f64,
     /// Seconds of it that were over before the first step.
     pub before: f64,
-    /// The time of what follows the last step, in steps as they are at the end.
+    /// The time of the work after the last step, in units of the last steps.
     pub finish: f64,
     /// The duration of steps before the run.
     pub timing: Timing,
@@ -46,7 +46,7 @@ pub(super) struct Place<'a> {
     progress: Position,
     /// Gaussians now, and at most.
     gaussians: [usize; 2],
-    /// Steps of the run that are left as it is planned.
+    /// Remaining planned steps of the run.
     left: usize,
 }
 
@@ -88,9 +88,9 @@ pub(super) struct Replanned {
 #[derive(Clone, Debug)]
 pub(super) struct Planner {
     budget: Budget,
-    /// Seconds between two looks.
+    /// Seconds between two readings.
     interval: f64,
-    /// Seconds since the command's start at the last look.
+    /// Seconds since the command's start at the last reading.
     looked: f64,
     /// Seconds of steps since then: taken, and as they were timed before the run.
     taken: [f64; 2],

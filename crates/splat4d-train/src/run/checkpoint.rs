@@ -36,7 +36,7 @@ pub struct Identity {
 /// The state of the run that is not the trainer's.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RunState {
-    /// Seconds of training so far. Never reaches a result.
+    /// Seconds of training. Never affects a result.
     pub seconds: f64,
     /// Smoothed loss, PSNR for progress. Never reach a result.
     pub smooth: [f64; 2],

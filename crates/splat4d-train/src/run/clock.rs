@@ -20,7 +20,7 @@ impl Stopwatch {
         Self(Arc::new(seconds))
     }
 
-    /// Seconds so far.
+    /// Elapsed seconds.
     pub fn seconds(&self) -> f64 {
         (self.0)()
     }

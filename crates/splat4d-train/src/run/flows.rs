@@ -14,7 +14,7 @@ use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// The folder next to the run, and the file that states what its flow is of.
+/// The folder next to the run, and the file that identifies the flow's input.
 const FOLDER: &str = "flow";
 const MARK: &str = "of.txt";
 /// The next training image may be so many frames later: one between them may be held out.

@@ -5,7 +5,7 @@ use crate::capture::Capture;
 use crate::recipe::Recipe;
 use crate::step::replans::ScheduleChanges;
 
-/// The mark of a run: its capture, its recipe and, where there is more to say, `text`.
+/// The mark of a run: its capture, its recipe and, optionally `text`.
 pub(super) fn identity(capture: &Capture, recipe: &Recipe, text: &str) -> Identity {
     Identity { capture: fingerprint(capture), recipe: recipe_print(recipe, text) }
 }

@@ -20,12 +20,12 @@ const STORED_BYTES: [u64; 2] = [4, 7];
 /// Bytes that nothing below counts: the program, threads, what the allocator holds back. Chosen on the runs of
 /// docs/models.md.
 const PROCESS_BYTES: u64 = 80 << 20;
-/// While a checkpoint is written, values and moments stand twice more in memory: as rows, and as the file. Of the
+/// While a checkpoint is written, values and moments are in memory twice more: as rows, and as the file. Of the
 /// tables.
 const CHECKPOINT: [u64; 2] = [3, 2];
 /// Bytes of a number.
 const F32: u64 = 4;
-/// Numbers of a learnable number: itself, its gradient, two moments.
+/// Numbers per learnable number: itself, its gradient, two moments.
 const LEARNT: u64 = 4;
 /// Numbers a splat has in a result, and as many in its gradient.
 const ANSWER: u64 = 2 * splat_numbers();
@@ -91,7 +91,7 @@ impl Few {
         Ok(Self { params, motion, nodes })
     }
 
-    /// Bytes of all tables at `rows` Gaussians: values, gradients, two moments and the steps that a row has taken.
+    /// Bytes of all tables at `rows` Gaussians: values, gradients, two moments and a row's step count.
     fn tables(&self, rows: usize) -> u64 {
         let p = &self.params;
         let bytes = |key| {
@@ -106,7 +106,8 @@ impl Few {
     }
 }
 
-/// Bytes of memory that the system could give a program now, within what its group may take; `None`: it does not say.
+/// Bytes of memory that the system could give a program now, within what its group may take; `None`: it does not report
+/// it.
 pub fn available_memory() -> Option<u64> {
     let number = |path: &str| std::fs::read_to_string(path).ok()?.trim().parse::<u64>().ok();
     let text = std::fs::read_to_string("/proc/meminfo").ok()?;

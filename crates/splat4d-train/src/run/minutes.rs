@@ -174,7 +174,7 @@ impl Probe<'_> {
     }
 
     /// Seconds a step [half size, full size] in the first stage and, skipping what is left of it, in the second; a run
-    /// of one stage has the first twice. It is over by `until`, if only a few steps are.
+    /// of one stage has the first twice. It ends by `until`, if only a few steps.
     fn rates(&mut self, until: f64) -> Result<[[f64; 2]; 2]> {
         let sizes = [usize::MAX, 0];
         let all = sizes.len() * self.trainer.stages.len().min(2);

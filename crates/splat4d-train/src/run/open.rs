@@ -114,7 +114,7 @@ pub(crate) struct OpenCapture {
     pub(crate) capture: Arc<Capture>,
     pub(crate) frames: Arc<Dataset>,
     pub(crate) simd: Simd,
-    /// What its trainers draw with.
+    /// The device of its trainers.
     pub(crate) device: Device,
 }
 
@@ -174,8 +174,8 @@ fn mean_color(frames: &dyn Frames) -> Result<[f32; 3]> {
     Ok(sums.map(|s| (s / pixels.max(1.0)) as f32))
 }
 
-/// What of cameras a recipe lets learn. Clocks carry no information where nothing moves, and nothing can be asked
-/// between the frames of a model that is learnt frame by frame.
+/// Corrections of cameras that a recipe enables. Clocks carry no information where nothing moves, and nothing can be
+/// asked between the frames of a model that is learnt frame by frame.
 pub(crate) fn learnable(recipe: &Recipe) -> RefineSettings {
     let timed = !["still", "tracked"].contains(&recipe.run.motion.as_str());
     RefineSettings { times: recipe.refine.times && timed, ..recipe.refine.clone() }
@@ -219,9 +219,9 @@ impl OpenCapture {
         Ok((recipe.with(|r| r.run.motion = MotionName::of(choice.motion)), choice))
     }
 
-    /// What shows where no Gaussian is: what images were cut out of or, where they fill their frames, their mean
+    /// The background: that of cut-out images or, for full frames, their mean
     /// colour, which
-    /// is the best guess at what no training camera sees. Errors: an image cannot be read.
+    /// is the best estimate for pixels that no training camera sees. Errors: an image cannot be read.
     pub(super) fn background(&self) -> Result<[f32; 3]> {
         match self.capture.background {
             Some(told) => Ok(told),

@@ -19,7 +19,7 @@ use std::sync::Arc;
 const FILE: &str = "points.ply";
 /// Of the initial Gaussians: with fewer points of its own, a capture's images are searched for more.
 const FEW: f64 = 0.05;
-/// A capture whose points leave out more than this share of what a camera sees (the median of its cameras) brings too
+/// A capture whose points leave out more than this share of what a camera sees (the median of its cameras) has too
 /// few as well, however many: a sky, a far background. Of eight captures the bundled one, a kitchen, a hall and five
 /// synthetic rooms
 /// have 0 to 0.06, one before a far background has 0.34 (docs/suite.md).
@@ -27,7 +27,7 @@ const BARE: f64 = 0.2;
 /// Cells along an image's longer side in which that is counted; of a rig at most so many views.
 const CELLS: f64 = 16.0;
 const VIEWS: usize = 64;
-/// Of the initial Gaussians, the points that are searched for: what is between them is laid along surfaces.
+/// Of the initial Gaussians, the points that are searched for: the others are placed between them along surfaces.
 const WANTED: f64 = 0.5;
 
 /// The capture with points from its images, where it brings too few and the recipe lets them be searched for.
@@ -93,7 +93,7 @@ fn bare(capture: &Capture, points: &[[f64; 3]]) -> f64 {
     shares.get(shares.len() / 2).copied().unwrap_or(0.0)
 }
 
-/// The share of the cells of an image in which no point lies, nor in the eight around it.
+/// The share of the cells of an image without a point in them or in the eight around.
 fn uncovered(camera: &Camera, points: &[[f64; 3]]) -> f64 {
     let side = camera.width.max(camera.height) as f64 / CELLS;
     let [columns, rows] = [camera.width, camera.height].map(|n| (n as f64 / side).round().max(1.0) as usize);

@@ -32,7 +32,7 @@ const VISIBLE: f64 = 0.3;
 /// whatever scale: noise of a quarter of the depth does as much, and single-image networks have less.
 const FOREIGN: f64 = 0.1;
 /// Share of the points that are before what a metric map shows, by more than [`METRIC_OFF`], from which on it is
-/// reported: what is before a point hides it, and what it is itself nothing can be before.
+/// reported: surfaces in front of a point hide it, and nothing can be in front of the point's own surface.
 const BEFORE: f64 = 0.1;
 /// A metric map is believed while the scene is within this share of it (median); others while they correlate by this.
 const METRIC_OFF: f64 = 0.1;
@@ -153,7 +153,7 @@ enum Depths {
     Fit,
     /// The points are so many times as far away, everywhere.
     Scaled(f64),
-    /// Even the closest scatter about the points by this (logarithm): no unit mends that.
+    /// Even the closest scatter about the points by this (logarithm): no unit corrects that.
     Foreign(f64),
 }
 

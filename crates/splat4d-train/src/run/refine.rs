@@ -49,7 +49,7 @@ pub(crate) struct Refine {
 pub(crate) struct Refined {
     /// How the run ended.
     pub outcome: Outcome,
-    /// The scene that learns. Where the last stage has a codec, what is seen of it is another: that one is in the run's
+    /// The scene that learns. If the last stage has a codec, the decoded scene differs: it is in the run's
     /// `scene.safetensors`.
     pub scene: Scene<f32>,
 }
@@ -57,7 +57,7 @@ pub(crate) struct Refined {
 /// Begins the run in the folder `run`, or continues it, exactly, where that holds one.
 ///
 /// A stage's start is not run again once a checkpoint holds a step of the stage: what codecs, losses and layers
-/// remember comes from the checkpoint. Errors: the folder holds another run; what stages and files may say.
+/// store is read from the checkpoint. Errors: the folder holds another run; what stages and files may say.
 pub(crate) fn refine(
     job: Refine,
     run: &Path,

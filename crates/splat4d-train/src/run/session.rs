@@ -33,13 +33,13 @@ pub struct TrainOptions {
     /// What renders. It is no part of the recipe: a run may be resumed on another device, whose last bits are others.
     pub device: Device,
     /// Keep all from the clock's zero to the end of what follows training to so long: iterations are fitted to it, and
-    /// fitted again while the run goes.
+    /// fitted again during the run.
     pub minutes: Option<f64>,
-    /// What the caller does after training (measuring, filming, baking) takes as long as about so many steps at the end
-    /// of training; `minutes` leaves room for it.
+    /// The caller's work after training (evaluation, film, baking) takes about as long as this many steps at the end
+    /// of training; `minutes` includes it.
     pub finish: f64,
-    /// Time steps before the run and say by [`Event::Predicted`] how long it will take. With `minutes` it is reported
-    /// anyhow.
+    /// Time steps before the run and report by [`Event::Predicted`] how long it will take. With `minutes` it is
+    /// reported anyhow.
     pub predict: bool,
     /// The clock of `minutes`; its zero is when the command began, or these options were made.
     pub clock: Stopwatch,
@@ -88,7 +88,7 @@ pub struct Outcome {
 
 /// Share of the largest number of Gaussians from which on a run is at its cap.
 const AT_CAP: f64 = 0.98;
-/// PSNR of training views below which a cloud at its cap is too small for them, dB: a real room of 292 photos ends at
+/// PSNR of training views below which a cloud at its cap is too small, dB: a real room of 292 photos ends at
 /// 26.5 with 30,000 Gaussians and at 27.4 with 150,000; captures that have enough end above 29
 /// (studies/records/2026-11-26-real-size.md).
 const UNDER_FITTED: f64 = 28.0;
@@ -113,7 +113,7 @@ pub(super) const ROLLBACK_RATE: f64 = 0.5;
 const SMOOTHING: f64 = 0.05;
 /// Seconds between two progress events.
 const PROGRESS_SECONDS: f64 = 0.25;
-/// Puts the newest sound checkpoint into the trainer. A damaged newest one is skipped, and said so.
+/// Loads the newest intact checkpoint. A damaged newest one is skipped with a warning.
 pub(super) fn restore_newest(
     run: &Path,
     trainer: &mut Trainer<'_>,
@@ -223,7 +223,7 @@ impl Session<'_> {
         write_atomically(&self.run.join("recipe.toml"), recipe.to_toml().as_bytes())
     }
 
-    /// Goes to the newest sound checkpoint, and warns of what was skipped.
+    /// Loads the newest intact checkpoint, and warns of what was skipped.
     pub(super) fn restore(&self, trainer: &mut Trainer<'_>, listen: &mut dyn FnMut(&Event)) -> Result<RunState> {
         let (state, warning) = restore_newest(self.run, trainer, &self.identity)?;
         if let Some(message) = warning {
@@ -377,7 +377,7 @@ impl Session<'_> {
         Ok(Outcome { run: self.run.to_owned(), iteration, gaussians, seconds: state.seconds, interrupted: !done })
     }
 
-    /// Says on what it trains, where that was requested or is not what it was before.
+    /// Reports the device if it was requested or has changed.
     fn report_device(&self, trainer: &Trainer<'_>, listen: &mut dyn FnMut(&Event)) {
         let device = &trainer.device;
         // Older runs, from before other devices existed, name none.
@@ -424,7 +424,7 @@ impl Session<'_> {
         self.write_info(totals, trainer, state, finished)
     }
 
-    /// run.json: what the run is and how it went.
+    /// run.json: the run's inputs and its state.
     fn write_info(&self, totals: &Totals, trainer: &Trainer<'_>, state: &RunState, finished: bool) -> Result<()> {
         let (capture, recipe) = (&self.opened.capture, self.recipe);
         let steps = totals.steps.max(1) as f64;

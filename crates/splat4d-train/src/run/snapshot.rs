@@ -1,4 +1,4 @@
-//! The scene while it learns, as a playback file: for the live view. It only reads, so that the result stays the same
+//! The scene during training, as a playback file: for the live view. It only reads, so that the result stays the same
 //! to the bit.
 
 use super::metrics::psnr;

@@ -105,7 +105,7 @@ pub fn train(
     session.drive(&mut trainer, state, &mut listen)
 }
 
-/// A recipe, and what is known of the time that it takes.
+/// A recipe and its estimated time.
 struct Timed {
     recipe: Recipe,
     /// From the command's start to its end.
@@ -174,7 +174,7 @@ pub struct Forecast {
     pub memory: u64,
 }
 
-/// Looks at a capture as `train` would before its first step.
+/// Examines a capture as `train` would before its first step.
 ///
 /// Errors: what `train` would refuse the capture for, images that cannot be read.
 pub fn forecast(capture: Arc<Capture>, listen: &mut dyn FnMut(&Event)) -> Result<Forecast> {
@@ -239,7 +239,8 @@ pub fn resume_with(
     session.drive(&mut trainer, state, &mut listen)
 }
 
-/// A run's recipe and its capture, relative to the offset of the run's scene. Errors: not a run; the capture has gone.
+/// A run's recipe and its capture, relative to the offset of the run's scene. Errors: not a run; the capture is
+/// missing.
 pub fn open_run(run: &Path) -> Result<(Recipe, Capture)> {
     let text = read_text(&run.join("recipe.toml"))?;
     let recipe = Recipe::from_toml(&text).map_err(|e| e.at(run.join("recipe.toml").display()))?;

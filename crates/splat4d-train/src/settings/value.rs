@@ -12,7 +12,7 @@ pub(crate) trait Value: Sized {
     fn choices() -> Vec<&'static str> {
         Vec::new()
     }
-    /// Its number, if it is one: what ranges are about.
+    /// Its number, if it is one, for ranges.
     fn number(&self) -> Option<f64> {
         None
     }

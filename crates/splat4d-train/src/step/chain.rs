@@ -1,6 +1,6 @@
 //! The fixed chain of one step: `motion.at → render → loss → render.backward → motion.backward`.
 //!
-//! Views and the queries of losses that look at several times are merged: one `prepare`, one `at` and one `backward`
+//! Views and the queries of losses over several times are merged: one `prepare`, one `at` and one `backward`
 //! for every distinct (layer, space, time), one `finish`.
 
 use super::channels::{Channels, Source};
@@ -73,9 +73,9 @@ pub(crate) struct Step<'a, F: Real> {
 pub(crate) struct Losses<'a, F: Real> {
     /// Compares images.
     pub image: &'a mut dyn ImageTerm<F>,
-    /// Look at several times.
+    /// Losses over several times.
     pub probes: &'a [Box<dyn ProbeLoss<F>>],
-    /// Look at raw parameters.
+    /// Losses on raw parameters.
     pub params: &'a [Box<dyn ParamLoss<F>>],
 }
 
@@ -145,7 +145,7 @@ impl<F: Real> Chain<F> {
         Ok(report)
     }
 
-    /// Collects the queries: what views see is what is alive, probes add their rows, channels other times.
+    /// Collects the queries: views need the rows that are alive, probes add their rows, channels other times.
     fn request(&mut self, step: &Step<'_, F>, image: &dyn ImageTerm<F>, probes: &[Vec<Probe>]) {
         self.evaluation.begin();
         for view in step.views {

@@ -1,4 +1,4 @@
-//! Further channels of the splats of a view, so that losses can look at them: normals, the way to another time, a
+//! Further channels of the splats of a view, for losses: normals, the displacement to another time, a
 //! column of the Gaussians. Each has its forward and its VJP here.
 
 use crate::loss::image::{Channel, View};
@@ -18,7 +18,7 @@ const CHUNK: usize = 512;
 pub(super) struct Source<'a, F: Real> {
     pub(super) scene: &'a Scene<F>,
     pub(super) view: &'a View<'a, F>,
-    /// By layer: the query that the view's splats answer.
+    /// By layer: the query whose results are the view's splats.
     pub(super) asked: &'a [usize],
 }
 
@@ -35,7 +35,7 @@ pub(super) struct Channels<F> {
     pub(super) table: Table<F>,
     /// The rendered channels, each with its first column.
     pub(super) places: Vec<(Channel, usize)>,
-    /// By channel that renders a way, by layer, where it goes.
+    /// By channel with a displacement, by layer, its target.
     later: Vec<(Channel, Vec<Later>)>,
 }
 

@@ -1,4 +1,4 @@
-//! [`Emphasis`]: pixels that show what moves weigh more. What moves is a small part of most images and the hardest,
+//! [`Emphasis`]: pixels of dynamic regions weigh more. Dynamic regions are a small part of most images and the hardest,
 //! since
 //! a still Gaussian learns from every frame and a moving one from those of its lifespan.
 //!
@@ -13,9 +13,9 @@ use splat4d::scene::Planes;
 use splat4d::simd::{Pass, Simd, dispatch_pass};
 use std::collections::BTreeMap;
 
-/// γ: a channel that is so far from the median counts half (K-Planes' setting of DyNeRF's for all frames).
+/// γ: at this distance from the median a channel counts half (K-Planes' setting of DyNeRF's for all frames).
 const GAMMA: f32 = 0.02;
-/// Rows of pixels of a task: fewer would cost more to hand out than to compute.
+/// Rows of pixels of a task: for fewer, scheduling would cost more than the work.
 const ROWS: usize = 16;
 
 /// Weights of pixels by how much they differ from the static background; none where cameras move, or have few images.
@@ -29,7 +29,7 @@ pub(crate) struct Emphasis {
 }
 
 impl Emphasis {
-    /// Looks at the static background. `None`: nothing is emphasised. Errors: an image cannot be read.
+    /// Computes the static background. `None`: nothing is emphasised. Errors: an image cannot be read.
     pub(crate) fn new(frames: &dyn Frames, strength: f64) -> Result<Option<Self>> {
         if strength <= 0.0 {
             return Ok(None);

@@ -58,7 +58,7 @@ pub struct Measured {
 pub struct Stepped {
     /// Timings and gradients to times and cameras; losses too, where the step is done.
     pub report: StepReport,
-    /// What steps measured that are done now and were not before: this one, or, of a device that is still at it,
+    /// Measurements of the steps that finished since the last call: this one, or, if the device is still busy,
     /// earlier ones.
     pub measured: Vec<Measured>,
     /// Loading images.
@@ -69,7 +69,7 @@ pub struct Stepped {
     pub other: Duration,
     /// Gaussians born, moved, removed.
     pub change: Change,
-    /// What the user should know of the device that renders.
+    /// A message for the user about the rendering device.
     pub notices: Vec<String>,
 }
 
@@ -89,8 +89,8 @@ pub struct Fault(pub String, pub Blame, pub Option<Vec<usize>>);
 
 /// Takes steps on a learner.
 pub trait Engine: Send {
-    /// One step: evaluate, draw, compare, back, Adam, noise. A device may still be at it afterwards. Inner error: it,
-    /// or one before it, was spoilt. Errors: those of what renders.
+    /// One step: evaluate, render, compare, backward, Adam, noise. A device may still be busy with it afterwards. Inner
+    /// error: it, or one before it, was spoilt. Errors: those of what renders.
     fn step(&mut self, train_state: &mut TrainState, plan: &mut StepPlan<'_>) -> Result<Result<Stepped, Fault>>;
 
     /// The learner was changed in other ways than by a step (it was settled before), or another stage begins: what is
@@ -140,7 +140,7 @@ pub(super) fn rates_of(scene: &Scene<f32>, plan: &StepPlan<'_>, all: &mut Rates)
     }
 }
 
-/// Share of a stage after which exposures come to rest: before it they learn at a constant rate, since a rate that
+/// Share of a stage after which exposures are frozen: before it they learn at a constant rate, since a rate that
 /// falls from the start leaves them short in runs of a few dozen images a camera (docs/suite.md).
 const EXPOSURE_RESTS: f64 = 0.7;
 /// What is left of their rate at the end: Adam moves a camera's colours by up to the rate a step whatever the gradient,
@@ -169,7 +169,7 @@ fn learn_exposure(train_state: &mut TrainState, plan: &StepPlan<'_>) {
     }
 }
 
-/// The rate of a layer's positions, by which noise on them goes; none: they rest.
+/// The rate of a layer's positions, which scales their noise; none: they are frozen.
 pub(super) fn noise_rate(plan: &StepPlan<'_>, layer: usize) -> Option<f64> {
     let group = plan.stage.groups.iter().find(|g| g.is_of(layer) && g.column == "means")?;
     Some(group.rate.at(plan.info.progress) * plan.stage.settled(plan.info.progress))
@@ -229,7 +229,7 @@ impl<'a> CpuEngine<'a> {
         codec.show(scene, &plan.info.times, &mut self.shown);
     }
 
-    /// Evaluate, draw, compare, and all the backward pass: fills the gradients.
+    /// Evaluate, render, compare, and all the backward pass: fills the gradients.
     fn evaluate(&mut self, train_state: &mut TrainState, plan: &mut StepPlan<'_>, out: &mut Stepped) -> Result<()> {
         let Parts { scene, stats, exposure, .. } = train_state.parts_mut();
         let scene = if plan.stage.codec.is_some() { &self.shown } else { &*scene };
@@ -285,7 +285,7 @@ impl<'a> CpuEngine<'a> {
         Err(Fault(format!("`{column}` of Gaussian {row} of layer {layer} is not finite"), Blame::Numbers, None))
     }
 
-    /// Noise on positions, where the stage has it.
+    /// Noise on positions, if the stage has it.
     fn add_noise(&self, train_state: &mut TrainState, plan: &StepPlan<'_>) {
         let Some(noise) = plan.stage.noise else { return };
         let (rate, rng) = (|layer: usize| noise_rate(plan, layer), noise_stream(plan));

@@ -1,4 +1,4 @@
-//! [`Pace`]: how fast a run goes through its schedule.
+//! [`Pace`]: how fast a run proceeds through its schedule.
 //!
 //! All that depends on a run's length (rates, densification, resolution, degrees of SH, stages) is stated in steps of
 //! its *schedule*, of which there are `run.iterations`. A step of the run is one of the schedule, until the run is

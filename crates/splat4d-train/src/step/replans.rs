@@ -1,8 +1,8 @@
-//! `run.replans`: changes of a run's length while it goes, as they were made.
+//! `run.replans`: changes of a run's length during the run, in order.
 
 use crate::settings::Value;
 
-/// A change of a run's length while it goes.
+/// A change of a run's length during the run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ScheduleChange {
     /// Steps that had been taken.

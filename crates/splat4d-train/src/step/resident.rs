@@ -45,7 +45,7 @@ struct UnderWay {
 pub(crate) struct DeviceEngine<'a> {
     cpu: CpuEngine<'a>,
     newest: Newest,
-    /// Whether the device has failed, or has no room.
+    /// Whether the device has failed or is out of memory.
     given_up: bool,
     /// Whether it was reported that the CPU keeps the tables.
     told: bool,
@@ -101,7 +101,7 @@ impl<'a> DeviceEngine<'a> {
         }))
     }
 
-    /// Hands the tables over, if what is kept is stale.
+    /// Uploads the tables if the device's copy is stale.
     fn keep(&mut self, train_state: &TrainState, plan: &StepPlan<'_>) -> Result<()> {
         if self.newest != Newest::TrainState {
             return Ok(());
@@ -122,7 +122,7 @@ impl<'a> DeviceEngine<'a> {
         Ok(())
     }
 
-    /// Remembers what steps measured that are done. Errors: one was spoilt.
+    /// Stores the measurements of finished steps. Errors: one is invalid.
     fn take_in(&mut self, train_state: &TrainState, done: Vec<ResidentStepped>) -> std::result::Result<(), Fault> {
         for stepped in done {
             let UnderWay { iteration, dssim, frames } =
@@ -182,7 +182,7 @@ fn kept<'a>(
     }
 }
 
-/// What a device knows of all layers for a step, or why the step is the CPU's.
+/// All layers of a step for a device, or the reason why the CPU takes the step.
 fn known(
     train_state: &TrainState,
     plan: &StepPlan<'_>,

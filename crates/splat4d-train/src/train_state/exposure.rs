@@ -10,7 +10,7 @@ use splat4d::simd::{Kernel, Simd, dispatch, each};
 const COLUMNS: usize = 12;
 /// The first offset.
 const OFFSET: usize = 9;
-/// Pixels of a piece of parallel work: sums are by piece and in order, so that they do not depend on the threads.
+/// Pixels of a piece of parallel work: sums are per piece and in order, so that they do not depend on the threads.
 const PIECE: usize = 8192;
 /// Pixels that are computed together: a register of AVX-512.
 const LANES: usize = 16;
@@ -54,7 +54,7 @@ fn pieces(picture: &mut Planes<f32>) -> impl IndexedParallelIterator<Item = [&mu
     cut(red).zip(cut(green)).zip(cut(blue)).map(|((r, g), b)| [r, g, b])
 }
 
-/// Shows the colours of a piece in place.
+/// Applies the exposure to a piece in place.
 fn respond(row: &[f32; COLUMNS], [r, g, b]: [&mut [f32]; 3]) {
     for ((r, g), b) in r.iter_mut().zip(g).zip(b) {
         [*r, *g, *b] = shown(row, [*r, *g, *b]);

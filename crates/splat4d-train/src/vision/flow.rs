@@ -6,7 +6,7 @@ use super::raster::{blurred, every_second, sample};
 use rayon::prelude::*;
 use splat4d::scene::Planes;
 
-/// Shorter side of the smallest image, pixels: patches must have room to move.
+/// Shorter side of the smallest image, pixels: patches must be able to move.
 const SMALLEST: usize = 56;
 /// Images of falling size; motion of up to some 30 pixels is followed.
 const LEVELS: usize = 4;

@@ -20,7 +20,7 @@ pub(crate) struct Track {
 
 /// Neighbours with which a camera is compared, at most.
 const NEIGHBOURS: usize = 10;
-/// Cameras whose axes are farther apart see other sides of things, degrees.
+/// Cameras whose axes are farther apart see other sides of objects, degrees.
 const WIDEST: f64 = 70.0;
 /// Depths at which two cameras should see the same, of the distance between them: they are then seen at 40 to 3
 /// degrees.
@@ -112,7 +112,7 @@ const GROWTH: f64 = 1.25;
 
 /// Share of a camera's image that another one holds too, at the depth where it holds most.
 fn overlap(a: &Camera, b: &Camera) -> f64 {
-    /// Pixels along either side that are asked.
+    /// Search radius in pixels.
     const ASKED: usize = 5;
     let baseline = norm(sub(a.center(), b.center()));
     if dot(a.forward(), b.forward()) < WIDEST.to_radians().cos() {
@@ -131,7 +131,7 @@ fn overlap(a: &Camera, b: &Camera) -> f64 {
     DEPTHS.into_iter().map(held).fold(0.0, f64::max)
 }
 
-/// Two features that look alike.
+/// A match of two features.
 struct Match {
     features: [usize; 2],
     /// Distance of the descriptors, of that to the second best.

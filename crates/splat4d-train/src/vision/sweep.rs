@@ -25,7 +25,7 @@ const SIDE: usize = 2 * HALF + 1;
 const WINDOW: usize = SIDE * SIDE;
 /// Neighbours that an image is compared with, at most.
 const NEIGHBOURS: usize = 4;
-/// A window whose grey values spread less than this (standard deviation, in [0, 1]) looks the same everywhere.
+/// A window whose grey values spread less than this (standard deviation, in [0, 1]) is uniform.
 const TEXTURE: f32 = 0.012;
 /// Least correlation of a window after tilting, and of one that is tilted.
 const ALIKE: f32 = 0.8;
@@ -50,11 +50,11 @@ const TILT: f64 = 1.0;
 const HALVINGS: usize = 4;
 /// Rounds of moves before they are halved.
 const ROUNDS: usize = 2;
-/// Points that a camera must see before they say in which depths to look.
+/// Points that a camera must see before they determine the range of depths.
 const ENOUGH: usize = 12;
-/// Of the points that a camera sees, those that may be wrong at either end.
+/// Of the points that a camera sees, the share of outliers at either end.
 const STRAY: f64 = 0.02;
-/// Surfaces may come nearer than what points were found on, times.
+/// Surfaces may be nearer than the points, by this factor.
 const BEYOND: f64 = 1.6;
 /// Without points: nearest depth, of the distance to the nearest neighbour.
 const UNKNOWN: f64 = 1.0;
@@ -96,7 +96,7 @@ struct Patch {
     tilt: [f64; 2],
 }
 
-/// At most `count` points, in the order of views. `known`: points that say in which depths to look, and which views are
+/// At most `count` points, in the order of views. `known`: points that determine the depths, and which views are
 /// neighbours.
 pub(crate) fn sweep(views: &[View], known: &[[f64; 3]], count: usize) -> Vec<Swept> {
     let references: Vec<Option<Reference<'_>>> =
@@ -292,7 +292,7 @@ impl<'a> Reference<'a> {
         (best.1 >= ALIKE).then_some(best.0)
     }
 
-    /// Whether this view finds, by itself, the point that `other` has at a pixel and an inverse depth.
+    /// Whether this view alone finds the point that `other` has at a pixel and an inverse depth.
     fn confirms(&self, other: &Reference<'_>, pixel: [f64; 2], inverse: f64) -> bool {
         let point = other.view.camera.unproject(pixel, 1.0 / inverse);
         let Some((here, z)) = self.view.camera.project(point).filter(|(p, _)| self.view.holds(*p)) else {
@@ -385,7 +385,7 @@ fn angle_worth(degrees: f64) -> f64 {
 
 /// Pixels that the middle of an image moves over in a neighbour between infinity and an inverse depth.
 fn path(view: &View, transfer: &Transfer, to: f64) -> f64 {
-    /// Pieces of the way: it is nearly straight, and not evenly fast.
+    /// Segments of the path: it is nearly straight, at a varying speed.
     const PIECES: usize = 8;
     let middle = [0.5 * view.camera.width as f64, 0.5 * view.camera.height as f64];
     let places: Vec<[f64; 2]> =

@@ -1,5 +1,5 @@
-//! Focal lengths and distortion: those at which matches are on their epipolar lines and colours of points are those of the
-//! images.
+//! Focal lengths and distortion: those at which matches are on their epipolar lines and colours of points are those of
+//! the images.
 
 use super::super::Capture;
 use super::super::account::Severity;
@@ -23,7 +23,7 @@ const REACH: f64 = 1.0;
 const BETTER: f64 = 1.5;
 const ENOUGH: f64 = 30.0;
 const SHARE: f64 = 0.15;
-/// How well matches may fit half or twice the focal length, of as read, where they determine it.
+/// Largest share of the error as read that matches may have at half or twice the focal length, where they determine it.
 const FLAT: f64 = 0.7;
 /// By how much colours of points fit another focal length better, where that is right.
 const COLOURS: f64 = 0.1;
@@ -47,8 +47,8 @@ impl Tried {
     }
 }
 
-/// A warning where points or matches need other focal lengths; a note where matches fit any. `None`: they are right, or there
-/// is no evidence. `matches`: none were searched for where points have shown that poses are right.
+/// A warning where points or matches need other focal lengths; a note where matches fit any. `None`: they are right, or
+/// there is no evidence. `matches`: none were searched for where points have shown that poses are right.
 pub(super) fn check(
     capture: &Capture,
     matches: Option<&[Match]>,

@@ -48,7 +48,7 @@ pub struct PoseCheck {
     pub written_as: Option<Poses>,
     /// What was found, or why nothing could be.
     pub finding: Finding,
-    /// What else images say: of single poses, focal lengths and masks.
+    /// Further findings from images: single poses, focal lengths and masks.
     pub more: Vec<Finding>,
     /// Whether the finding is another convention.
     misread: bool,
@@ -326,7 +326,7 @@ impl Measure {
         points + self.pairs.share() + 0.5 * self.foreground.unwrap_or(0.0)
     }
 
-    /// What speaks for the poses as they are read, or why nothing does.
+    /// Evidence for the poses as read, or the reason why there is none.
     fn agrees(&self) -> Finding {
         let mut parts = Vec::new();
         if self.points.convinces() {

@@ -16,7 +16,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 /// Captures of at most so many places are compared image by image; of larger ones the conspicuous poses.
 const ALL: usize = 24;
-/// Conspicuous poses that are looked into at most, and of all places: where more are so, it is how the capture is.
+/// Conspicuous poses that are examined at most, and share of all positions: more are a property of the capture.
 const SUSPECTS: usize = 4;
 const FEW: f64 = 0.2;
 /// Images before and after that an image is compared with: in most captures they overlap.
@@ -27,7 +27,7 @@ const OVERLAP: usize = 20;
 /// poses less than all, and a wrong pose fits what is near its lines by chance. Between them nothing is reported.
 const FITS: [f64; 2] = [0.4, 0.15];
 /// Gain of the colours of initial points from which an image alone shows that its pose is right: exchanged images of
-/// one scene gain 0.14 (see `points`). Looking for features takes forty times as long.
+/// one scene gain 0.14 (see `points`). Feature detection takes forty times as long.
 const VOUCHED: f64 = 0.3;
 /// Gain of an image below which it does not fit the points, where the images in the middle gain so much.
 const STRANGE: (f64, f64) = (0.1, 0.35);
@@ -60,7 +60,7 @@ impl Sign {
     }
 }
 
-/// Looks for single wrong poses; `looks` are images that are read already.
+/// Searches for single wrong poses; `looks` are images that were already read.
 pub(super) fn check(capture: &Capture, looks: Vec<SmallImage>, pixels: usize) -> Vec<Finding> {
     let order = places(capture);
     let signs = signs(capture, &order);
@@ -179,7 +179,7 @@ impl Strange {
     }
 }
 
-/// Looks for such images among those that are read already and some more.
+/// Searches for such images among those that were already read and some more.
 fn strange(
     capture: &Capture,
     order: &[usize],

@@ -24,7 +24,7 @@ const RIVAL: f64 = 0.8;
 /// Share of the matches that a right convention fits at least: many are chance.
 const FITTING: f64 = 0.2;
 
-/// Two features that look alike, of these looks: their rays.
+/// A match of features of these two images: their rays.
 pub(super) struct Match {
     looks: [usize; 2],
     rays: [[f64; 2]; 2],
@@ -32,7 +32,7 @@ pub(super) struct Match {
 
 #[cfg(test)]
 impl Match {
-    /// The two looks.
+    /// The two images.
     pub(super) fn looks(&self) -> [usize; 2] {
         self.looks
     }
@@ -71,7 +71,7 @@ pub(super) fn prefers(m: &Measure) -> bool {
     m.convinces() && m.gained >= MORE.0 && m.gained >= MORE.1 * m.lost && stated as f64 <= RIVAL * m.fitting as f64
 }
 
-/// Mutual best matches of all pairs of looks but those of one pose, which fits them in any convention.
+/// Mutual best matches of all pairs of images except those of one pose, which agree in any convention.
 pub(super) fn matches(looks: &[SmallImage]) -> Vec<Match> {
     let all = (0..looks.len()).flat_map(|a| (a + 1..looks.len()).map(move |b| [a, b]));
     let pairs: Vec<[usize; 2]> = all.filter(|&[a, b]| !same_pose(&looks[a].camera, &looks[b].camera)).collect();
@@ -106,7 +106,7 @@ pub(super) fn between(looks: [usize; 2], from: &[Mark], to: &[Mark], ratio: f64)
     forth.into_iter().enumerate().filter_map(good).collect()
 }
 
-/// Measures every convention; `poses` are those of the looks in each, the first as read.
+/// Measures every convention; `poses` are those of the images in each convention, the first as read.
 pub(super) fn measure(matches: &[Match], looks: &[SmallImage], poses: &[Option<Vec<Se3>>]) -> Vec<Measure> {
     let fits: Vec<Vec<bool>> = poses
         .iter()
@@ -130,7 +130,7 @@ pub(super) fn measure(matches: &[Match], looks: &[SmallImage], poses: &[Option<V
         .collect()
 }
 
-/// How many of the matches of two looks their poses fit.
+/// Number of matches of two images that agree with their poses.
 pub(super) fn fitting(matches: &[Match], looks: &[SmallImage], poses: &[Se3]) -> usize {
     let centers: Vec<[f64; 3]> = poses.iter().map(|p| p.inverse().translation).collect();
     let least = least(&centers);
@@ -160,7 +160,7 @@ pub(super) fn residuals(matches: &[Match], looks: &[SmallImage], poses: &[Se3], 
     matches.iter().map(residual).collect()
 }
 
-/// The distance of a match from the place or line where a static scene has it, pixels of the small image.
+/// The distance of a match from its position or epipolar line in a static scene, pixels of the small image.
 pub(super) fn distance(m: &Match, looks: &[SmallImage], poses: &[Se3]) -> f64 {
     let [a, b] = m.looks;
     let motion = poses[b].after(&poses[a].inverse());

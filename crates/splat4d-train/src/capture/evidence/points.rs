@@ -13,7 +13,7 @@ use splat4d::math::Se3;
 use splat4d::math::se3::{norm, sub};
 use std::collections::BTreeSet;
 
-/// Cameras and points that are asked, at most, evenly chosen.
+/// Cameras and points that are sampled, at most, evenly chosen.
 const CAMERAS: usize = 24;
 const POINTS: usize = 400;
 /// Share of points in images, and gain of colours, from which poses are right.
@@ -27,7 +27,7 @@ const APART: f64 = 0.05;
 const FEW: usize = 100;
 /// Share of points that another convention shows at least, and how many times that of the poses as read.
 const SHOWN: (f64, f64) = (0.25, 4.0);
-/// The same without colours that say anything.
+/// The same without informative colours.
 const ALONE: f64 = 10.0;
 /// By how much another convention's colours fit better at least, where points in images already indicate it; else
 /// alone.
@@ -41,7 +41,7 @@ const ENOUGH: usize = 60;
 /// What points show about one convention.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Measure {
-    /// Points that were asked.
+    /// Points that were sampled.
     pub(super) asked: usize,
     /// Part of (camera, point) in front and inside.
     pub(super) seen: f64,
@@ -52,7 +52,7 @@ pub(super) struct Measure {
 }
 
 impl Measure {
-    /// The finding where points fit neither poses nor images. `None`: nothing speaks against them.
+    /// The finding where points fit neither poses nor images. `None`: there is no evidence against them.
     pub(super) fn doubt(&self, pairs: &pairs::Measure) -> Option<Finding> {
         if self.asked > 0 && self.seen == 0.0 {
             return Some(self.elsewhere());
@@ -109,13 +109,13 @@ impl Measure {
     }
 }
 
-/// The training frames whose cameras are asked.
+/// The training frames whose cameras are sampled.
 pub(super) fn frames(capture: &Capture) -> Vec<usize> {
     let step = capture.train.len().div_ceil(CAMERAS).max(1);
     capture.train.iter().step_by(step).copied().collect()
 }
 
-/// Measures one convention: `spread` are frames with their poses in it, `looks` images with theirs.
+/// Measures one convention: `spread` are frames with their poses in it, `looks` are images with theirs.
 pub(super) fn measure(
     capture: &Capture,
     (frames, poses): (&[usize], &[Se3]),
@@ -134,7 +134,7 @@ pub(super) fn measure(
     Measure { asked: chosen.len(), seen: share, gain, compared: compared.unwrap_or(0) }
 }
 
-/// Every how many points one is asked.
+/// Stride of the sampled points.
 fn step(cloud: &PointCloud) -> usize {
     cloud.points.len().div_ceil(POINTS).max(1)
 }
@@ -215,7 +215,7 @@ const GRID: usize = 24;
 const AGREE: f64 = 0.03;
 const UNIT: (f64, f64) = (0.4, 1.5);
 
-/// What is looked up in a depth map: pixels, and for each the unit that asks and the depth that it expects.
+/// Lookups in a depth map: pixels, and for each the querying unit and its expected depth.
 struct Asked<'a> {
     frame: &'a Frame,
     pixels: Vec<[f64; 2]>,
@@ -303,11 +303,11 @@ fn by_views(capture: &Capture) -> Option<f64> {
     }
 }
 
-/// What is known of the unit of metric depth maps.
+/// Findings about the unit of metric depth maps.
 pub(super) enum Unit<'a> {
     /// There are no such maps, or it is right.
     Right,
-    /// How many times as far away things are as they say, the evidence, and a map's file.
+    /// Ratio of true to stated depths, the evidence, and a map's file.
     Wrong(f64, &'static str, &'a DepthFile),
     /// Neither points nor other maps determine it.
     Unknown,

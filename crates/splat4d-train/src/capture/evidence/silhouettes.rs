@@ -7,10 +7,10 @@ use splat4d::math::se3::{dot, norm, normalize, sub};
 
 /// Images with a foreground that are needed.
 const ENOUGH: usize = 4;
-/// Angle between the ray to a foreground's middle and the common place, radians: things move, and are seen from other
+/// Angle between the ray to a foreground's middle and the common place, radians: objects move, and are seen from other
 /// sides.
 const WITHIN: f64 = 0.2;
-/// Of the cameras' spread: what is nearer is no place in front of a camera.
+/// Of the cameras' spread: nearer positions are not in front of a camera.
 const CLOSE: f64 = 0.05;
 /// Part of the images from which poses are right, and below which another convention may be.
 pub(super) const CONVINCES: f64 = 0.7;
@@ -21,7 +21,7 @@ const EDGE: f64 = 0.9;
 /// Part of the images whose hidden part is at one place, from which masks are inverted: foregrounds of good captures
 /// are at one place in 70 % and more.
 const INVERTED: f64 = 0.8;
-/// Angle between a camera's axis and what it was pointed at, radians: in the middle half of usual fields of view.
+/// Angle between a camera's axis and its target, radians: in the middle half of usual fields of view.
 const AIMED: f64 = 0.35;
 /// Mean difference of two masks below which they are one: they hide a part of the camera, such as its own mount.
 const ONE_MASK: f64 = 0.01;
@@ -35,14 +35,14 @@ pub(super) fn measure(looks: &[SmallImage], poses: &[Se3]) -> Option<f64> {
 pub(super) enum Masks {
     /// There are none, or foregrounds are at one place.
     Fine,
-    /// What they hide is at the place that cameras look at: part of the images, share of what is shown, and of the
+    /// The hidden parts are where the cameras point: part of the images, share of what is shown, and of the
     /// edges.
     Inverted(f64, f64, f64),
     /// Neither: images with masks that were examined, and the share of what is shown.
     Unsure(usize, f64),
 }
 
-/// Whether masks or alpha hide what cameras look at, and show what is around it.
+/// Whether masks or alpha hide the cameras' target and show its surroundings.
 pub(super) fn masks(looks: &[SmallImage], poses: &[Se3]) -> Masks {
     let shown: Vec<&Shown> = looks.iter().filter_map(|l| l.shown.as_ref()).collect();
     if shown.is_empty() || measure(looks, poses).is_some_and(|share| share >= CONVINCES) {
@@ -65,7 +65,7 @@ pub(super) fn masks(looks: &[SmallImage], poses: &[Se3]) -> Masks {
 }
 
 /// Part of the images that have `what` at the place that is nearest to all, and the median angle between that place and
-/// the cameras' axes, radians; `None`: too few have it.
+/// the cameras' axes, radians; `None`: too few meet it.
 fn at_one_place(
     looks: &[SmallImage],
     poses: &[Se3],

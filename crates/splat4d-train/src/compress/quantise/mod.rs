@@ -23,7 +23,7 @@ use splat4d::scene::LifeKind;
 use splat4d::scene::{BLOCK, Grads, SH, Space, Table, Time};
 use std::sync::{Arc, Mutex, MutexGuard};
 
-/// Rates of fine-tuning fall to this share of themselves, so that numbers come to rest on one side of a rounding.
+/// Rates of fine-tuning fall to this share of themselves, so that numbers settle on one side of a rounding threshold.
 const FALL: f64 = 0.1;
 /// The palette's entries learn this much slower than base colours, as rows' own coefficients do (Kerbl et al. 2023).
 const SH_SLOWDOWN: f64 = 20.0;
@@ -177,7 +177,7 @@ pub(crate) fn tuned(groups: Vec<Group>, share: f64) -> Vec<Group> {
     groups.into_iter().map(|g| Group { rate: fall(g.rate), ..g }).collect()
 }
 
-/// The rate of a palette that goes with [`tuned`].
+/// The rate of a palette for [`tuned`].
 pub(crate) fn palette_rate(rates: &RateSettings, share: f64) -> Rate {
     let rate = share * rates.feature * rates.decay / SH_SLOWDOWN;
     Rate { start: rate, end: FALL * rate }

@@ -1,4 +1,4 @@
-//! Known depth: what a pixel shows is as far away as the capture's depth map states, as far as the map knows that.
+//! Known depth: the rendered depth of a pixel equals that of the capture's depth map, where the map has it.
 
 use super::{ImageTerm, Needs, PictureGrads, SEEN, Shown, View, expected_depth_backward, over_rows};
 use crate::capture::DepthKind;
@@ -7,7 +7,7 @@ use crate::loss::terms::StepInfo;
 use splat4d::math::{Real, median_by};
 use splat4d::scene::Planes;
 
-/// [`depth`] of views that know theirs, times a weight that falls to [`LAST`] of it by the end: a map that is wrong
+/// [`depth`] of views that have depth, times a weight that falls to [`LAST`] of it by the end: a map that is wrong
 /// bends the scene early, and images decide in the end.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Depth(pub f64);
@@ -51,7 +51,7 @@ fn charbonnier<F: Real>(e: F) -> (F, F) {
 /// fitted to the map and then held would reward a rendering without any shape. No unit.
 ///
 /// Shapes: `pictures` Σ z α T and A, [1, h, w]; `d` adds up their gradients.
-/// Sources: Ranftl et al. 2020 (MiDaS) for what is free of scale and shift, with moments for medians; Li et al. 2021
+/// Sources: Ranftl et al. 2020 (MiDaS) for invariance to scale and shift, with moments for medians; Li et al. 2021
 /// (NSFF) for its use on moving scenes.
 pub(crate) fn depth<F: Real>(
     [depth, alpha]: [&Planes<F>; 2],

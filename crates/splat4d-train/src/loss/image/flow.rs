@@ -1,11 +1,11 @@
-//! Flow and tracks: what a pixel shows goes where the truth states, by the next frame or by any other.
+//! Flow and tracks: the rendered displacement of a pixel equals the truth, to the next frame or to any other.
 
 use super::{Channel, ImageTerm, Needs, PictureGrads, SEEN, Shown, View, over_rows};
 use crate::loss::terms::StepInfo;
 use splat4d::math::Real;
 use splat4d::scene::Planes;
 
-/// [`flow()`] of views that know theirs, times a weight.
+/// [`flow()`] of views that have flow, times a weight.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Flow(pub f64);
 
@@ -27,7 +27,7 @@ impl<F: Real> ImageTerm<F> for Flow {
     }
 }
 
-/// [`tracks()`] of views that know some, times a weight.
+/// [`tracks()`] of views that have tracks, times a weight.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Tracks(pub f64);
 
@@ -66,8 +66,8 @@ const HUBER: f64 = 3.0;
 
 /// Mean over pixels of tracked points that show something of h(‖F − F*‖₂) over the image's longer side, F as in
 /// [`flow`] but
-/// to the time of the track's other end: r²/(2δ) to δ = 3 pixels, and r − δ/2 beyond (Huber). What the pixel shows is followed by
-/// the weights with which it is blended: the point is where these Gaussians are, and goes where they go.
+/// to the time of the track's other end: r²/(2δ) to δ = 3 pixels, and r − δ/2 beyond (Huber). The surface at the pixel
+/// is followed by the weights with which it is blended: the point is where these Gaussians are, and moves with them.
 ///
 /// Shapes: as [`flow`]. Source: Wang et al. 2024 (Shape of Motion), track reprojection, with Huber's penalty.
 pub(crate) fn tracks<F: Real>(drawn: &Planes<F>, truth: &Planes<F>, weight: f64, d: &mut Planes<F>) -> f64 {

@@ -1,4 +1,4 @@
-//! The contract of losses on rendered images, [`ImageTerm`]: it states which channels it needs, looks at an image and
+//! The contract of losses on rendered images, [`ImageTerm`]: it states which channels it needs, compares an image and
 //! its truth, and adds its gradient.
 
 use crate::capture::frames::{DepthTruth, FlowTruth};
@@ -35,9 +35,9 @@ pub struct View<'a, F = f32> {
     pub mask: Option<&'a Planes<F>>,
     /// Pixels that count, 1 channel.
     pub weight: Option<&'a Planes<F>>,
-    /// How far away what it shows is, as far as that is known.
+    /// Its depth, where known.
     pub depth: Option<DepthTruth<'a, F>>,
-    /// Where its pixels go, as far as that is known.
+    /// Its optical flow, where known.
     pub flow: Option<FlowTruth<'a, F>>,
     /// Where tracked points are at another time: flow that is known in their pixels alone.
     pub tracks: Option<FlowTruth<'a, F>>,
@@ -53,13 +53,13 @@ pub struct View<'a, F = f32> {
 pub enum Channel {
     /// Σ α T n, n the shortest axis of a splat towards the camera, camera axes, 3 planes.
     Normals,
-    /// Σ α T f, f the way of a splat's centre on the screen to where the view's flow goes, pixels, 2 planes, and Σ α T
-    /// of the splats that have an f. Only views that know their flow may request it.
+    /// Σ α T f, f the displacement of a splat's centre on the screen to the time of the view's flow, pixels, 2 planes,
+    /// and Σ α T of the splats that have an f. Only views with flow may request it.
     Flow,
-    /// The same for where the view's tracks go.
+    /// The same to the time of the view's tracks.
     Tracks,
     /// Σ α T s, s the sigmoid of this column of the Gaussians, 1 plane; 0 in layers without that column, and not
-    /// rendered where no layer has it.
+    /// rendered if no layer has it.
     Sigmoid(String),
 }
 
@@ -72,7 +72,7 @@ impl Channel {
         }
     }
 
-    /// The other time at which it looks at the view's splats.
+    /// The other time at which it needs the view's splats.
     pub(crate) fn other_time<F: Copy>(&self, view: &View<'_, F>) -> Option<Time> {
         match self {
             Channel::Flow | Channel::Tracks => Some(self.way(view)?.to),
@@ -80,7 +80,7 @@ impl Channel {
         }
     }
 
-    /// What is known of the way that it renders.
+    /// Known motion of a channel to render.
     pub(crate) fn way<'a, F: Copy>(&self, view: &View<'a, F>) -> Option<FlowTruth<'a, F>> {
         match self {
             Channel::Flow => view.flow,
@@ -95,7 +95,7 @@ impl Channel {
 pub struct Needs {
     /// Σ z α T.
     pub depth: bool,
-    /// Further channels, in order, none twice.
+    /// Further channels, in order, without duplicates.
     pub extra: Vec<Channel>,
 }
 
@@ -220,7 +220,7 @@ pub trait ImageTerm<F: Real = f32>: Send {
         Needs::default()
     }
 
-    /// Whether it looks at this view: where it does not, its value is 0 and it adds no gradient.
+    /// Whether it applies to this view: if not, its value is 0 and it adds no gradient.
     fn looks_at(&self, _view: &View<'_, F>) -> bool {
         true
     }

@@ -48,7 +48,7 @@ pub(super) fn keys(interval: usize, times: &[f64], fps: f64) -> Vec<f64> {
 
 /// Gives every layer of `scene` masks: at a key time, the Gaussians that any training view of that time shows (weight
 /// above 0, behind what hides them). One whose lifespan is between two key times and meets none is admitted at both;
-/// one that lives wholly before or after all training frames at none. Masks that the layers have count for nothing.
+/// one that is alive only before or after all training frames at none. Existing masks of the layers are ignored.
 /// `progress` hears of views done and in all.
 ///
 /// Errors: there is no frame.

@@ -35,8 +35,8 @@ pub(crate) struct ScoreConfig {
     pub combine: Combine,
     /// Whether the temporal score is multiplied with a power of the volume in space and time.
     pub volume: bool,
-    /// Power of the mean share that a Gaussian has of the pixels it touches. Above 0, haze goes first: it costs a blend
-    /// as much a pixel as what is solid does, and gives less (our own addition; 0: as published).
+    /// Power of the mean share that a Gaussian has of the pixels it touches. Above 0, haze is pruned first: it costs as
+    /// much blending per pixel as solid Gaussians, and contributes less (our own addition; 0: as published).
     pub cost: f64,
     /// Frames of a unit of time, in which derivatives of the lifespan are measured (`UNIT_FRAMES`).
     pub unit: f64,

@@ -46,15 +46,16 @@ pub enum Spatial {
     /// Σ over pixels and channels of the squared change that its removal alone would make. Neighbours of one colour
     /// replace each other, and may all go.
     Change,
-    /// The geometric mean of both in each view: neither what covers nor what differs from what is behind goes first.
+    /// The geometric mean of both in each view: neither covering Gaussians nor those that differ from the background
+    /// are pruned first.
     Both,
     /// Opacity at every time at which a view shows it (3DGS).
     Opacity,
     /// The share, times min(V/V₉₀, 1)^0.1 of the volume: the global significance of LightGaussian (Fan et al. 2024).
     LightGaussian,
     /// The sixth root of the determinant of the 6x6 Fisher block of mean and scale over all views: the rank of its
-    /// logarithm, by which PUP 3D-GS (Hanson et al. 2025) prunes in rounds. What one view alone shows has no full block
-    /// and goes first.
+    /// logarithm, by which PUP 3D-GS (Hanson et al. 2025) prunes in rounds. Gaussians in a single view have no full
+    /// block and are pruned first.
     Pup,
     /// Σ over pixels and channels of the squared gradient to the bare bell (Speedy-Splat, Hanson et al. 2025).
     Speedy,

@@ -67,9 +67,9 @@ impl Pacing {
 }
 
 impl ChunkEstimate {
-    /// Looks at a take as `train` would before its first step, of which at least [`look_ahead`](super::look_ahead) is
+    /// Examines a take as `train` would before its first step, of which at least [`look_ahead`](super::look_ahead) is
     /// listed. Within `minutes`, if there are any, from the start of `clock` on, and within the recipe's memory limit.
-    /// What the caller does after training takes as long as `finish` steps at its end. `timed`: steps are timed even
+    /// The caller's work after training takes as long as the last `finish` steps. `timed`: steps are timed even
     /// without `minutes`. `None`: the capture is learnt at once.
     ///
     /// Errors: what the recipe requests cannot be had in chunks, or not within these limits; images that cannot be

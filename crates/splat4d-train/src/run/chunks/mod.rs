@@ -42,13 +42,13 @@ const FRAMES: usize = 60;
 /// A capture of so many frames is learnt at once where the recipe leaves it open: the cap's Gaussians are enough for
 /// it.
 const WHOLE: usize = 300;
-/// Seconds between two looks whether other workers are done.
+/// Seconds between two checks whether other workers are done.
 const POLL: Duration = Duration::from_secs(1);
 /// Folder of the chunks in a run.
 const FOLDER: &str = "chunks";
 /// Folder in it whose lock states who writes the playback file.
 const FILM: &str = "film";
-/// Time between two looks whether it may be written.
+/// Time between two checks whether it may be written.
 const TURNS: Duration = Duration::from_millis(200);
 /// File of the plan in it.
 const PLAN: &str = "plan.json";
@@ -86,7 +86,7 @@ pub struct Chunked {
     plan: ChunkPlan,
     /// What the lenses of the capture recorded, from the part that was opened first: it is the same for all.
     lenses: Lenses,
-    /// Keeps what this worker does to its minutes.
+    /// Limits this worker to its minutes.
     pacing: Option<Pacing>,
 }
 
@@ -180,7 +180,7 @@ impl Chunked {
     }
 
     /// All parts, in an order in which one worker can do them: an odd chunk as soon as both its neighbours are there,
-    /// so that what is finished has few gaps.
+    /// so that the finished part has few gaps.
     pub fn parts(&self) -> Vec<Part> {
         let count = self.plan.len();
         let chunks = (0..count).map(|k| match k {
@@ -226,7 +226,7 @@ impl Chunked {
         })
     }
 
-    /// Does one part; nothing where it is done. Errors: parts before it are missing, another worker has it, and those
+    /// Trains one part, unless it is done. Errors: parts before it are missing, another worker has it, and those
     /// of training.
     pub fn work(
         &self,
@@ -392,7 +392,7 @@ fn beginning(capture: &Capture, plan: &ChunkPlan) -> Capture {
     Capture { train, ..capture.clone() }
 }
 
-/// The frames of a capture to look at first: they show whether it is a long capture.
+/// The frames of a capture to examine first: they show whether it is a long capture.
 pub fn look_ahead(recipe: &Recipe) -> Vec<Range<usize>> {
     let first = recipe.capture.first_frame;
     let look = first..first.saturating_add(recipe.chunks.frames.max(WHOLE)).saturating_add(1);

@@ -2,7 +2,7 @@
 //!
 //! Temporal medians of every fixed camera over parts of the capture are a capture of their own, on which a still scene
 //! is trained as any other run is. Of its Gaussians those stay that most cameras see where next to nothing ever
-//! changes: what is left out is learnt by the chunks, what would be wrong in there they could not mend.
+//! changes: chunks learn what it omits, but cannot correct errors in it.
 
 use super::Chunked;
 use crate::Result;
@@ -45,16 +45,17 @@ const MEDIAN_OF: usize = 9;
 const CHANGED: f32 = 0.06;
 /// A pixel is calm where at most this share of the frames that are examined has changed.
 const CALM: f64 = 0.1;
-/// Steps of the layer, in those of a chunk: every chunk shows it and none can mend it (docs/scale.md has the figures).
+/// Steps of the layer, in those of a chunk: every chunk shows it and none can correct it (docs/scale.md has the
+/// figures).
 pub(super) const STEPS: usize = 4;
-/// A Gaussian stays where at least this share of the cameras that look at it finds it calm.
+/// A Gaussian stays where it is static in at least this share of the cameras that see it.
 const AGREED: f64 = 0.5;
 
 /// What a finished part states.
 pub(super) struct Shared {
     /// The static background, as it was learnt; none: nothing does.
     pub still: Option<Layer<f32>>,
-    /// What shows where no Gaussian is.
+    /// The background.
     pub background: [f32; 3],
     exposures: Vec<(String, [f32; 12])>,
     /// Fingerprint of it all.
@@ -270,7 +271,7 @@ fn write_png(path: &Path, data: &[u8], view: &Camera, color: ExtendedColorType) 
     write_atomically(path, &out)
 }
 
-/// Leaves of a scene the Gaussians that stand where images are calm.
+/// Keeps the Gaussians of a scene in static image regions.
 fn calm_only(scene: &mut Scene<f32>, capture: &Capture, folder: &Path) -> Result<()> {
     let mut views: Vec<(Camera, Vec<u8>)> = Vec::new();
     for (rig, camera) in capture.cameras.iter().enumerate() {
@@ -291,7 +292,7 @@ fn calm_only(scene: &mut Scene<f32>, capture: &Capture, folder: &Path) -> Result
     Ok(())
 }
 
-/// Whether most of the cameras that look at a place find it calm.
+/// Whether a position is static in most cameras that see it.
 fn is_calm(mean: [f64; 3], views: &[(Camera, Vec<u8>)]) -> bool {
     let (mut seen, mut calm) = (0, 0);
     for (camera, map) in views {

@@ -32,7 +32,7 @@ impl Neighbour {
 
 /// λ‖I − I'‖₁, the mean over pixels and channels of the difference to the neighbour's image I', as the camera
 /// exposes both.
-/// Source: render-space consistency of overlapping chunks; no gradient goes to the neighbour.
+/// Source: render-space consistency of overlapping chunks; the neighbour has no gradient.
 pub(super) struct Tie {
     weight: f64,
     neighbours: Arc<Vec<Neighbour>>,
