@@ -32,7 +32,7 @@ const COMPARED_POSES: usize = 12;
 const COMPARED_BESIDE: usize = 2;
 /// Longer side of those renders, pixels.
 const COMPARED_SIDE: usize = 800;
-/// Most bytes of a poster: it comes before everything else.
+/// Most bytes of a poster: it is first in the file.
 const POSTER_BYTES: usize = 30 << 10;
 /// Longer side of a poster and JPEG qualities, tried in turn until it is small enough.
 const POSTERS: [(usize, u8); 5] = [(640, 85), (640, 70), (480, 70), (320, 60), (160, 50)];
@@ -52,7 +52,7 @@ const BYTES_A_SECOND: f64 = 1.5e6;
 /// Bytes of a primitive, its share of the palette included, until the first file is written (docs/format.md: 32 before
 /// deflate).
 const BYTES_A_PRIMITIVE: f64 = 28.0;
-/// Cuts that are tried: the first, one that is calibrated by it, and one that mends what that missed.
+/// Cuts that are tried: the first, one that is calibrated by it, and one that corrects its error.
 const CUTS: usize = 3;
 /// A file this much larger than it may be is cut again.
 const TOO_LARGE: f64 = 1.03;
@@ -68,7 +68,7 @@ const SAMPLING: f64 = 0.25;
 const WEIGHING: f64 = 0.1;
 /// See [`WEIGHING`].
 const WEIGHING_RENDERS: f64 = 3.0;
-/// Seconds in which a primitive is fitted and packed, on a slow machine; and the share of what is left that may go into
+/// Seconds in which a primitive is fitted and packed, on a slow machine; and the share of the remaining time for
 /// it.
 const SECONDS_A_PRIMITIVE: f64 = 4e-5;
 const FITTING: f64 = 0.4;
@@ -122,7 +122,7 @@ pub struct Packed {
     at: Option<(f64, [f64; 2])>,
 }
 
-/// Bakes a scene and packs it, without a look at how well. The options' cameras are the source's.
+/// Bakes a scene and packs it, without comparing the result. The options' cameras are the source's.
 pub fn pack(source: &Source, title: &str, baking: &Baking, console: &dyn Listener) -> Result<Packed> {
     pack_scene(&source.scene, source, title, baking, console)
 }

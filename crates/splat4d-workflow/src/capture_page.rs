@@ -104,8 +104,8 @@ fn reduced(picture: RgbImage, side: u32) -> RgbImage {
     resize(&picture, scaled(w), scaled(h), FilterType::Triangle)
 }
 
-/// The points of a capture as a static scene of dots over the capture's time; a capture without points has one dot where
-/// its cameras look.
+/// The points of a capture as a static scene of dots over the capture's time; a capture without points has one dot
+/// where its cameras point.
 pub fn points(capture: &Capture) -> Scene<f32> {
     let none = PointCloud::default();
     let cloud = capture.points.as_ref().unwrap_or(&none);

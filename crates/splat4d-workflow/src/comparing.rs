@@ -5,8 +5,8 @@ use serde_json::Value;
 use splat4d::{Error, Result};
 use std::path::{Path, PathBuf};
 
-/// Scores of held-out views that are compared: key, digits, whether more is better. The names of other programs are those
-/// of 3DGS' `results.json`, whatever their case.
+/// Scores of held-out views that are compared: key, digits, whether more is better. The names of other programs are
+/// those of 3DGS' `results.json`, whatever their case.
 pub const SCORES: [(&str, usize, bool); 8] = [
     ("PSNR", 2, true),
     ("PSNR-dynamic", 2, true),
@@ -32,7 +32,7 @@ pub struct Entry {
     pub gaussians: Option<usize>,
     pub seconds: Option<f64>,
     pub bytes: Option<u64>,
-    /// What was measured, where the results say it: two that differ cannot be compared.
+    /// Identity of the measurement, where the results contain it: different ones cannot be compared.
     pub capture: Option<String>,
     pub views: Vec<ViewScore>,
     /// Folder of `gt` and `renders`, where it is kept.
@@ -84,8 +84,8 @@ impl Entry {
         })
     }
 
-    /// Results of another program: `{"ours_30000": {"PSNR": …}}` as 3DGS writes them, `{"results": {"psnr": …}}` as nerfstudio,
-    /// or the scores themselves.
+    /// Results of another program: `{"ours_30000": {"PSNR": …}}` as 3DGS writes them, `{"results": {"psnr": …}}` as
+    /// nerfstudio, or the scores themselves.
     fn of_file(file: &Path) -> Result<Self> {
         let bytes = crate::files::read(file)?;
         let text = String::from_utf8_lossy(&bytes);
@@ -165,7 +165,8 @@ pub fn differences(entries: &[Entry]) -> Vec<String> {
     out
 }
 
-/// The place of the best row in each column of [`SCORES`] that at least two rows have; none if the rows cannot be compared.
+/// The place of the best row in each column of [`SCORES`] that at least two rows have; none if the rows cannot be
+/// compared.
 pub fn best(entries: &[Entry]) -> Vec<Option<usize>> {
     if !differences(entries).is_empty() {
         return vec![None; SCORES.len()];

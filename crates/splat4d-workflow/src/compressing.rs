@@ -33,7 +33,7 @@ const MOST_TRIES: usize = 3;
 /// The guard takes back this share of the pruning.
 const GENTLER: f64 = 0.5;
 
-/// Settings that the user requested; they are in [`ORDER`], so that an interrupted compression knows them.
+/// Settings that the user requested; they are in [`ORDER`], so that an interrupted compression can read them.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CompressJob {
@@ -43,7 +43,7 @@ pub struct CompressJob {
     pub level: u8,
     /// Most dB that training views may lose; 0: no guard.
     pub guard: f64,
-    /// Whether the user said how much is to be pruned: then the guard only warns.
+    /// Whether the user set the share to prune: then the guard only warns.
     pub asked: bool,
     /// Most bytes of the file.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -195,7 +195,7 @@ impl CompressJob {
     }
 }
 
-/// What the first Ctrl-C is answered with while a scene is tuned.
+/// Message for the first Ctrl-C during fine-tuning.
 const SAVING: &str = "stopping: a checkpoint is being saved";
 /// What an owner's record calls this verb.
 const COMMAND: &str = "compress";
@@ -359,7 +359,7 @@ impl Work {
         format!("what was tuned is kept: splat4d compress --resume {} continues", in_command(&self.dir))
     }
 
-    /// Everything before and after, measured in one go.
+    /// Scores before and after, measured together.
     fn compare(
         &self,
         source: &Source,
@@ -581,7 +581,7 @@ impl Original<'_> {
 
 /// Bytes of a file next to its Gaussians: a poster, cameras, a path.
 const BESIDES: u64 = 48 << 10;
-/// Room that another attempt leaves below the size.
+/// Margin below the size for another attempt.
 const AGAIN_MARGIN: f64 = 0.01;
 
 /// The folder, in that of a compression, of the unpruned scene that was trained on.

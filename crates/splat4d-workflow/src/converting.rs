@@ -61,7 +61,7 @@ pub struct Conversion {
     pub exact: bool,
     /// Positions in the capture's world, in double precision.
     pub world: bool,
-    /// Values of the input to read as they are, not as logarithms, logits or coefficients.
+    /// Values of the input to read unconverted, not as logarithms, logits or coefficients.
     pub linear: Vec<Linear>,
     /// Version of .spz to write.
     pub spz_version: u32,
@@ -70,9 +70,9 @@ pub struct Conversion {
 /// Which way is up in the file.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Up {
-    /// As the format has it.
+    /// As in the format.
     Format,
-    /// As the scene has it.
+    /// As in the scene.
     Keep,
     /// This direction.
     Axis([f64; 3]),
@@ -164,7 +164,7 @@ pub fn run(args: &Conversion, console: &dyn Listener) -> Result<()> {
     write(args, source, console)
 }
 
-/// Reads values as they are where the options specify it.
+/// Reads values unconverted where the options specify it.
 fn read_linear(source: &mut Source, linear: &[Linear]) {
     for &what in linear {
         // The reader's own doubt about them is settled.
@@ -197,7 +197,7 @@ fn asked(args: &Conversion) -> Result<(Option<(Pattern, PathBuf)>, Target)> {
     Ok((pattern, target))
 }
 
-/// Writes a scene that was opened, as the options say.
+/// Writes an opened scene by the options.
 pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> Result<()> {
     let (pattern, target) = asked(args)?;
     if args.no_provenance {
@@ -292,7 +292,7 @@ pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> R
     Ok(())
 }
 
-/// How like the scene a file of it looks.
+/// Similarity of a file to its scene.
 fn like(
     source: &Source,
     dialect: Dialect,
@@ -310,7 +310,7 @@ fn like(
     Ok(likeness)
 }
 
-/// A playback file. The capture's cameras belong to the old axes: a scene that was rotated goes without them.
+/// A playback file. The capture's cameras belong to the old axes: a rotated scene is written without them.
 fn bake(mut source: Source, args: &Conversion, rotated: bool, console: &dyn Listener) -> Result<()> {
     let title = baking::title(&source, &args.input);
     if rotated {
@@ -412,7 +412,7 @@ fn rotate(scene: &mut Scene<f32>, up: Up, target: Target, console: &dyn Listener
     r
 }
 
-/// The first camera of the data set, if it is available: a place from which the scene looks right.
+/// The first camera of the data set, if it is available: a sensible viewpoint.
 fn first_camera(source: &Source) -> Option<Camera> {
     Some(source.views().ok()?.into_iter().next()?.camera)
 }

@@ -43,7 +43,7 @@ impl Deadline {
         self.end.is_finite()
     }
 
-    /// Seconds of the clock so far.
+    /// Elapsed seconds.
     pub fn now(&self) -> f64 {
         self.clock.seconds()
     }

@@ -129,7 +129,7 @@ const RAMP: [[f32; 3]; 6] = [
 /// Turn of the hue from one label to the next, of a whole one: the golden section, so that few labels are far apart and
 /// many never meet.
 const GOLDEN: f32 = 0.618_034;
-/// Most training images that are asked for the uncertainty of a scene, evenly chosen.
+/// Most training images used for the uncertainty of a scene, evenly chosen.
 const WITNESSES: usize = 48;
 
 /// Pixels that a thread turns into bytes at once: enough to amortise the overhead.
@@ -259,7 +259,7 @@ impl<'a> Painter<'a> {
         self.backend.name()
     }
 
-    /// Renders into [`image`](Self::image). A GPU that fails on the way is reported, and left for the CPU.
+    /// Renders into [`image`](Self::image). A GPU that fails on the way is reported, and the CPU takes over.
     pub fn draw(&mut self, camera: &Camera, time: f64) {
         if self.channel.is_field() {
             return self.draw_field(camera, time);
@@ -410,12 +410,12 @@ impl<'a> Painter<'a> {
     }
 }
 
-/// As recipes say it, for the renderer.
+/// The recipe's value for the renderer.
 pub fn antialias(on: bool) -> Antialias {
     if on { Antialias::On } else { Antialias::Off }
 }
 
-/// Near is bright; even steps of disparity look even.
+/// Near is bright; equal steps of disparity appear equal.
 fn depth_color(depth: f32, [near, far]: [f32; 2]) -> [u8; 3] {
     let (n, f) = (1.0 / near.max(1e-6), 1.0 / far.max(near * 1.0001).max(1e-6));
     ramp((1.0 / depth.max(1e-6) - f) / (n - f))
@@ -429,7 +429,7 @@ fn ramp(share: f32) -> [u8; 3] {
     std::array::from_fn(|k| (RAMP[i][k] * (1.0 - u) + RAMP[i + 1][k] * u).round() as u8)
 }
 
-/// Numbers as colours; what has none is black.
+/// Numbers as colours; undefined ones are black.
 fn field_rgb(raw: &Planes<f32>, channel: Channel, [low, high]: [f32; 2]) -> Rgb {
     let span = (high - low).max(f32::MIN_POSITIVE);
     let color = |p: usize| -> [u8; 3] {

@@ -27,7 +27,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::SystemTime;
 
-/// Masks of images that are examined for the subject, at most: each costs a look at the whole scene.
+/// Masks of images that are examined for the subject, at most: each costs one pass over the whole scene.
 const MOST_MASKS: usize = 120;
 /// Held-out images that are compared before and after floaters are removed.
 const COMPARED: usize = 40;
@@ -284,7 +284,7 @@ pub struct Proposal {
 }
 
 impl Bring<'_> {
-    /// Looks for floaters.
+    /// Searches for floaters.
     ///
     /// Errors: no run with its capture, no held-out views, a strength that is not from 0 to 1.
     pub fn propose(&self, scene: &Scene<f32>, strength: f64) -> Result<Proposal> {
@@ -342,7 +342,7 @@ pub fn with_steps(mut edits: Edits, steps: impl IntoIterator<Item = Step>) -> Ed
     edits
 }
 
-/// Where an edited scene comes from: what its file said before, with these edits behind those and other words if there
+/// Provenance of an edited scene: that of its file, with these edits appended and another text if there
 /// are some.
 pub fn provenance(source: &Source, earlier: Option<Provenance>, edits: &Edits, words: Option<String>) -> Provenance {
     let earlier = earlier.unwrap_or_default();

@@ -1,5 +1,6 @@
-//! The work behind `view --edit`: a page asks, and a list of edits is replayed, examined, baked and saved, by the same
-//! code as `edit`. It writes one file, the list, and reads nothing that a page names but files next to the list.
+//! The work behind `view --edit`: a page sends requests, and a list of edits is replayed, examined, baked and saved, by
+//! the same code as `edit`. It writes one file, the list, and reads nothing that a page names but files next to the
+//! list.
 
 use crate::baking::{Baking, pack_scene};
 use crate::draw::color_rgb;
@@ -94,13 +95,13 @@ struct Pulled {
 #[derive(Clone, Debug, Deserialize)]
 #[serde(tag = "do", rename_all = "kebab-case", deny_unknown_fields)]
 enum Ask {
-    /// What there is, and the list as it is; `kept`: the list that the page has in its place.
+    /// The state and the current list; `kept`: the list that the page has instead.
     Open { kept: Option<Vec<Step>> },
     /// The edited scene as an image.
     Show { steps: Vec<Step>, view: Eye, t: f64 },
     /// The edited scene as a playback file.
     Bake { steps: Vec<Step> },
-    /// The list goes into its file.
+    /// Saves the list to its file.
     Save { steps: Vec<Step> },
     /// Who is selected.
     Select { steps: Vec<Step>, select: String, t: f64 },
@@ -168,7 +169,7 @@ impl Editor {
         Ok(Self { source, title, file: file.to_owned(), listed, state, bakings: AtomicU64::new(0) })
     }
 
-    /// The edited scene as a playback file, as the list has it at the start; none: the list is empty.
+    /// The edited scene as a playback file, after the initial list; none: the list is empty.
     pub fn start(&self, console: &dyn Listener) -> Result<Option<Vec<u8>>> {
         if self.listed.steps.is_empty() {
             return Ok(None);
@@ -476,7 +477,7 @@ mod tests {
             self.editor.answer(asked.clone()).unwrap_or_else(|e| panic!("{asked}: {e}")).told
         }
 
-        /// What is reported of what cannot be done; the list is what it was.
+        /// The message for an impossible request; the list is unchanged.
         fn refused(&self, asked: Value) -> String {
             let before = std::fs::read(self.list()).ok();
             let error = self.editor.answer(asked.clone()).map(|a| a.told).expect_err(&asked.to_string()).to_string();
@@ -602,7 +603,7 @@ mod tests {
         assert!(bench.refused(json!({"do": "show", "steps": [], "view": wide, "t": 0.0})).contains("camera"));
     }
 
-    /// What would have taken all memory, or made numbers of none: the server answers, and continues with the page's
+    /// Requests that would exhaust memory or give invalid numbers: the server responds and continues with the page's
     /// steps.
     #[test]
     fn excessive_requests_are_refused_and_others_continue() {

@@ -62,7 +62,7 @@ const STRAIGHT: [&str; 3] = ["still", "spacetime", "native4d"];
 /// See [`HELD_STEPS`]: an image with a mask of labels or an image of features, rendered and taken back once.
 const LABEL_STEPS: f64 = 1.0;
 
-/// The time of what follows training, in training steps at full size: `--minutes` leaves room for it.
+/// The time of the work after training, in training steps at full size: `--minutes` includes it.
 pub fn steps(capture: &Capture, recipe: &Recipe, only_playback: bool) -> f64 {
     let frames = || capture.train.iter().map(|&i| &capture.frames[i]);
     let masks = frames().filter(|f| f.labels.is_some()).count().min(labels::MOST_PICTURES);
@@ -203,7 +203,7 @@ impl Times {
     }
 }
 
-/// Bakes the run into `scene.s4d`, whatever it takes. What goes wrong is reported and never costs the run.
+/// Bakes the run into `scene.s4d`, at any size. Errors are reported and never fail the run.
 pub fn playback(run: &Path, console: &dyn Listener) -> Result<()> {
     playback_by(run, &Deadline::default(), console)
 }
@@ -361,7 +361,7 @@ pub(crate) fn say_split(scores: &Scores, measured: Measured, background: &str, c
     }));
 }
 
-/// Says and writes how far the cameras of a run are from those of a capture that knows.
+/// Reports and writes the distances of a run's cameras from those of a capture with ground truth.
 ///
 /// Errors: captures that cannot be read, or have no cameras in common.
 pub fn trajectory(run: &Path, truth: &Path, console: &dyn Listener) -> Result<()> {
@@ -444,7 +444,7 @@ fn lives(scene: &Scene<f32>) -> [usize; LIFE_BINS] {
     counts
 }
 
-/// Measures tracks in space where the capture comes with true ones.
+/// Measures tracks in space if the capture contains true ones.
 fn tracks(run: &Path, scene: &Scene<f32>, capture: &Capture, console: &dyn Listener) -> Result<()> {
     let Some(e) = track_error(scene, capture)? else { return Ok(()) };
     console.say(&format!(
@@ -570,7 +570,7 @@ fn in_words(score: impl Fn(&str) -> Option<f64>) -> String {
     words.join(", ")
 }
 
-/// Says how far training moved the cameras, the one that went furthest by name.
+/// Reports how far training moved the cameras, naming the one that moved most.
 pub fn say_refined(run: &Path, console: &dyn Listener) -> Result<()> {
     if let Some(words) = corrected::read(run)?.and_then(|refined| refined_in_words(&refined)) {
         console.say(&words);

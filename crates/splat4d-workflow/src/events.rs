@@ -42,7 +42,7 @@ pub enum Event<'a> {
         /// The capture; none: that of the run, which is continued.
         capture: Option<&'a Arc<Capture>>,
     },
-    /// An event of training or evaluation. Its warnings come as [`Warning`](Self::Warning).
+    /// An event of training or evaluation. Its warnings are sent as [`Warning`](Self::Warning).
     Training(&'a Training),
     /// From here on the workflow polls its stop flag; the sentence states what it does when the flag is raised.
     StopPolled(&'a str),
@@ -128,7 +128,7 @@ impl<'a> Recorded<'a> {
         Self { listener, warnings: RefCell::default() }
     }
 
-    /// The warnings so far.
+    /// The present warnings.
     pub(crate) fn warnings(&self) -> Vec<String> {
         self.warnings.borrow().clone()
     }

@@ -1,5 +1,5 @@
-//! A scene as files for others to open: one time or each frame as a 3DGS .ply, the whole as a page with its player, and paths of
-//! its Gaussians, or of requested points, as JSON or CSV.
+//! A scene as files for others to open: one time or each frame as a 3DGS .ply, the whole as a page with its player, and
+//! paths of its Gaussians, or of requested points, as JSON or CSV.
 
 use crate::events::Listener;
 use crate::files;
@@ -70,7 +70,8 @@ pub fn open(path: &Path, label: Option<&str>) -> Result<Source> {
     Ok(source)
 }
 
-/// Writes a file per frame, `frame_00000.ply` and so on, into a folder; returns how many. `force` replaces a sequence of ours.
+/// Writes a file per frame, `frame_00000.ply` and so on, into a folder; returns how many. `force` replaces a sequence
+/// of ours.
 ///
 /// Errors: times outside the clip; a folder with other files; a file cannot be written.
 pub fn frames(
@@ -108,7 +109,8 @@ fn is_json(out: &Path) -> Result<bool> {
     }
 }
 
-/// Writes positions over time of points that the file `points` lists (pixels of cameras, or positions), and their visibility.
+/// Writes positions over time of points that the file `points` lists (pixels of cameras, or positions), and their
+/// visibility.
 ///
 /// Errors: a list that cannot be read; more numbers than a file should have.
 pub fn points(source: &Source, points: &Path, frames: &Frames, out: &Path, listener: &dyn Listener) -> Result<()> {
@@ -178,8 +180,8 @@ pub fn tracks(scene: &Scene<f32>, options: &TrackOptions, out: &Path, listener: 
     Ok(())
 }
 
-/// Writes the Gaussians alive at a time, seconds of the scene, as a 3DGS .ply; returns how many. `world`: in the capture's world,
-/// in double precision.
+/// Writes the Gaussians alive at a time, seconds of the scene, as a 3DGS .ply; returns how many. `world`: in the
+/// capture's world, in double precision.
 pub fn moment(scene: &Scene<f32>, time: f64, world: bool, out: &Path) -> Result<usize> {
     let params = freeze(scene, Time(time))?;
     let mut bytes = Vec::new();
@@ -188,7 +190,7 @@ pub fn moment(scene: &Scene<f32>, time: f64, world: bool, out: &Path) -> Result<
     Ok(params.len())
 }
 
-/// Says that a file of one time is empty, where it is.
+/// Reports if a file of one time is empty.
 pub fn warn_of_empty(scene: &Scene<f32>, time: f64, count: usize, listener: &dyn Listener) {
     if count == 0 {
         listener.warn(&format!(

@@ -33,11 +33,11 @@ pub struct Imported {
     pub checked: Option<(Checked, PathBuf)>,
 }
 
-/// Makes a capture of videos or folders of images: frames, synchronization, poses, lenses and points. `check`: examines the finished
-/// capture too and writes `import/doctor.html`. The same request continues interrupted work.
+/// Makes a capture of videos or folders of images: frames, synchronization, poses, lenses and points. `check`: examines
+/// the finished capture too and writes `import/doctor.html`. The same request continues interrupted work.
 ///
-/// Errors: the folder contains a capture of another program; videos that cannot be read; poses that cannot be found; `stop` was
-/// raised.
+/// Errors: the folder contains a capture of another program; videos that cannot be read; poses that cannot be found;
+/// `stop` was raised.
 ///
 /// ```no_run
 /// use splat4d_import::recording::Request;
@@ -79,7 +79,7 @@ pub fn import(request: &Request, check: bool, stop: &AtomicBool, console: &dyn L
     Ok(Imported { report, checked })
 }
 
-/// What the user should know of cameras.
+/// Messages about cameras.
 fn warnings(report: &Report) -> Vec<String> {
     let mut out = Vec::new();
     for camera in &report.cameras {
@@ -152,7 +152,8 @@ impl Imported {
     }
 }
 
-/// Refuses a folder that holds what an import writes, but no import: images, masks or points of other origin are never replaced.
+/// Refuses a folder that holds what an import writes, but no import: images, masks or points of other origin are never
+/// replaced.
 fn check_ours(folder: &Path) -> Result<()> {
     if folder.join(corrections::FILE).is_file() {
         return Ok(());

@@ -78,7 +78,7 @@ pub struct Inspection {
     pub json: Value,
     /// The same for people, in lines.
     pub text: String,
-    /// Why it does not look healthy.
+    /// Reasons why it does not look healthy.
     pub troubles: Vec<String>,
     /// More reasons, which `text` contains already.
     pub listed: Vec<String>,

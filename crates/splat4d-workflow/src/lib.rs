@@ -41,7 +41,7 @@
 //! | `labelling.rs`, `chunked.rs`, `compressing.rs` | labels, long captures in chunks, compression with a guard |
 //! | `training.rs` | a capture becomes a run, which is measured, filmed and reported |
 //! | `importing.rs`, `inspecting.rs`, `inspecting/` | videos become a capture; what a capture, run or file contains |
-//! | `predicting.rs`, `predicting/` | forecasts, compared with what came |
+//! | `predicting.rs`, `predicting/` | forecasts, compared with the later images |
 //! | `editing.rs`, `picking.rs`, `editor.rs` | lists of edits; edits from a page of the player |
 //! | `texts.rs` | texts that users write, for the fuzz targets |
 

@@ -1,5 +1,5 @@
 //! How a scene plays on this machine's CPU: who is alive, how many bytes, frames per second rendered from the capture's
-//! own cameras over its clip. What is compared is measured in turns, image by image, so that a machine that is busy
+//! own cameras over its clip. Compared variants are measured in turns, image by image, so that a machine that is busy
 //! for a while slows all of them.
 
 use crate::draw::color_into;
@@ -24,7 +24,7 @@ use std::time::Instant;
 pub const SIZE: [usize; 2] = [800, 800];
 /// Images of a round: enough that every side of the scene and all parts of the clip take part.
 const LOOKS: usize = 24;
-/// Rounds of which the best of every image counts, after one that makes room.
+/// Rounds of which the best of every image counts, after a warm-up round.
 const ROUNDS: usize = 5;
 /// Times that the first image is rendered from bytes; the best counts.
 const DECODES: usize = 3;
@@ -48,7 +48,7 @@ pub struct Side {
     /// Means over the held-out views, dB; `None` where they were not measured or are not defined.
     pub psnr: Option<f64>,
     pub ssim: Option<f64>,
-    /// Where things move, dB.
+    /// Of dynamic regions, dB.
     pub psnr_dynamic: Option<f64>,
     /// Mean difference between the change from frame to frame and the truth's, in 1/255.
     pub flicker: Option<f64>,
@@ -87,7 +87,7 @@ impl Side {
 /// Scene or file that is measured.
 #[derive(Clone, Debug)]
 pub enum What<'a> {
-    /// A scene in memory, with its 32-bit floats; played as it is.
+    /// A scene in memory, with its 32-bit floats; played unchanged.
     Scene(&'a Scene<f32>),
     /// The bytes of a playback file; played page by page.
     File(Arc<[u8]>),
@@ -134,7 +134,7 @@ pub fn measured_views(views: &[View], clip: [f64; 2], [width, height]: [usize; 2
     (0..LOOKS).map(look).collect()
 }
 
-/// From camera to camera: about the golden section of the rig, so that neighbours in time look from elsewhere, and
+/// From camera to camera: about the golden section of the rig, so that neighbours in time differ in viewpoint, and
 /// coprime to their number, so that all take part.
 fn stride(cameras: usize) -> usize {
     const GOLDEN: f64 = 0.382;
@@ -149,7 +149,7 @@ fn stride(cameras: usize) -> usize {
 }
 
 /// Measures all subjects in turns, with all threads of the current pool; one [`Side`] each, without scores.
-/// Panics: no looks.
+/// Panics: no samples.
 ///
 /// Errors: those of the file.
 pub fn in_turns(
@@ -193,7 +193,7 @@ struct Seat<'a> {
     renderer: Renderer<f32>,
     image: Image<f32>,
     rgb: Vec<u8>,
-    /// Seconds of the blend stage and of the whole image, by look.
+    /// Seconds of the blend stage and of the whole image, by image.
     best: Vec<[f64; 2]>,
     decode_ms: f64,
     pairs: f64,

@@ -1,4 +1,4 @@
-//! Shapes that are drawn over an image, as selections in words.
+//! Shapes drawn over an image, as text of selections.
 
 use serde::Deserialize;
 use splat4d::device;
@@ -17,7 +17,7 @@ const FAINT: f32 = 0.1;
 const SEEN: f32 = 0.5;
 /// Share of the nearest visible depth by which a selection reaches towards the camera.
 const MARGIN: f64 = 0.05;
-/// Distance of colours that look alike, 0 to 1.
+/// Distance of similar colours, 0 to 1.
 const ALIKE: f64 = 0.12;
 /// Farther than this nothing is searched for, scene units.
 const ENDLESS: f64 = 1e6;

@@ -1,4 +1,4 @@
-//! Points that users request: a file of pixels or places, followed through a scene, and who sees them.
+//! Points that users request: a file of pixels or positions, followed through a scene, and their visibility.
 
 use crate::paths::View;
 use splat4d::flow::query::{Followed, Place, PointView, Query, follow, sights};
@@ -33,9 +33,9 @@ fn remedy() -> String {
         .into()
 }
 
-/// Reads points. `views` are the cameras that the scene's file knows.
+/// Reads points. `views` are the cameras of the scene's file.
 ///
-/// Errors, with the line's number: columns that are unknown, missing or twice, a number that is none, a camera that is
+/// Errors, with the line's number: columns that are unknown, missing or duplicate, an invalid number, a camera that is
 /// not there, a pixel outside of its image, a time outside of the clip.
 pub fn read(text: &str, views: &[View], clip: [f64; 2]) -> Result<Vec<PointQuery>> {
     let mut lines = text.lines().enumerate().map(|(i, l)| (i + 1, l.trim())).filter(|(_, l)| !l.is_empty());

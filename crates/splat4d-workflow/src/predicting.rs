@@ -30,12 +30,12 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
-/// Shares of the observed ticks from which forecasts are tried to choose a model by, and how far these go. Models are
-/// fitted to what is before the first of them: one start can fall where a wrong model is right by chance, say on a
+/// Shares of the observed ticks at which trial forecasts for the choice of a model start, and their length. Models are
+/// fitted to what is before the first of them: at a single start a wrong model may be right by chance, for example on a
 /// swing's turning point.
 const STARTS: [f64; 3] = [0.6, 0.7, 0.8];
 const AHEAD: f64 = 0.2;
-/// Where the work goes, in the run.
+/// Output folder in the run.
 const FOLDER: &str = "predict";
 
 /// Nodes on dynamic regions unless others are requested.
@@ -329,7 +329,7 @@ impl Work {
         (mean, Some(spread))
     }
 
-    /// The nodes in another scene's future, as far as that goes.
+    /// The nodes in another scene's future, as far as it is known.
     fn follow(&self, scene: &Scene<f32>) -> Vec<Moment> {
         let end = scene.clip[1] + 0.5 / self.clock.fps;
         let ticks: Vec<f64> = (0..=self.horizon).map(|h| self.clock.at(h)).take_while(|t| *t < end).collect();
@@ -353,7 +353,7 @@ impl Work {
         Ok(Some(scene))
     }
 
-    /// The model whose scene is written: the only one that was asked for, else the best at forecasting what was
+    /// The model whose scene is written: the requested one if there is only one, else the best at forecasting what was
     /// observed.
     fn chosen<'a>(&self, forecasts: &'a [Forecast]) -> &'a Forecast {
         let asked = |f: &&Forecast| self.order.models.contains(&f.model);

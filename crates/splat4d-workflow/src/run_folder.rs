@@ -22,7 +22,7 @@ use std::path::{Path, PathBuf};
 const MARKERS: [&str; 4] = ["recipe.toml", "run.json", "scene.safetensors", "checkpoints"];
 /// File of results that `compress` leaves next to the file that it writes, for the report and for machines.
 pub const COMPRESS: &str = "compress.json";
-/// File that holds the settings `compress` was asked for.
+/// File with the requested settings of `compress`.
 pub const ORDER: &str = "compress.toml";
 /// Start of the commands that train, in the record of who has a folder.
 const TRAIN: &str = "train";
@@ -49,7 +49,7 @@ pub struct Metrics {
     pub gaussians: f64,
     /// The stage of training.
     pub stage: String,
-    /// Seconds of training so far.
+    /// Seconds of training.
     pub seconds: f64,
     /// Milliseconds of each of [`Run::stages`].
     pub stages: Vec<f64>,
@@ -86,7 +86,7 @@ pub struct Run {
     pub views: Vec<ViewScore>,
     /// `compress.json`, where the run was made by compressing another.
     pub compressed: Value,
-    /// What was asked for, of a run without checkpoints.
+    /// The request of a run without checkpoints.
     asked: Option<RunRequest>,
     iteration: Option<usize>,
 }
@@ -223,7 +223,7 @@ impl Run {
         recorded.or_else(|| self.asked.as_ref().map(|asked| asked.capture.clone()))
     }
 
-    /// What it was trained on.
+    /// Its capture.
     pub fn origin(&self) -> Origin {
         let opened = || {
             let (root, recipe) = (self.capture()?, self.recipe().ok()?);
@@ -315,7 +315,7 @@ fn is_starting(path: &Path) -> bool {
     path.join(STATE).is_dir() && (RunRequest::unbegun(path).is_some() || Owner::holder(path).is_some_and(trains))
 }
 
-/// Refuses a folder that a command has taken as its output and not written to yet. Errors: who has it.
+/// Refuses a folder that a command has taken as its output and not written to yet. Errors: another owner.
 pub fn check_written(folder: &Path) -> Result<()> {
     let mut there = std::fs::read_dir(folder).into_iter().flatten().flatten();
     if !folder.join(STATE).is_dir() || there.any(|entry| entry.file_name() != STATE) {
@@ -410,7 +410,7 @@ fn read_view(value: &Value) -> Option<View> {
     })
 }
 
-/// Where a run of the capture with this name goes by default.
+/// Default folder of a run of the capture with this name.
 pub fn usual_folder(capture: &str) -> PathBuf {
     let name: String =
         capture.chars().map(|c| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '-' }).collect();
@@ -440,7 +440,7 @@ impl Origin {
     }
 }
 
-/// What a training run was asked for: the same command continues it, from whatever state a crash left.
+/// The request of a training run: the same command continues it, from whatever state a crash left.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RunRequest {
     version: String,
@@ -516,7 +516,7 @@ pub fn left<T>(folder: OutputFolder, run: &Path, trained: &Result<T>) -> Option<
     Some(folder)
 }
 
-/// Where a new run goes: the requested folder, or with a number behind it if that is taken.
+/// Folder of a new run: the requested one, or with a number appended if that is taken.
 pub fn free_folder(wanted: &Path) -> PathBuf {
     let holds = |p: &Path| std::fs::read_dir(p).is_ok_and(|d| d.flatten().any(|e| e.file_name() != STATE));
     let taken = |p: &Path| p.is_file() || holds(p) || Owner::holder(p).is_some();
@@ -535,7 +535,7 @@ pub fn free_folder(wanted: &Path) -> PathBuf {
 /// An entry `ours_N` of `results.json` next to the one that the run is judged by.
 #[derive(Clone, Debug)]
 pub struct Baseline<'a> {
-    /// What it is called: a split, and a background where it is not the run's own.
+    /// Its name: a split, and a background where it is not the run's own.
     pub name: &'a str,
     pub step: usize,
     pub scores: &'a Value,

@@ -122,7 +122,7 @@ pub struct Read<'a> {
 
 /// Takes a folder for the first `count` frames of these patterns.
 ///
-/// Errors: another process has it; it is what is read; it holds frames of another sequence, or such as splat4d has no
+/// Errors: another process owns it; it is an input; it holds frames of another sequence, or such as splat4d has no
 /// record of.
 pub fn take(patterns: &[&Pattern], count: usize, read: &Read<'_>, command: &str, force: bool) -> Result<OutputFolder> {
     let origin = read.run.map(Run::origin).unwrap_or_default();
@@ -152,9 +152,9 @@ pub struct Frames {
     pub files: Vec<PathBuf>,
     /// Frames from the first to each, by the numbers.
     pub numbers: Vec<u64>,
-    /// Numbers that are missing between them, as people say it.
+    /// Numbers that are missing between them, as text.
     pub missing: Option<String>,
-    /// The newest file, where the numbers look like steps of a training.
+    /// The newest file, if the numbers are probably training steps.
     pub snapshots: Option<PathBuf>,
 }
 

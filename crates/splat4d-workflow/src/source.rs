@@ -21,7 +21,7 @@ use std::path::Path;
 const OUTLIERS: f64 = 0.1;
 /// Share of a cloud's means beyond each side of the box that a first view shows: thin parts stay in it, strays do not.
 const BEYOND: f64 = 0.01;
-/// Room around that box.
+/// Margin around that box.
 const ROOM: f64 = 1.1;
 
 /// Remedy that lists the files that can be opened, for errors.
@@ -30,7 +30,7 @@ fn remedy() -> String {
     format!("Give a run folder, a scene.safetensors, a checkpoint, a .s4d, or a {others} file.")
 }
 
-/// A scene and where it came from.
+/// A scene and its origin.
 pub struct Source {
     pub scene: Scene<f32>,
     /// The run, where it is one.
@@ -39,7 +39,7 @@ pub struct Source {
     pub ply: Option<PlyInfo>,
     /// The start of the playback file, where it is one.
     pub playback: Option<Index>,
-    /// Where the playback file comes from, where it states so; written along into playback files that are made of it.
+    /// Provenance of the playback file, if stated; copied into playback files made of it.
     pub provenance: Option<Provenance>,
     /// Whose format it is, where it is not our own.
     pub dialect: Option<Dialect>,
@@ -47,8 +47,8 @@ pub struct Source {
     pub warnings: Warnings,
 }
 
-/// Refuses an output that would replace what is read (the scene, a file of its run's capture, or one of `others`) or what any run
-/// needs, and one in a folder that another process owns.
+/// Refuses an output that would replace what is read (the scene, a file of its run's capture, or one of `others`) or
+/// what any run needs, and one in a folder that another process owns.
 pub fn keep(path: &Path, run: Option<&Run>, output: &Path, others: &[&Path]) -> Result<()> {
     // A new file replaces nothing: the capture need not be opened.
     let origin = run.filter(|_| output.is_file()).map(Run::origin).unwrap_or_default();
@@ -129,8 +129,8 @@ impl Source {
         Ok(source)
     }
 
-    /// Leaves out Gaussians whose numbers are not finite: files of other programs have such, and no writer takes them. Says
-    /// what else of a .ply is lost: times and velocities of a moving scene, for instance.
+    /// Leaves out Gaussians whose numbers are not finite: files of other programs have such, and no writer accepts
+    /// them. Reports what else of a .ply is lost: times and velocities of a moving scene, for instance.
     pub fn finite(mut self) -> Self {
         let unread = self.ply.as_ref().map_or(&[][..], |ply| &ply.extra_properties);
         if !unread.is_empty() {
@@ -182,7 +182,7 @@ fn looks_own(bytes: &[u8]) -> bool {
     bytes.get(8) == Some(&b'{')
 }
 
-/// By content; by its ending only where there is nothing in the content to know it by.
+/// By content; by its ending only if the content does not identify it.
 fn dialect_of(path: &Path, bytes: &[u8]) -> Option<Dialect> {
     let name = path.file_name().map(|n| n.to_string_lossy()).unwrap_or_default();
     Dialect::of_file(&name, bytes)

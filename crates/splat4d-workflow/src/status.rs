@@ -16,11 +16,11 @@ use std::path::Path;
 #[serde(rename_all = "snake_case")]
 pub enum State {
     Done,
-    /// A worker has it.
+    /// A worker is training it.
     Training,
     /// It begins where other parts end that are not done.
     Waiting,
-    /// It was begun, and no worker has it.
+    /// It was begun, and no worker is training it.
     Stopped,
     /// It can be begun.
     Open,
@@ -34,14 +34,14 @@ pub struct PartStatus {
     /// First frame and the one after the last.
     frames: Option<[usize; 2]>,
     state: State,
-    /// Who has it: command, process, host, since when.
+    /// Its owner: command, process, host, start.
     worker: Option<String>,
     /// Parts that it waits for.
     waits_for: Vec<String>,
     iteration: Option<usize>,
     iterations: Option<usize>,
     gaussians: Option<usize>,
-    /// Of training so far.
+    /// Of training.
     seconds: Option<f64>,
     seconds_left: Option<f64>,
     /// Bytes.

@@ -31,7 +31,7 @@ pub fn compress_order(text: &str) -> Result<()> {
     CompressJob::read(text).map(drop)
 }
 
-/// Who answers the page of `view --edit`.
+/// The server side of `view --edit`.
 pub struct Page(Editor);
 
 impl Page {

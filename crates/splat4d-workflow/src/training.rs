@@ -1,5 +1,5 @@
-//! The work behind `train`: a capture becomes a run: trained, baked, measured, filmed and reported. Long captures are trained in
-//! chunks, and runs are continued.
+//! The work behind `train`: a capture becomes a run: trained, baked, measured, filmed and reported. Long captures are
+//! trained in chunks, and runs are continued.
 
 use crate::chunked::{self, ChunkSelection};
 use crate::deadline::Deadline;
@@ -25,7 +25,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-/// Time between two looks whether the worker that begins a long capture has begun it.
+/// Time between two checks whether the worker that begins a long capture has begun it.
 const WAIT: Duration = Duration::from_millis(200);
 /// What an owner's record calls this work.
 const TRAIN: &str = "train";
@@ -39,7 +39,7 @@ const SAVING: &str = "stopping: a checkpoint is being saved";
 pub enum Finish {
     /// Nothing: the run has its scene.
     Scene,
-    /// Labels and features, where the capture has them, and the playback file.
+    /// Labels and features, if the capture has them, and the playback file.
     Playback,
     /// These, and scores of held-out views, an orbit film and the report.
     #[default]
@@ -63,7 +63,8 @@ pub struct TrainingOptions {
     pub device: Device,
     /// How held-out views are measured.
     pub measure: Measure,
-    /// What follows training. With [`Finish::Scene`] a long capture is trained as a whole unless the recipe states chunks.
+    /// What follows training. With [`Finish::Scene`] a long capture is trained as a whole unless the recipe states
+    /// chunks.
     pub finish: Finish,
     /// The clock of `minutes`; its zero is when these options were made.
     pub clock: Stopwatch,
@@ -102,11 +103,11 @@ pub struct Trained {
     pub interrupted: bool,
 }
 
-/// Trains a scene of a capture by a recipe, and does what follows training. Frames of captures that are shipped as videos are
-/// extracted first. The same request continues a run that it began.
+/// Trains a scene of a capture by a recipe, and does what follows training. Frames of captures that are shipped as
+/// videos are extracted first. The same request continues a run that it began.
 ///
-/// Errors: the capture cannot be read; the output folder contains something else, or belongs to another process; training
-/// diverged.
+/// Errors: the capture cannot be read; the output folder contains something else, or belongs to another process;
+/// training diverged.
 ///
 /// ```no_run
 /// use splat4d_train::recipe::Recipe;
@@ -136,7 +137,8 @@ pub fn train(
     work.begin(&Begin { capture, recipe, minutes, predict, output, resumed: false })
 }
 
-/// Continues a run from its newest checkpoint, and does what follows training. Of the options only `device`, `measure`, `finish`,
+/// Continues a run from its newest checkpoint, and does what follows training. Of the options only `device`, `measure`,
+/// `finish`,
 /// `clock`, `own_loss` and `chunk` count.
 ///
 /// Errors: no such run; it belongs to another process; those of training.

@@ -34,7 +34,7 @@ pub enum Film {
         output: Staged,
         /// The program.
         child: Child,
-        /// Where frames go.
+        /// Destination of frames.
         pipe: Option<ChildStdin>,
         /// Collects what ffmpeg states.
         words: Option<std::thread::JoinHandle<Vec<u8>>>,
@@ -50,7 +50,7 @@ pub enum Film {
     Folder {
         /// The folder.
         path: PathBuf,
-        /// Frames so far.
+        /// Number of frames.
         next: usize,
     },
 }

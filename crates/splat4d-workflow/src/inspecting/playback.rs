@@ -1,4 +1,5 @@
-//! What the index of a playback file states: sections, sizes, and how much has to arrive before there is something to see.
+//! What the index of a playback file states: sections, sizes, and how much has to arrive before there is something to
+//! see.
 
 use super::line;
 use crate::files::{grouped, human_bytes};
@@ -133,7 +134,7 @@ fn section(e: &Entry) -> Value {
     v
 }
 
-/// Bytes from the file's start to the end of the first tier of the clip's start, and of the palettes on the way.
+/// Bytes from the file's start to the end of the first tier of the clip's start, and of the palettes before it.
 fn first_picture(index: &Index) -> u64 {
     let start = index.pages_at(index.meta.clip[0]);
     let first = start.iter().filter(|(_, e)| e.tier == 0).map(|(_, e)| e.offset + u64::from(e.stored)).max();

@@ -97,12 +97,12 @@ pub fn orbit_seconds(playing: f64) -> f64 {
 const MAX_FRAMES: f64 = 200_000.0;
 
 impl Clock {
-    /// Seconds of film when the scene plays by itself.
+    /// Seconds of film when the scene plays alone.
     fn playing(&self) -> f64 {
         self.seconds.unwrap_or((self.to - self.from) * self.slow_motion.unwrap_or(1.0))
     }
 
-    /// The scene's second, `share` (0 to 1) of the way through the film.
+    /// The scene's second, `share` (0 to 1) of the film.
     fn at(&self, share: f64) -> f64 {
         self.freeze.unwrap_or(self.from + (self.to - self.from) * share)
     }

@@ -74,7 +74,7 @@ impl Stage {
         self.reach >= PI
     }
 
-    /// The camera `share` (0 to 1) of the way; it ends where it began.
+    /// The camera at `share` (0 to 1) of the orbit; it ends where it began.
     pub fn orbit(&self, share: f64) -> Camera {
         let turn = if self.full() { TAU * share } else { self.reach * (TAU * share).sin() };
         let angle = self.azimuth + turn;

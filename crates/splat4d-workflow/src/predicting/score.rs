@@ -1,4 +1,4 @@
-//! Forecasts next to the images of what really came.
+//! Forecasts compared with the later images.
 
 use super::{Forecast, Work};
 use crate::deadline::unless_stopped;
@@ -24,7 +24,7 @@ use std::sync::atomic::AtomicBool;
 const CHANGED: f32 = 0.05;
 /// Nodes that carry a true point.
 const CARRIERS: usize = 4;
-/// dB at which equal images stand: 8 bits resolve no more.
+/// dB reported for equal images: 8 bits resolve no more.
 const MOST_DB: f64 = 99.0;
 
 /// An image of the future, and the last observed one of the same camera.
