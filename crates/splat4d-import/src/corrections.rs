@@ -38,7 +38,7 @@ pub struct Corrections {
     pub cameras: Vec<Camera>,
 }
 
-/// What is known of a camera.
+/// Known values of a camera.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Camera {
@@ -59,7 +59,7 @@ pub struct Camera {
     /// Standard deviation of the offset, seconds: to read.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sigma: Option<f64>,
-    /// What the offset is from: to read.
+    /// Source of the offset, for readers.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub by: Vec<String>,
     /// Whether other evidence would have contradicted a wrong offset: to read.

@@ -59,10 +59,11 @@ fn stem(video: &Path) -> String {
     video.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
 }
 
-/// Extracts the frames of such a capture into its folder `images/`; what is there already is left, and work that was
-/// interrupted continues. `None`: it is no such capture. `stop` is asked after every few frames.
+/// Extracts the frames of such a capture into its folder `images/`; existing files are kept, and work that was
+/// interrupted continues. `None`: not such a capture. `stop` is called after every few frames.
 ///
-/// Errors: other poses than videos, a video that cannot be read, no space; of kind `Interrupted` where `stop` said so.
+/// Errors: other poses than videos, a video that cannot be read, no space; of kind `Interrupted` if `stop` requested
+/// it.
 pub fn extract(root: &Path, progress: &mut Progress<'_>, stop: &dyn Fn() -> bool) -> Result<Option<Extracted>> {
     let videos = videos(root);
     if videos.is_empty() {

@@ -94,12 +94,12 @@ impl FromStr for Board {
 pub(crate) struct Tag {
     /// Its number in its family.
     pub id: usize,
-    /// Pixels of the dark square's corners: from the first bit's on, as the hands of a clock go when the tag is
+    /// Pixels of the dark square's corners: from the first bit's on, clockwise when the tag is
     /// examined.
     pub corners: [[f64; 2]; 4],
 }
 
-/// The tags of a family in a grey image, by number; those that are there twice are left out.
+/// The tags of a family in a grey image, by number; duplicates are left out.
 pub(crate) fn tags(picture: &Planes<f32>, family: &Family) -> Vec<Tag> {
     let codes = family.codes();
     let mut found: Vec<Tag> =

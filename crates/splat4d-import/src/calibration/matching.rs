@@ -62,7 +62,7 @@ fn named(cameras: &[Calibrated], fits: &dyn Fn(&str) -> bool) -> Vec<usize> {
     cameras.iter().enumerate().filter_map(of).collect()
 }
 
-/// One camera for every video, none twice.
+/// One camera for every video, without duplicates.
 fn sure(found: &[Vec<usize>]) -> Option<Vec<usize>> {
     let all: Vec<usize> =
         found.iter().map(|f| <[usize; 1]>::try_from(f.as_slice()).ok().map(|f| f[0])).collect::<Option<_>>()?;
@@ -72,7 +72,7 @@ fn sure(found: &[Vec<usize>]) -> Option<Vec<usize>> {
     (once.len() == all.len()).then_some(all)
 }
 
-/// The words of a name: what is between spaces, dashes and the like.
+/// The words of a name: the parts between spaces, dashes and the like.
 fn words(name: &str) -> impl Iterator<Item = String> + '_ {
     name.split(|c: char| !c.is_alphanumeric()).filter(|w| !w.is_empty()).map(str::to_owned)
 }

@@ -30,7 +30,7 @@ use tree::Tree;
 /// A camera of a calibration.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Calibrated {
-    /// What it is called; the first is its name, others are what its video may be called too.
+    /// Its names; the first is the camera's, others may be those of its video.
     pub names: Vec<String>,
     /// Pixels across and down of the images that it was calibrated with, where the file states it.
     pub size: Option<[usize; 2]>,
@@ -61,9 +61,9 @@ pub struct Calibration {
     pub cameras: Vec<Calibrated>,
     /// The unit of lengths.
     pub unit: Unit,
-    /// Points that come with it.
+    /// Its points.
     pub points: Option<PointCloud>,
-    /// What was left out or is odd, a sentence each.
+    /// Remarks on omitted or odd content, a sentence each.
     pub notes: Vec<String>,
 }
 
@@ -110,7 +110,7 @@ const MAX_FILES: usize = 1000;
 
 /// Reads a calibration: a file, or a folder with one, with a file for each camera, or with a COLMAP reconstruction.
 ///
-/// Errors: nothing that is known; damage; matrices that are missing or none; a camera twice; lenses that captures
+/// Errors: an unknown format; damage; missing or invalid matrices; a duplicate camera; lenses that captures
 /// cannot have.
 pub fn read(path: &Path) -> Result<Calibration> {
     let there = std::fs::metadata(path).map_err(|e| {
@@ -299,7 +299,7 @@ impl Calibration {
         self.cameras.iter().all(|c| c.pose.is_some())
     }
 
-    /// What its unit of length is, a sentence.
+    /// Its unit of length, a sentence.
     pub(crate) fn about_lengths(&self) -> String {
         /// Cameras farther apart than this are measured in millimetres: rigs of more metres are rare, of fewer
         /// millimetres too.

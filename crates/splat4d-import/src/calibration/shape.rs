@@ -15,18 +15,18 @@ const MOST_BARS: f64 = 0.45;
 /// Pixels of the stored images that bars may be wider or narrower than they should.
 const BAR_ROUNDING: f64 = 3.0;
 
-/// How a video of another size has come of the calibrated images.
+/// Relation of a video of another size to the calibrated images.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Shape {
     /// Scaled as a whole.
     Scaled,
-    /// As it was; a codec's padding is gone, or is left in.
+    /// The same size; a codec's padding is removed or kept.
     Padded,
     /// Perhaps scaled to fit, with so many pixels of the video in bars at the sides, and above and below.
     Boxed([f64; 2]),
 }
 
-/// How a video can have come of the calibrated images.
+/// Possible relations of a video to the calibrated images.
 ///
 /// Errors: it is of another shape.
 pub(crate) fn shape(camera: &Calibrated, video: [usize; 2]) -> Result<Shape> {
@@ -66,7 +66,7 @@ fn sizes(size: [usize; 2], video: [usize; 2]) -> String {
 ///
 /// Errors: the video is of another shape than the images it was calibrated with, and neither bars nor padding explain
 /// why; the
-/// principal point lies outside.
+/// principal point is outside.
 pub(crate) fn fitted(
     camera: &Calibrated,
     video: [usize; 2],

@@ -6,7 +6,7 @@ use super::{Grade, Report};
 use crate::sync::median;
 use splat4d_train::capture::Capture;
 
-/// The static background went so far, pixels of 1920, and at least so many own ones.
+/// Motion of the static background that is reported, pixels of 1920, and at least this many own ones.
 pub(super) const MOVED: [f64; 2] = [0.5, 2.0];
 pub(super) const MOVED_PIXELS: [f64; 2] = [0.35, 1.0];
 /// Brightness that jumps from image to image, stops.
@@ -18,7 +18,7 @@ const FRAMES: [f64; 2] = [0.01, 0.05];
 const CLIPPED: f64 = 0.6;
 /// Mean below which an image is too dark, of 255.
 const DARK: f64 = 20.0;
-/// How much larger steps across blocks are, of 255. Images of two recordings that look sound have 0.9 to 1.4.
+/// How much larger steps across blocks are, of 255. Images of two recordings without visible blocks have 0.9 to 1.4.
 const BLOCKS: [f64; 2] = [2.5, 5.0];
 
 /// Findings from a camera's own images.

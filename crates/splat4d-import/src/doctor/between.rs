@@ -87,7 +87,7 @@ fn around(stand: &Stand, [u, v]: [f64; 2]) -> Option<([f64; 3], f64)> {
     (mean > 0.0).then(|| (sums.map(|s| s / (side * side) as f64), fine / mean))
 }
 
-/// What two stands show about each other.
+/// Findings of a pair of camera positions.
 struct Pair {
     stands: [usize; 2],
     matches: usize,
@@ -170,7 +170,7 @@ fn relative(cameras: usize, told: &[([usize; 2], f64, f64)], scale: f64) -> Vec<
     (0..cameras).map(|c| told.iter().any(|(pair, ..)| pair.contains(&c)).then(|| values[c] - middle(c))).collect()
 }
 
-/// How far what a camera shows lies off, as those of its pairs say that are surest: pixels of 1920, and own ones.
+/// Error of a camera by its most reliable pairs: pixels of 1920, and own ones.
 fn poses(pairs: &[Pair], stands: &[(usize, &Stand)], camera: usize) -> Option<(f64, f64)> {
     let mut own: Vec<&Pair> = pairs.iter().filter(|p| p.stands.iter().any(|&k| stands[k].0 == camera)).collect();
     own.sort_by(|p, q| p.off[0].total_cmp(&q.off[0]));

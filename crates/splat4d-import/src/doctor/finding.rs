@@ -27,12 +27,12 @@ pub(super) fn worse([a, b]: [f64; 2], [c, d]: [f64; 2]) -> [f64; 2] {
 
 /// Pixels of an image 1920 wide for each of its own.
 pub(super) fn unit(view: &Camera) -> f64 {
-    /// The longer side of what thresholds are about.
+    /// The image's longer side that thresholds refer to.
     const WIDE: f64 = 1920.0;
     WIDE / view.width.max(view.height) as f64
 }
 
-/// Where findings go.
+/// Destination of findings.
 pub(super) struct FindingList<'a> {
     pub(super) report: &'a mut Report,
 }

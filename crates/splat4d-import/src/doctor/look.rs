@@ -12,7 +12,7 @@ use splat4d_train::capture::{Capture, ImageStore, Rgb8};
 
 /// Images over the recording whose median is the static background.
 const SPREAD: usize = 15;
-/// From so many on a median knows the static background.
+/// From this many on a median gives the static background.
 const MEDIAN_FROM: usize = 3;
 /// Images of a moving camera that are compared with others.
 const STANDS: usize = 16;
@@ -61,7 +61,7 @@ fn halvings(view: &Camera) -> u32 {
     (0..).find(|k| (view.width >> k) * (view.height >> k) <= PIXELS).unwrap_or(0)
 }
 
-/// The view of an image as it is examined.
+/// The view of an examined image.
 fn looked(view: &Camera) -> Camera {
     view.downscaled(1 << halvings(view))
 }

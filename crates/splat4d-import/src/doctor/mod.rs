@@ -49,7 +49,7 @@ pub struct Finding {
     pub unit: &'static str,
     /// The finding, a sentence.
     pub what: String,
-    /// What it will look like, a sentence; empty where that is reported.
+    /// Its visible effect, a sentence; empty if it is stated already.
     pub looks: &'static str,
     /// The remedy, a sentence.
     pub remedy: String,
@@ -100,7 +100,7 @@ impl CameraReport {
     }
 }
 
-/// What two cameras show about each other.
+/// Findings of a pair of cameras.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct PairReport {
     /// Their names.
@@ -145,7 +145,7 @@ pub struct Report {
     pub left: Vec<String>,
 }
 
-/// How closely to look.
+/// Level of detail.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Options {
     /// Consecutive images of a camera that are followed.
@@ -178,7 +178,7 @@ fn machine_memory() -> Option<u64> {
     Some(container.map_or(all, |c: u64| c.min(all)))
 }
 
-/// Looks for everything that commonly spoils results.
+/// Checks for all common causes of bad results.
 ///
 /// Errors: a capture without images, images that cannot be read.
 pub fn examine(capture: &Capture, options: &Options, progress: &mut Progress<'_>) -> Result<Report> {

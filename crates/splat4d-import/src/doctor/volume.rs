@@ -7,7 +7,7 @@ use splat4d_train::vision::triangulate::{self, PixelObservation};
 
 /// Cells of the cube along each side.
 const SIDE: usize = 40;
-/// Half the cube's side, of the cameras' median distance from what they look at: it holds what is half way to them.
+/// Half the cube's side, of the cameras' median distance from their target: it reaches half way to them.
 const HALF: f64 = 0.6;
 /// So many cameras bound a place, and so many give it a shape.
 const SEES: [usize; 2] = [2, 3];
@@ -16,7 +16,7 @@ const MOVES: f64 = 0.75;
 /// Cells in all times that must move before a share means anything.
 const LEAST: usize = 60;
 
-/// Where so many cameras look, by their images' middles.
+/// Target of these cameras, from their image centres.
 pub(super) fn target(views: &[&Camera]) -> Option<[f64; 3]> {
     let middle = |v: &&Camera| [0.5 * v.width as f64, 0.5 * v.height as f64];
     let sights: Vec<PixelObservation<'_>> =

@@ -1,4 +1,4 @@
-//! The clock of all cameras before poses are known: by sound, then by motion, then as their files have it.
+//! Time offsets of all cameras before poses are known: by sound, then by motion, then from their files.
 
 use super::cache::Cache;
 use super::poses::Solved;
@@ -13,7 +13,7 @@ use crate::{Error, ErrorKind, Result};
 use rayon::prelude::*;
 use splat4d_train::event::Progress;
 
-/// Metres between cameras as sound goes, where nothing is known of them: a room's; 15 ms.
+/// Assumed distance of cameras for sound, metres, if unknown: that of a room; 15 ms.
 pub(super) const WAY: f64 = 5.0;
 /// Least seconds that all cameras must film at once.
 const LEAST_SHARED: f64 = 0.1;
@@ -182,14 +182,14 @@ fn seen(
     Ok(pairs.iter().map(of).collect())
 }
 
-/// Offsets of all cameras from what is known of pairs.
+/// Offsets of all cameras from the lags of pairs.
 pub(super) fn solve(cameras: &[Camera], evidence: &[Evidence], told: &[Option<f64>]) -> Solution {
     let rate = |c: &Camera| c.source.info().average_rate.or(c.source.info().nominal_rate).unwrap_or(USUAL_RATE);
     let slowest = cameras.iter().map(rate).fold(f64::INFINITY, f64::min);
     graph::solve(cameras.len(), evidence, told, 0.5 / slowest)
 }
 
-/// What of each camera is stored: of the chosen part, on the first camera's clock, what all cameras film.
+/// The stored part of each camera: the common time span of the chosen part, on the first camera's clock.
 pub(super) fn shared(
     cameras: &[Camera],
     clock: &Solution,

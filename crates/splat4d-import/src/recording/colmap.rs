@@ -16,7 +16,7 @@ const PROGRAM: &str = "colmap";
 /// How to install what is missing.
 const INSTALL: &str = "Install it (apt install colmap, brew install colmap, or from colmap.github.io), or leave --colmap out: \
                        poses are found without it.";
-/// Between two looks at whether the program is done.
+/// Interval between checks whether the program is done.
 const LOOK: Duration = Duration::from_millis(100);
 /// Characters of the program's last words that are repeated.
 const LAST_WORDS: usize = 400;
@@ -67,7 +67,7 @@ const STEPS: [Step; 3] = [
 /// where images
 /// and masks are the same.
 ///
-/// Errors: no program; it fails; cameras that it could not place; of kind `Interrupted` where `stop` said so.
+/// Errors: no program; it fails; cameras that it could not place; of kind `Interrupted` if `stop` requests it.
 pub(super) fn calibrate(
     stored: &Stored<'_>,
     progress: &mut Progress<'_>,
@@ -98,7 +98,7 @@ pub(super) fn calibrate(
     Ok(found)
 }
 
-/// What each step states that it knows. Errors: the program is not there.
+/// Options that each step supports. Errors: the program is not there.
 fn helps() -> Result<Vec<String>> {
     let help = |step: &Step| {
         let out = Command::new(PROGRAM).args([step.name, "--help"]).stdin(Stdio::null()).output();

@@ -1,4 +1,4 @@
-//! Lags by motion, of cameras whose places are known: no feature needs to look alike from two sides.
+//! Lags by motion, of cameras with known poses: features need no match across viewpoints.
 
 use super::cache::Cache;
 use super::stored::Stored;
@@ -13,11 +13,12 @@ use splat4d_train::event::Progress;
 
 /// Frames in a row in which corners are followed.
 const WINDOW: usize = 90;
-/// Part of them that a clock is searched for within: right lags are recognized by standing out of many.
+/// Part of them for the search of a time offset: right lags are recognised as peaks among many.
 const WITHIN: f64 = 1.0 / 3.0;
-/// Corners of a camera that are followed, as the doctor has them.
+/// Corners of a camera that are followed, as in the doctor.
 const TRACKS: usize = 60;
-/// Frames that it takes: among fewer lags, a wrong one stands out as well (of 14 frames of the bundled capture, one was a frame off).
+/// Frames that it takes: among fewer lags, a wrong one can be a peak as well (of 14 frames of the bundled capture, one
+/// was a frame off).
 const SHORTEST: usize = 30;
 /// Neighbours that each camera is compared with.
 const NEIGHBOURS: usize = 3;
@@ -29,7 +30,7 @@ struct StandingCamera {
     frames: usize,
 }
 
-/// Lags of neighbouring cameras. `clock` states about where to look.
+/// Lags of neighbouring cameras. `clock` gives the approximate lag.
 pub(super) fn by_geometry(
     stored: &Stored<'_>,
     clock: &Solution,

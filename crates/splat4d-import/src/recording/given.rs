@@ -21,7 +21,7 @@ pub(super) struct Given {
     pub posed: bool,
     /// Whether its lengths are metres.
     pub metres: bool,
-    /// Points that came with it.
+    /// Its points.
     pub points: Option<PointCloud>,
 }
 
@@ -74,7 +74,7 @@ impl Given {
 /// Images of a camera in which bars are searched for.
 const LOOKS: usize = 3;
 
-/// What is known of every camera's stored images: by calibration, and by the user's own lens, which goes first.
+/// Known lenses of every camera's stored images: from the calibration, and from the user, which has priority.
 /// Sentences about
 /// calibrations that had to be corrected for them join the images' warnings.
 pub(super) fn known(

@@ -1,6 +1,6 @@
 //! The whole import, from videos to a capture folder.
 //!
-//! Sound comes first because it needs no images. Then frames of the shared time span are stored, motion guesses the
+//! Sound is used first because it needs no images. Then frames of the shared time span are stored, motion guesses the
 //! offsets that sound leaves open, and offsets and poses are solved in turn until both converge. Results are stored in
 //! [`corrections::FILE`], where they can be corrected before the next run.
 
@@ -113,7 +113,7 @@ impl Request {
 const MOST_WALKING: usize = 150;
 
 /// Share of the cameras that must be placed, and below which that is reported: what people who reconstruct by
-/// structure from motion go by.
+/// structure from motion is keyed by.
 const PLACED_LEAST: f64 = 0.7;
 const PLACED_WARN: f64 = 0.9;
 /// Points below which a reconstruction hangs on too little: a chessboard's.
@@ -131,10 +131,10 @@ struct Camera {
     source: Box<dyn Source>,
 }
 
-/// Makes a capture. `stop` is asked between steps and between frames.
+/// Makes a capture. `stop` is called between steps and between frames.
 ///
 /// Errors: inputs that cannot be read, cameras that share no time, images that do not show one scene, no space; of kind
-/// `Interrupted` where `stop` said so. What was stored until then is kept, and the same request continues from there.
+/// `Interrupted` if `stop` requested it. What was stored until then is kept, and the same request continues from there.
 pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() -> bool) -> Result<Report> {
     request.selection.check()?;
     let folder = &request.folder;
@@ -374,7 +374,7 @@ fn agrees(solved: &poses::Solved, pictures: &[Pictures], report: &mut Report) ->
     Ok(())
 }
 
-/// Takes the way of sound out of clocks that sound alone determines, or reports why not.
+/// Removes the travel time of sound from clocks that sound alone determines, or reports why not.
 fn sound_goes(
     solved: &mut poses::Solved,
     evidence: &[Evidence],
@@ -437,7 +437,7 @@ fn crop(
     Ok(())
 }
 
-/// Opens all inputs; no file twice.
+/// Opens all inputs; without duplicates.
 fn open(request: &Request) -> Result<Vec<Camera>> {
     let inputs = find(&request.inputs)?;
     let mut sources = Vec::with_capacity(inputs.len());

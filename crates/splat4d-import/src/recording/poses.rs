@@ -1,4 +1,4 @@
-//! Where the cameras are and when: clocks and poses need each other, and are solved in turn until both rest.
+//! Poses and time offsets of the cameras: each needs the other, so they are solved in turn until both converge.
 
 use super::cache::Cache;
 use super::stored::Stored;
@@ -13,8 +13,8 @@ use splat4d::scene::{Intrinsics, Lens};
 use splat4d_train::capture::PointCloud;
 use splat4d_train::event::Progress;
 
-/// Rounds of clocks and poses at most. Of a hall whose clocks were up to four frames off, the worst was 0.3 frames off after
-/// three rounds, and no better after five (methods/16).
+/// Rounds of clocks and poses at most. Of a hall whose clocks were up to four frames off, the worst was 0.3 frames off
+/// after three rounds, and no better after five (methods/16).
 const ROUNDS: usize = 4;
 /// Clocks rest when the one that changed most changed by less, frames.
 const RESTED: f64 = 0.05;
@@ -56,7 +56,7 @@ pub(super) struct Solved {
     pub stray: Vec<bool>,
 }
 
-/// A solution as it is stored; of lenses that were given nothing.
+/// A stored solution; empty for given lenses.
 #[derive(Serialize, Deserialize)]
 struct Note {
     cameras: Vec<Result<Row, String>>,
@@ -75,7 +75,7 @@ struct Row {
     fixed: bool,
     /// fx fy cx cy.
     intrinsics: [f64; 4],
-    /// k1 to k6, p1, p2; what is found has no other terms.
+    /// k1 to k6, p1, p2; estimated lenses have no other terms.
     brown: Option<[f64; 8]>,
     sightings: usize,
     error: f64,
@@ -350,7 +350,7 @@ impl Solved {
 }
 
 impl Stand {
-    /// As it is written.
+    /// As written.
     pub(super) fn written(&self, pictures: &Pictures, offset: Offset, masks: Option<Masks>) -> Placed {
         let poses = match &self.poses[..] {
             [Some(pose)] if self.fixed => Poses::Fixed(*pose),

@@ -51,11 +51,11 @@ pub struct CameraReport {
     pub offset: Option<f64>,
     /// Their standard deviation.
     pub sigma: Option<f64>,
-    /// What the offset is from.
+    /// Source of the offset.
     pub by: Vec<&'static str>,
     /// Why it could not be placed.
     pub trouble: Option<String>,
-    /// Points that it sees where they are.
+    /// Points that it sees consistently.
     pub sightings: usize,
     /// Median distance of points from where they are seen, pixels.
     pub error: Option<f64>,

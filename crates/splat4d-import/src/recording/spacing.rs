@@ -7,7 +7,7 @@ use splat4d::math::se3::{dot, norm, sub};
 /// Largest angle between neighbours that features survive in most scenes, degrees (docs/filming.md).
 pub(super) const FAR: f64 = 20.0;
 
-/// Two neighbours on the way from camera to camera.
+/// Two neighbours along the rig.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Gap {
     /// Their names.

@@ -11,7 +11,7 @@ use splat4d::scene::Planes;
 use splat4d_train::capture::Rgb8;
 use std::path::Path;
 
-/// All cameras' stored images, and the clock of all as far as it is known.
+/// All cameras' stored images, and their time offsets as far as known.
 pub(super) struct Stored<'a> {
     pub folder: &'a Path,
     pub pictures: &'a [Pictures],

@@ -1,4 +1,5 @@
-//! The way of sound: once cameras have places in metres, what each heard too late is taken out of the clocks that only sound determines.
+//! Travel time of sound: once camera positions are known in metres, the delay of each is removed from clocks that only
+//! sound determines.
 
 use super::clocks::WAY;
 use super::poses::Solved;
@@ -7,9 +8,9 @@ use crate::sync::sound::{way, without_way};
 use splat4d::math::mat3;
 use splat4d::math::se3::{add, dot, norm, normalize, scale, sub};
 
-/// Of the cameras' distance from what they look at, the standard deviation of where sounds come from.
+/// Of the cameras' distance from their target, the standard deviation of the positions of sounds.
 const ABOUT: f64 = 0.3;
-/// Steps to where sounds come from; lags are nearly linear in it.
+/// Steps to the positions of sounds; lags are nearly linear in it.
 const STEPS: usize = 20;
 /// Standard deviations from which on a lag counts less (Huber).
 const OUTLIER: f64 = 2.0;
@@ -25,10 +26,10 @@ pub(super) struct Corrected {
     pub most: f64,
 }
 
-/// Takes the way of sound out of clocks that sound alone determines. The solution's unit is the metre.
+/// Removes the travel time of sound from clocks that sound alone determines. The solution's unit is the metre.
 ///
-/// The positions of sounds come from cameras whose clocks geometry found or users gave: what these heard is late by
-/// nothing but its way. Of fewer cameras, or none, it is the middle of what all look at.
+/// The positions of sounds are estimated from cameras whose clocks geometry found or users gave: their sound is late by
+/// its travel time alone. With fewer cameras, or none, it is the common target of all.
 pub(super) fn corrected(
     solved: &mut Solved,
     evidence: &[Evidence],
@@ -103,7 +104,7 @@ fn own_sigma(e: &Evidence) -> f64 {
     (e.sigma.powi(2) - (0.5 * way(WAY)).powi(2)).max(SURE * SURE).sqrt()
 }
 
-/// The point that lies nearest to where all cameras look, and their median distance from it.
+/// The point nearest to the axes of all cameras, and their median distance from it.
 fn looked_at(places: &[Option<([f64; 3], [f64; 3])>]) -> Option<([f64; 3], f64)> {
     let known: Vec<_> = places.iter().flatten().collect();
     let (mut a, mut b) = ([[0.0; 3]; 3], [0.0; 3]);
@@ -122,7 +123,7 @@ fn looked_at(places: &[Option<([f64; 3], [f64; 3])>]) -> Option<([f64; 3], f64)>
     distances.get(distances.len() / 2).map(|d| (middle, *d))
 }
 
-/// Where sounds come from.
+/// Positions of sounds.
 struct Source<'a> {
     places: &'a [Option<([f64; 3], [f64; 3])>],
     /// What is believed before anything was heard, and its standard deviation.
@@ -138,8 +139,8 @@ impl Source<'_> {
         sub(to(b), to(a)).map(way)
     }
 
-    /// The most likely place by lags of cameras whose clocks are known, and its standard deviation. (Gauss and Newton; differences
-    /// of times of arrival.)
+    /// The most likely place by lags of cameras whose clocks are known, and its standard deviation. (Gauss and Newton;
+    /// differences of times of arrival.)
     fn heard(&self, lags: &[&Evidence], clocks: &[Option<f64>]) -> ([f64; 3], f64) {
         let known: Vec<(&Evidence, f64)> = lags
             .iter()

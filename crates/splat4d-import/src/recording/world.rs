@@ -26,7 +26,7 @@ pub(super) enum Origin {
 
 /// Gives a solution its unit and its axes, and states so in the report; whether the unit is the metre.
 ///
-/// Errors: what should give the scale is not visible, or contradicts itself.
+/// Errors: the reference of the scale is not visible, or contradicts itself.
 pub(super) fn settle(
     request: &Request,
     stored: &Stored<'_>,
@@ -90,7 +90,7 @@ pub(super) fn settle(
     Ok(told || origin == Origin::Calibrated { metres: true })
 }
 
-/// Turns the world so that z is upwards and x and y are along walls, if there are any, with cameras looking along y.
+/// Rotates the world so that z is upwards and x and y are along walls, if there are any, with cameras looking along y.
 fn turn(solved: &mut Solved, up: [f64; 3], fixed: bool) -> Axes {
     let points: Vec<[f64; 3]> = solved.points.iter().map(|p| p.0).collect();
     let found = axes(&points, up, fixed);

@@ -1,11 +1,11 @@
 //! Bundle adjustment: poses, lenses, clocks and points together, so that points are seen where they were found.
 //!
-//! Levenberg-Marquardt with a robust loss; points are eliminated (Schur complement), so that what is solved has a few rows
-//! for each camera (Triggs et al. 2000, "Bundle adjustment – a modern synthesis").
+//! Levenberg-Marquardt with a robust loss; points are eliminated (Schur complement), so that the reduced system has a
+//! few rows for each camera (Triggs et al. 2000, "Bundle adjustment – a modern synthesis").
 //!
-//! A camera whose clock is late by τ saw at its frame what the others saw τ later. A feature that moves by v pixels a second
-//! therefore belongs at x + v·τ, and the residual of point X is e = π(X) − (x + v·τ): clocks are found by the same least
-//! squares as poses, and what moves helps poses.
+//! A camera whose clock is late by τ saw at its frame what the others saw τ later. A feature that moves by v pixels a
+//! second therefore belongs at x + v·τ, and the residual of point X is e = π(X) − (x + v·τ): clocks are found by the
+//! same least squares as poses, and what moves helps poses.
 
 use super::algebra::{orthonormal, rotation};
 use super::lens::Lens;
@@ -39,7 +39,7 @@ pub(crate) struct Sighting {
     pub velocity: [f64; 2],
 }
 
-/// Cameras, points, and who sees what where.
+/// Cameras, points, and the sightings.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Bundle {
     /// The cameras.
@@ -110,7 +110,7 @@ pub(crate) struct Settings {
     pub gain: f64,
 }
 
-/// What came of it.
+/// The result.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Report {
     /// The loss before: Σ of half the robust squares, with priors.
@@ -194,7 +194,7 @@ impl Bundle {
     }
 }
 
-/// How far a lens is from what is known of it, and the weights of that.
+/// Deviation of a lens from its known values, and its weights.
 fn known(lens: &Lens, prior: &Lens, settings: &Settings) -> [(f64, f64); LENS] {
     let p = &settings.priors;
     let weight = |deviation: f64| deviation.powi(-2);
@@ -415,7 +415,7 @@ fn invert(m: &[[f64; 3]; 3]) -> Option<[[f64; 3]; 3]> {
     Some([column(0)?, column(1)?, column(2)?])
 }
 
-/// Numbers that stay: what is not free, and what fixes where the world is, which way it looks and how large it is.
+/// Fixed numbers: those that are not free, and the gauge (position, orientation and scale of the world).
 struct Gauge {
     held: Vec<bool>,
 }
@@ -478,7 +478,8 @@ fn moved(bundle: &Bundle, cameras: &[f64], points: &[[f64; 3]], held: &[bool]) -
 
 /// Adjusts a bundle in place.
 ///
-/// The first view's pose stays, and one number of another's translation: they fix place, direction and size of the world.
+/// The first view's pose stays, and one number of another's translation: they fix place, direction and size of the
+/// world.
 pub(crate) fn adjust(bundle: &mut Bundle, settings: &Settings) -> Report {
     assert!(bundle.sightings.is_sorted_by_key(|s| s.point), "sightings come in the order of their points");
     assert_eq!(settings.priors.lenses.len(), bundle.lenses.len(), "every lens has its prior");
@@ -588,8 +589,8 @@ mod tests {
         Settings { scale: f64::INFINITY, free, exact: Vec::new(), priors: Priors::none(lenses), steps: 100, gain: 0.0 }
     }
 
-    /// Largest differences of rotations (radians) and of centres after the best similarity, of focal lengths (relative) and
-    /// of clocks from each other (seconds).
+    /// Largest differences of rotations (radians) and of centres after the best similarity, of focal lengths (relative)
+    /// and of clocks from each other (seconds).
     fn apart(a: &Bundle, b: &Bundle) -> [f64; 4] {
         let poses = |b: &Bundle| b.views.iter().map(|v| v.pose).collect::<Vec<_>>();
         let (from, to) = (poses(a), poses(b));

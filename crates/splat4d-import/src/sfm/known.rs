@@ -43,7 +43,7 @@ impl Straight {
         self.to.pinhole(pose, width, height)
     }
 
-    /// Where the camera without distortion sees what is seen at a pixel; none where no ray leads there.
+    /// The undistorted position of a pixel; none where no ray leads there.
     pub(crate) fn pixel(&self, [u, v]: [f64; 2]) -> Option<[f64; 2]> {
         let k = &self.from;
         let ray = self.lens.undistort([(u - k.cx) / k.fx, (v - k.cy) / k.fy])?;
@@ -71,8 +71,8 @@ impl Straight {
 /// Points and clocks of cameras whose poses and lenses are given. `links` were found without them, and measure their
 /// errors.
 ///
-/// What moves is next to its epipolar lines as long as clocks are off: first clocks are found of what looks alike,
-/// within wide
+/// Moving objects are off their epipolar lines as long as time offsets are wrong: first, offsets are estimated from
+/// matches, within wide
 /// bounds; then points of what is on the lines, which it is at any clock, so that they determine none.
 pub(crate) fn about(sights: &[CameraView], links: &[Link], how: &Mapping, progress: &mut Progress<'_>) -> Mapped {
     /// Of the tolerance: two frames of what is followed at all, in images 1920 across.
@@ -111,7 +111,7 @@ pub(crate) fn about(sights: &[CameraView], links: &[Link], how: &Mapping, progre
 
 /// Matches of the static background that a pair of cameras must have before it shows whether poses are right.
 const SURE: usize = 12;
-/// Cameras whose axes are farther apart see other sides of things: what seems alike there is chance, degrees.
+/// Cameras whose axes are farther apart see other sides of objects: matches there are chance, degrees.
 const APART: f64 = 70.0;
 /// Median over lower quartile of the size of a normal error: 0.6745 / 0.3186.
 const QUARTILE_TO_MEDIAN: f64 = 2.117;

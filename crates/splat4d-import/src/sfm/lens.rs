@@ -126,7 +126,7 @@ pub(crate) fn off(lens: &Lens, pose: &Se3, x: [f64; 3], pixel: [f64; 2]) -> f64 
     lens.project(p).map_or(f64::INFINITY, |[u, v]| (u - pixel[0]).hypot(v - pixel[1]))
 }
 
-/// What is known of a camera.
+/// Known values of a camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Known {
     /// Pixels of the files' images.

@@ -1,4 +1,4 @@
-//! Cameras one after another: a pair to start with, then always the one that sees most of what is known.
+//! Cameras one after another: starts with a pair, then always adds the one that sees most known points.
 
 mod overlaid;
 mod strays;
@@ -85,7 +85,7 @@ const FAMILY_FROM: usize = 4;
 const FAMILY: f64 = 0.003;
 /// Where images contradict that, lenses differ by this share: of phones of several models, some per cent.
 const STRANGERS: f64 = 0.05;
-/// Twice the loss that it costs to take lenses for equal, of the variance of a sighting and for each lens: more
+/// Twice the loss of treating lenses as equal, of the variance of a sighting and for each lens: more
 /// contradicts it. Were sightings' errors independent, 1 would be usual (Wilks 1938).
 const CONTRADICTS: f64 = 8.0;
 /// Rounds of adjusting, leaving out and finding again at the end.
@@ -95,19 +95,19 @@ const ROUNDS: usize = 4;
 #[derive(Clone, Debug)]
 struct Spot {
     place: [f64; 3],
-    /// Which of its track's sights see it there.
+    /// The sights of its track that see it there.
     seen: Vec<usize>,
 }
 
-/// What is known so far.
+/// The present state of the map.
 #[derive(Clone)]
 pub(crate) struct Map<'a> {
     sights: &'a [CameraView],
     tracks: &'a [Track],
-    /// For each sight its tracks and its place in them.
+    /// For each sight its tracks and its index in them.
     shows: &'a [Vec<(usize, usize)>],
     how: &'a Mapping,
-    /// Placed sights in the order in which they were.
+    /// Placed sights in the order of placement.
     order: Vec<usize>,
     poses: Vec<Option<Se3>>,
     taus: Vec<f64>,
@@ -121,7 +121,7 @@ pub(crate) struct Map<'a> {
     spots: Vec<Option<Spot>>,
     /// Why sights could not be placed.
     reasons: Vec<String>,
-    /// Lenses that look alike were found not to be of one model.
+    /// Lenses with similar values were found to be of different models.
     strangers: bool,
 }
 
@@ -182,7 +182,7 @@ impl<'a> Ground<'a> {
         link.matches.iter().map(|&([i, j], _)| [ray(a, focal[0], i), ray(b, focal[1], j)]).collect()
     }
 
-    /// The map of no camera, with focal lengths (of the larger side) as they are given or guessed.
+    /// The map of no camera, with focal lengths (of the larger side) as given or guessed.
     fn empty(&self, focal: f64) -> Map<'_> {
         let mut lenses: Vec<Option<Lens>> = vec![None; self.lens_count];
         let mut told = vec![false; self.lens_count];
@@ -238,7 +238,7 @@ impl<'a> Ground<'a> {
         map
     }
 
-    /// The map of cameras as another one has them.
+    /// The map of cameras from another map.
     fn again(&self, from: &Map<'_>) -> Map<'_> {
         let mut map = self.empty(1.0);
         map.order.clone_from(&from.order);
@@ -266,7 +266,7 @@ impl Map<'_> {
         &self.lenses[self.lens_of[sight]]
     }
 
-    /// Where a sight saw a track's place, by the clock that all share.
+    /// The sighting of a track in a sight, at the common time.
     fn pixel(&self, track: usize, k: usize) -> [f64; 2] {
         let (sight, feature) = self.tracks[track].seen[k];
         let f = &self.sights[sight].features[feature];
@@ -289,16 +289,16 @@ impl Map<'_> {
         self.poses[sight].as_ref().expect("only placed sights are asked").inverse().translation
     }
 
-    /// The largest angle between the rays of these sights of a track at a place, degrees.
+    /// The largest angle between the rays of these sights of a track at a point, degrees.
     fn angle(&self, track: usize, seen: &[usize], x: [f64; 3]) -> f64 {
         let centers: Vec<[f64; 3]> = seen.iter().map(|&k| self.center(self.tracks[track].seen[k].0)).collect();
         let pairs = (0..centers.len()).flat_map(|i| (0..i).map(move |j| (i, j)));
         pairs.map(|(i, j)| angle_at(x, centers[i], centers[j])).fold(0.0, f64::max).to_degrees()
     }
 
-    /// The place of a track that most of its placed sights agree with.
+    /// The position of a track that most of its placed sights agree with.
     fn triangulated(&self, track: usize, cameras: &[Option<Camera>]) -> Option<Spot> {
-        /// Pairs of sights that places are tried of, at most.
+        /// Pairs of sights for trial positions, at most.
         const PAIRS: usize = 40;
         let placed = self.placed(track);
         if placed.len() < 2 {
@@ -467,7 +467,7 @@ impl Map<'_> {
     }
 
     /// Whether all lenses seem to be of one model: rigs are often made of equal cameras, and what differs between them
-    /// is then the error of each. Of too few, or of images of several sizes, it is not asked.
+    /// is then the error of each. It is skipped for too few, or for images of several sizes.
     fn family(&self, lenses: &[usize]) -> bool {
         if lenses.len() < FAMILY_FROM || self.order.len() < ALL_FROM {
             return false;
@@ -539,7 +539,7 @@ impl Map<'_> {
         true
     }
 
-    /// Places as many sights as can be.
+    /// Places as many sights as possible.
     pub(crate) fn grow(&mut self, tell: &mut dyn FnMut(usize)) {
         const STEPS: usize = 10;
         let mut adjusted = self.order.len() as f64;
@@ -570,7 +570,7 @@ impl Map<'_> {
         }
     }
 
-    /// Adjusts, leaves out and finds again; all sights stay.
+    /// Adjusts, removes outliers and matches again; all sights stay.
     pub(super) fn settle(&mut self) {
         const STEPS: usize = 50;
         for _ in 0..ROUNDS {
@@ -579,7 +579,7 @@ impl Map<'_> {
         }
     }
 
-    /// Adjusts, leaves out, finds again until it rests; sights that are left with too little are taken out.
+    /// Adjusts, removes outliers and matches again until convergence; sights with too few points are removed.
     pub(crate) fn finish(&mut self) {
         const STEPS: usize = 50;
         for _ in 0..ROUNDS {
@@ -631,7 +631,7 @@ impl Map<'_> {
         out
     }
 
-    /// Points that a sight sees where they are.
+    /// Points that a sight sees consistently.
     fn fits(&self, sight: usize) -> usize {
         let of = |&&(t, k): &&(usize, usize)| self.spots[t].as_ref().is_some_and(|s| s.seen.contains(&k));
         self.shows[sight].iter().filter(of).count()
@@ -705,7 +705,7 @@ pub(crate) struct Stand {
     pub lens: Lens,
     /// How far its clock is ahead, seconds.
     pub tau: f64,
-    /// Points that it sees where they are.
+    /// Points that it sees consistently.
     pub sightings: usize,
     /// Their median distance from where they are seen, pixels of the sight's size.
     pub error: f64,

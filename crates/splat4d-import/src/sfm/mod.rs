@@ -1,7 +1,7 @@
 //! Structure from motion: poses, lenses, time offsets and points of images without any.
 //!
 //! A fixed camera is one image: the features of its median background, and the features of moving objects at some
-//! shared times. Moving objects are evidence where walls look alike. Each of their features has a velocity, so time
+//! shared times. Moving objects are evidence where walls are ambiguous. Each of their features has a velocity, so time
 //! offsets are found together with poses (`adjust`). Each frame of a moving camera is an image.
 
 pub mod adjust;
@@ -32,7 +32,7 @@ type Who = (usize, Option<usize>);
 /// How poses are found.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Options {
-    /// What features are taken from.
+    /// Source of features.
     pub look: FeatureOptions,
     /// How cameras are placed.
     pub mapping: Mapping,
@@ -53,7 +53,7 @@ pub struct Taken {
     pub placed: Result<Placed, String>,
 }
 
-/// Where a camera stands.
+/// Pose of a camera.
 #[derive(Clone, Copy, Debug)]
 pub struct Placed {
     /// Takes world points into the camera's axes.
@@ -64,7 +64,7 @@ pub struct Placed {
     pub size: [usize; 2],
     /// How far its clock is ahead, seconds: to be taken from its times. Only differences between cameras mean anything.
     pub tau: f64,
-    /// Points that it sees where they are.
+    /// Points that it sees consistently.
     pub sightings: usize,
     /// Their median distance from where they are seen, pixels of the files' images.
     pub error: f64,
@@ -96,7 +96,7 @@ pub struct Solution {
     pub up: [f64; 3],
     /// Pairs of images that were found to show one scene.
     pub pairs: usize,
-    /// For each camera whose place was known, how far what it shows is from where that states: epipolar distance of matches that
+    /// For each camera with a known pose, the deviation from it: epipolar distance of matches that
     /// were found without it, at the median, pixels of the files' images. None: too few matches.
     pub contradiction: Vec<Option<f64>>,
     /// Of each of [`Solution::taken`], the points that move by which its clock was found.
@@ -108,7 +108,7 @@ pub struct Solution {
 /// Finds where images were taken from.
 ///
 /// The world's unit is the median distance of the cameras from the points; its axes are those of the camera that was
-/// placed first. Lengths and the vertical must come from elsewhere. Where all places are known, so are unit and axes:
+/// placed first. Scale and the vertical need other sources. If all poses are known, so are unit and axes:
 /// then only points and clocks are found.
 ///
 /// Errors: images that cannot be read; no two that show one scene.

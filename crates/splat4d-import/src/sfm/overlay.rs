@@ -1,7 +1,7 @@
 //! Places of features made exact: the windows about one point in all its images are laid over each other.
 //!
-//! A detector finds the middle of a blob, which is another place of the thing from every side, some tenths of a pixel
-//! off. What counts for poses is that all images mean the same place: the window of one image, warped as a small plane
+//! A detector finds the middle of a blob, which is another point of the object from every side, some tenths of a pixel
+//! off. For poses, all images must locate the same point: the window of one image, warped as a small plane
 //! at the point
 //! would be seen from the other camera, is moved over the other image until they agree best (Lucas and Kanade 1981,
 //! with an
@@ -64,7 +64,7 @@ impl Shown {
 }
 
 /// Weights of four neighbours at a place between the middle two (Catmull and Rom 1974): linear ones blur, by how much
-/// depends on the place, and draw places to pixels' middles.
+/// depends on the position, and bias positions to pixel centres.
 fn cubic(t: f64) -> [f64; 4] {
     let (t2, t3) = (t * t, t * t * t);
     [0.5 * (-t + 2.0 * t2 - t3), 0.5 * (2.0 - 5.0 * t2 + 3.0 * t3), 0.5 * (t + 4.0 * t2 - 3.0 * t3), 0.5 * (t3 - t2)]
@@ -152,7 +152,7 @@ const STEPS: usize = 20;
 const STILL: f64 = 0.003;
 /// Farthest that a place may move, pixels.
 const FARTHEST: f64 = 1.5;
-/// Windows whose correlation is less do not show one thing from both sides.
+/// Windows whose correlation is less do not show one object from both sides.
 const ALIKE: f64 = 0.9;
 /// Standard deviation of grey values in a window, of 255: less has nothing to lay over.
 const FLAT: f64 = 4.0;

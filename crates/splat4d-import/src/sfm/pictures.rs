@@ -20,7 +20,7 @@ pub trait Pictures: Sync {
     fn name(&self, camera: usize) -> String;
     /// How many frames a camera has.
     fn frames(&self, camera: usize) -> usize;
-    /// When a frame was taken, seconds on the clock that all share as far as it is known; ascending.
+    /// When a frame was taken, seconds on the common clock as far as known; ascending.
     fn time(&self, camera: usize, frame: usize) -> f64;
     /// A frame's image: 3 channels in [0, 1]. All frames of a camera are of one size.
     fn load(&self, camera: usize, frame: usize) -> Result<Planes<f32>>;
@@ -52,7 +52,7 @@ pub struct Feature {
     /// 0: it is static; otherwise which of the shared times it was seen at, from 1. Those of different times are
     /// never the same.
     pub moment: usize,
-    /// What it looks like.
+    /// Its descriptor.
     pub descriptor: [u8; NUMBERS],
     /// sRGB.
     pub color: [u8; 3],
@@ -74,7 +74,7 @@ pub struct CameraView {
     pub exact: bool,
     /// Takes world points into the camera's axes, where that is known.
     pub pose: Option<Se3>,
-    /// Sights of one number share a lens.
+    /// Sights with the same number share a lens.
     pub lens: usize,
     /// How long a frame lasts, seconds.
     pub frame: f64,
@@ -85,7 +85,7 @@ pub struct CameraView {
     pub shown: Vec<Option<Shown>>,
 }
 
-/// What features are taken from.
+/// Source of features.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FeatureOptions {
     /// Times at which features are taken from dynamic regions.
@@ -110,7 +110,7 @@ impl Default for FeatureOptions {
 
 /// Frames whose median is the static background.
 const MEDIAN_OF: usize = 15;
-/// From so many frames on a median knows the static background.
+/// From this many frames on a median gives the static background.
 const MEDIAN_FROM: usize = 3;
 /// A pixel that differs by more than this from the static background (mean of the channels, in [0, 1]) belongs to
 /// something that moves: above the noise of ordinary cameras.
@@ -355,7 +355,7 @@ impl Window {
 
 /// Features of what moves in a frame, each with its velocity; brought to the shared time, which may be next
 /// to the
-/// frame's. And what they are from.
+/// frame's. And their sources.
 fn moving(
     pictures: &dyn Pictures,
     camera: usize,

@@ -31,14 +31,14 @@ pub struct Link {
     pub matches: Vec<([usize; 2], f32)>,
     /// From pixels (about the middle of the first image) to lines of the second; zero where poses led to the matches.
     pub fundamental: [[f64; 3]; 3],
-    /// All that look alike, whether they agree with one motion or not; empty where poses led to the matches.
+    /// All matches, whether they agree with one motion or not; empty if the matches were guided by poses.
     pub alike: Vec<[usize; 2]>,
 }
 
-/// A place that several sights see.
+/// A point that several sights see.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Track {
-    /// Numbers of the sights, ascending and none twice, and of their features.
+    /// Numbers of the sights, ascending without duplicates, and of their features.
     pub seen: Vec<(usize, usize)>,
 }
 
@@ -172,7 +172,7 @@ pub(crate) fn links(sights: &[CameraView], pairing: Pairing, seed: u64, progress
     out
 }
 
-/// What is known of a placed sight: where its features would be without distortion, by the clock that all share.
+/// Data of a placed sight: its undistorted features, at the common time.
 pub(crate) struct Known {
     /// Without distortion.
     pub camera: Camera,
@@ -186,7 +186,7 @@ const GUIDED_RATIO: f32 = 0.75;
 /// descriptors, an
 /// eighth of the largest there is.
 const FAR: f32 = 65_536.0;
-/// Cameras whose axes are farther apart see other sides of things, degrees.
+/// Cameras whose axes are farther apart see other sides of objects, degrees.
 const WIDEST: f64 = 80.0;
 
 /// Compares placed images along epipolar lines, within `tolerance` pixels of [`super::lens::unit`].
@@ -309,7 +309,7 @@ fn verified(sights: &[CameraView], [a, b]: [usize; 2], matches: Vec<([usize; 2],
     })
 }
 
-/// Joins the matches of all links, surest first, so that no track has two places of one sight. Tracks ascend by their
+/// Joins the matches of all links, surest first, so that no track has two features of one sight. Tracks ascend by their
 /// first features.
 pub fn join(sights: &[CameraView], links: &[Link]) -> Vec<Track> {
     // Features of exactly one place are one.

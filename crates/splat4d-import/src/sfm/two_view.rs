@@ -129,7 +129,7 @@ pub(crate) fn unlike_focal(f: &Mat3, focal: f64) -> f64 {
 }
 
 /// Exponents of x, y and z of the monomials of degree three and less, in the order of Nistér 2004, so that ten of them
-/// can be eliminated and what is left are polynomials in z times x, y and 1.
+/// can be eliminated and the remaining equations are polynomials in z times x, y and 1.
 const MONOMIALS: [[usize; 3]; 20] = [
     [3, 0, 0],
     [0, 3, 0],
@@ -257,7 +257,7 @@ pub(crate) fn motions(e: &Mat3) -> [Se3; 4] {
     [(1.0, t), (1.0, back), (-1.0, t), (-1.0, back)].map(|(s, t)| Se3 { rotation: turn(s), translation: t })
 }
 
-/// Depths along the two rays of a pair at which they come nearest to each other.
+/// Depths along the two rays of a pair at which they are nearest to each other.
 pub(crate) fn depths(motion: &Se3, &[a, b]: &Pair) -> [f64; 2] {
     let a = mat_vec(&motion.rotation, long(a));
     let b = long(b);

@@ -1,5 +1,5 @@
-//! Lags by geometry: what moves is on the epipolar line of where the other camera saw it at the same time, and leaves
-//! the line at any other.
+//! Lags by geometry: a moving point is on the epipolar line of its sighting in the other camera at the same time, and
+//! leaves the line at any other.
 
 use super::tracks::Track;
 use super::{NORMAL_MAD, Refusal, median};
@@ -7,8 +7,8 @@ use rayon::prelude::*;
 use splat4d::math::se3::{mat_mul, mat_vec, norm, sub, transpose};
 use splat4d::scene::Camera;
 
-/// Pixels off the epipolar line from which on a match at some lag is none: a few times what corners and poses are exact
-/// to.
+/// Pixels off the epipolar line from which on a match at some lag is rejected: a few times what corners and poses are
+/// exact to.
 const TOLERANCE: f64 = 3.0;
 /// Pixels that corners and poses are usually off, together, in the search.
 const USUAL: f64 = 1.0;
@@ -18,7 +18,7 @@ const INDEPENDENT: f64 = 5.0;
 const NO_MATCH: f64 = 0.05;
 /// Steps of the search in median intervals between frames.
 const GRID: f64 = 0.5;
-/// Pixels that a track must move to say anything.
+/// Pixels that a track must move to be informative.
 const MOVES: f64 = 2.0;
 /// Matches that a lag needs.
 const MATCHES: usize = 8;
@@ -37,7 +37,7 @@ const AS_GOOD: f64 = 0.75;
 const LOBE: f64 = 1.5;
 /// The largest uncertainty that is a lag, in intervals.
 const VAGUE: f64 = 0.35;
-/// How often matches are chosen and the lag is refined in turn.
+/// Rounds of matching and refining the lag.
 const ROUNDS: usize = 3;
 /// The least that a corner is off, pixels: uncertainties must not vanish with noise-free data.
 const EXACT: f64 = 0.02;
@@ -57,7 +57,7 @@ pub(crate) struct EpipolarLag {
     pub error: f64,
 }
 
-/// Where to look.
+/// Range of the search.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Range {
     /// The middle, seconds.

@@ -1,5 +1,5 @@
-//! Offsets of all cameras from lags of pairs: robust least squares on the graph. What contradicts the rest is left out and
-//! named.
+//! Offsets of all cameras from lags of pairs: robust least squares on the graph. Lags that contradict the rest are left
+//! out and named.
 
 use serde::{Deserialize, Serialize};
 use splat4d::math::cholesky::Cholesky;
@@ -51,7 +51,7 @@ pub struct Evidence {
     pub sigma: f64,
     /// Seconds by which it grows each second, where that is known.
     pub drift: Option<f64>,
-    /// What it is from.
+    /// Its source.
     pub kind: Kind,
 }
 
@@ -95,8 +95,9 @@ pub(crate) struct Solution {
     pub refused: Vec<Refused>,
 }
 
-/// Offsets of so many cameras, camera 0's being 0 unless `given` states otherwise; where it gives an offset, it is kept. Lags
-/// that are off by more than `tolerance` seconds (half a frame) and more than four standard deviations contradict.
+/// Offsets of so many cameras, camera 0's being 0 unless `given` states otherwise; where it gives an offset, it is
+/// kept. Lags that are off by more than `tolerance` seconds (half a frame) and more than four standard deviations
+/// contradict.
 pub(crate) fn solve(cameras: usize, evidence: &[Evidence], given: &[Option<f64>], tolerance: f64) -> Solution {
     let mut known: Vec<Option<f64>> = (0..cameras).map(|c| given.get(c).copied().flatten()).collect();
     let told: Vec<bool> = known.iter().map(Option::is_some).collect();
@@ -194,8 +195,8 @@ impl Graph<'_> {
         values[a] - values[b] - self.evidence[k].lag
     }
 
-    /// The largest set of lags found that agree, in order: truncated least squares by graduated non-convexity, then what was
-    /// lost of the trusted ones is taken back where it leads to a camera that nothing else leads to.
+    /// The largest set of lags found that agree, in order: truncated least squares by graduated non-convexity, then
+    /// what was lost of the trusted ones is taken back where it leads to a camera that nothing else leads to.
     fn agree(&self, edges: &[usize], known: &[Option<f64>]) -> Vec<usize> {
         if edges.is_empty() {
             return Vec::new();

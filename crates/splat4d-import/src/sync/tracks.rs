@@ -6,7 +6,7 @@ use splat4d_train::capture::Rgb8;
 
 /// Pixels between corners that are followed.
 pub(crate) const APART: f64 = 8.0;
-/// Images are halved until they have no more pixels: 640x360 is looked at as it is, and a film's images at half size.
+/// Images are halved until they have no more pixels: 640x360 is used in full, and a film's images at half size.
 pub(crate) const PIXELS: usize = 700_000;
 /// Sizes of an image: motion of up to `RADIUS · 2^(LEVELS − 1)` pixels is followed.
 pub(crate) const LEVELS: usize = 4;
@@ -70,7 +70,7 @@ impl Track {
 
     /// Where it was at a time, smoothed by a cubic B-spline over four frames; None within a frame of its ends.
     ///
-    /// A line between two noisy places is less noisy half way than at either end, so that lags would be drawn to half
+    /// A line between two noisy places is less noisy half way than at either end, so that lags would be biased to half
     /// frames (on a real rig half of the pairs were); the weights of a cubic B-spline have nearly the same sum of
     /// squares everywhere (0.50 to 0.46), and blur the motion by the same third of a squared frame.
     pub(crate) fn smooth(&self, time: f64) -> Option<[f64; 2]> {
@@ -107,7 +107,7 @@ impl Track {
     }
 }
 
-/// Weights of the samples −1, 0, 1 and 2 at a part of the way from sample 0 to 1.
+/// Weights of the samples −1, 0, 1 and 2 at a fraction between samples 0 and 1.
 fn b_spline(u: f64) -> [f64; 4] {
     let v = 1.0 - u;
     let (u2, v2) = (u * u, v * v);
@@ -188,7 +188,7 @@ fn smaller_eigenvalue([xx, xy, yy]: [f64; 3]) -> f64 {
 }
 
 /// Where points of image a are in image b; None where they are lost: they left, nothing there is like them, or they do
-/// not come back when followed the other way.
+/// not return to the start when tracked backwards.
 pub fn follow(a: &Pyramid, b: &Pyramid, points: &[[f64; 2]]) -> Vec<Option<[f64; 2]>> {
     let both = |&p: &[f64; 2]| {
         let there = step(a, b, p)?;
@@ -275,7 +275,7 @@ fn at_level(a: &Grey, b: &Grey, [x, y]: [f64; 2], mut moved: [f64; 2], finest: b
     Some(moved)
 }
 
-/// Follows corners through a camera's frames; where some are lost, new ones are looked for.
+/// Follows corners through a camera's frames; where some are lost, new ones are detected.
 pub(crate) struct Tracker {
     most: usize,
     apart: f64,

@@ -20,7 +20,7 @@ const MAX_DEPTH: usize = 8;
 pub(super) struct Avi {
     path: PathBuf,
     info: Info,
-    /// Where each frame lies, and how long it is; a length of 0 repeats the frame before.
+    /// Position and length of each frame; a length of 0 repeats the frame before.
     frames: Vec<(u64, u32)>,
     /// Seconds a frame.
     interval: f64,
@@ -116,7 +116,7 @@ fn info(path: &Path, interval: f64, warnings: Vec<String>) -> Info {
     }
 }
 
-/// Reads the list at a place; where the next thing begins.
+/// Reads the list at a place; returns the position after it.
 fn list(file: &mut BufReader<File>, at: u64, end: u64, found: &mut AviContents, depth: usize) -> std::io::Result<u64> {
     file.seek(SeekFrom::Start(at))?;
     let mut head = [0; 12];

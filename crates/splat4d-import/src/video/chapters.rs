@@ -164,7 +164,7 @@ struct Pages<'a> {
     next: usize,
     open: Option<Open<'a>>,
     times: Vec<f64>,
-    /// Frames of the chosen part so far.
+    /// Frames read of the chosen part.
     counted: usize,
     warnings: Vec<String>,
 }

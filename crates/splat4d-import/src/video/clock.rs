@@ -1,4 +1,4 @@
-//! What the times of a video's frames show: its rate, whether it varies, frames that are missing or there twice.
+//! What the times of a video's frames show: its rate, whether it varies, missing and duplicate frames.
 
 use super::Rgb8;
 
@@ -85,7 +85,7 @@ impl Clock {
         clock
     }
 
-    /// Frames per second, as the median interval has them; 0 where there are fewer than two frames.
+    /// Frames per second, from the median interval; 0 where there are fewer than two frames.
     pub(crate) fn rate(&self) -> f64 {
         if self.interval > 0.0 { 1.0 / self.interval } else { 0.0 }
     }

@@ -28,7 +28,7 @@ pub(super) struct Video {
 }
 
 impl Video {
-    /// Asks ffprobe what it is.
+    /// Probes it with ffprobe.
     pub(super) fn open(path: &Path, tools: Tools) -> Result<Self> {
         let json = tools.probe(path)?;
         let mut probe = probe::parse(&json, stem(path)).map_err(|e| e.at(path.display()))?;
@@ -148,7 +148,7 @@ struct Pictures<'a> {
     told: usize,
     /// How many were given away.
     given: usize,
-    /// Pixels with alpha, as they come.
+    /// Raw pixels with alpha.
     raw: Vec<u8>,
     warnings: Vec<String>,
     done: bool,
@@ -157,7 +157,7 @@ struct Pictures<'a> {
 }
 
 impl Pictures<'_> {
-    /// The time of the next frame that was kept; times of all frames are noted on the way. None: ffmpeg has ended.
+    /// The time of the next frame that was kept; times of all frames are recorded. None: ffmpeg has ended.
     fn next_stamp(&mut self) -> Option<f64> {
         loop {
             let (which, time) = self.running.stamps.recv().ok()?;

@@ -12,7 +12,7 @@ const WHITE: u32 = 100;
 pub(super) struct Chain {
     /// As `-vf` takes it.
     pub text: String,
-    /// Size of the frames that come out.
+    /// Size of the output frames.
     pub size: [usize; 2],
     /// A sentence each.
     pub warnings: Vec<String>,

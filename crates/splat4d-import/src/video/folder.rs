@@ -19,7 +19,7 @@ pub(crate) struct Folder {
 }
 
 impl Folder {
-    /// Looks what is there; reads the first image for its size. Images are `1/fps` seconds apart, and further where
+    /// Lists the folder; reads the first image for its size. Images are `1/fps` seconds apart, and further where
     /// numbers are missing.
     ///
     /// Errors: no images, a frame rate that is none, a damaged first image.
@@ -108,7 +108,7 @@ struct Pictures<'a> {
     folder: &'a Folder,
     selection: Selection,
     next: usize,
-    /// Images of the chosen part so far.
+    /// Images read of the chosen part.
     counted: usize,
     times: Vec<f64>,
 }
@@ -153,7 +153,7 @@ impl Reader for Pictures<'_> {
     }
 }
 
-/// An image in the size that was asked for.
+/// An image in the requested size.
 pub(super) fn scaled(picture: Rgb8, selection: &Selection) -> Rgb8 {
     let [width, height] = selection.scaled([picture.width, picture.height]);
     let picture = match selection.crop {
@@ -173,7 +173,7 @@ pub(super) fn scaled(picture: Rgb8, selection: &Selection) -> Rgb8 {
     Rgb8 { width, height, data }
 }
 
-/// An alpha channel in the size that was asked for.
+/// An alpha channel in the requested size.
 fn scaled_plane(alpha: Vec<u8>, size: [usize; 2], selection: &Selection) -> Vec<u8> {
     let [width, height] = selection.scaled(size);
     let (alpha, size) = match selection.crop {
@@ -215,7 +215,7 @@ fn natural(a: &str, b: &str) -> Ordering {
     }
 }
 
-/// How many intervals each image comes after the first: by the last numbers in the names where they ascend evenly
+/// Number of intervals of each image after the first: by the last numbers in the names where they ascend evenly
 /// but for
 /// some that are missing, else by position.
 fn steps(names: &[String]) -> Vec<f64> {

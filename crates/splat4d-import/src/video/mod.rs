@@ -41,7 +41,7 @@ pub struct Selection {
     pub from: Option<f64>,
     /// No frame at or after this second.
     pub to: Option<f64>,
-    /// Pixels of the shorter side; smaller images stay as they are.
+    /// Pixels of the shorter side; smaller images are kept.
     pub size: Option<usize>,
     /// Whether interlaced videos are taken, and their lines filled in.
     pub deinterlace: bool,
@@ -140,16 +140,16 @@ pub trait Reader {
     /// early, and a warning states so.
     fn next(&mut self, frame: &mut Frame) -> Result<bool>;
 
-    /// Times of all frames passed so far, chosen or not, seconds, ascending.
+    /// Times of all frames read, chosen or not, seconds, ascending.
     fn times(&self) -> &[f64];
 
-    /// What was odd so far, a sentence or two each.
+    /// Remarks on the input, a sentence or two each.
     fn warnings(&self) -> &[String];
 }
 
-/// What images come from.
+/// Source of images.
 pub trait Source: Send + Sync {
-    /// What it is.
+    /// Its kind.
     fn info(&self) -> &Info;
 
     /// Its frames. Errors: nonsense in the selection, interlaced, a program that cannot be started.

@@ -4,8 +4,8 @@ use super::program::ratio;
 use serde_json::Value;
 use splat4d::{Error, ErrorKind, Result};
 
-/// Lines from which on an untagged video is taken for high definition, and its colours for BT.709 (as players do); below
-/// they are BT.601.
+/// Lines from which on an untagged video is taken for high definition, and its colours for BT.709 (as players do);
+/// below they are BT.601.
 const HD_LINES: usize = 720;
 /// Pixels across from which on it is, for wide images of fewer lines.
 const HD_COLUMNS: usize = 1280;
@@ -58,7 +58,7 @@ pub struct Info {
     pub name: String,
     /// Pixels across and down of its frames: upright, square pixels.
     pub size: [usize; 2],
-    /// Pixels across and down as they are stored.
+    /// Pixels across and down as stored.
     pub stored: [usize; 2],
     /// Degrees by which stored images are turned clockwise.
     pub rotation: i32,
@@ -84,7 +84,7 @@ pub struct Info {
     pub sound: bool,
     /// Whether pixels may be transparent.
     pub alpha: bool,
-    /// What was assumed or is odd, a sentence each.
+    /// Assumptions and remarks, a sentence each.
     pub warnings: Vec<String>,
 }
 

@@ -1,4 +1,4 @@
-//! The programs ffmpeg and ffprobe: found, asked what they can do, started without a shell.
+//! The programs ffmpeg and ffprobe: search, supported features, start without a shell.
 
 use splat4d::{Error, ErrorKind, Result};
 use std::collections::VecDeque;
@@ -12,7 +12,7 @@ use std::thread::JoinHandle;
 /// How to install what is missing.
 const INSTALL: &str = "Install it: apt install ffmpeg (Debian, Ubuntu), brew install ffmpeg (macOS) or winget \
                        install ffmpeg (Windows). Or extract the frames elsewhere and give folders of images.";
-/// The first version that knows `-fps_mode`; the older name is gone from newer ones.
+/// The first version with `-fps_mode`; newer ones lack the older name.
 const FPS_MODE_SINCE: (u32, u32) = (5, 1);
 /// The first version whose `showinfo` can leave out checksums, and the oldest that is used.
 const OLDEST: (u32, u32) = (4, 3);
@@ -35,7 +35,7 @@ pub struct Tools {
 }
 
 impl Tools {
-    /// Looks for the programs where the system looks for programs. Errors: not there, too old.
+    /// Searches the programs in the system's search path. Errors: missing, too old.
     pub(crate) fn find() -> Result<Self> {
         Self::at(Path::new("ffmpeg"), Path::new("ffprobe"))
     }
@@ -76,7 +76,7 @@ impl Tools {
         out.is_ok_and(|out| String::from_utf8_lossy(&out.stdout).lines().any(named))
     }
 
-    /// What ffprobe reports of a file, as JSON. Errors: nothing that it knows, damage.
+    /// What ffprobe reports of a file, as JSON. Errors: an unsupported file, damage.
     pub(super) fn probe(&self, path: &Path) -> Result<String> {
         let mut command = Command::new(&self.ffprobe);
         command.args([

@@ -1,4 +1,4 @@
-//! `capture.json`: what the images are, where they were taken from and when.
+//! `capture.json`: images, poses and times.
 
 use super::{Masks, Pictures};
 use crate::sync::graph::Offset;
@@ -38,7 +38,7 @@ pub struct Placed {
     pub masks: Option<Masks>,
 }
 
-/// What is known of the whole recording.
+/// Data of the whole recording.
 #[derive(Clone, Debug, Default)]
 pub struct Recording {
     /// A short name; the folder's if there is none.

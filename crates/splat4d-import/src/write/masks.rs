@@ -34,8 +34,8 @@ pub(crate) struct Begin {
 /// camera an image
 /// `NAME.png` for the whole recording, or a folder `NAME` with one for each frame of its video, in the order of names.
 ///
-/// Errors: a camera without masks, fewer masks than frames, masks of another shape, no space; of kind `Interrupted` where `stop`
-/// said so.
+/// Errors: a camera without masks, fewer masks than frames, masks of another shape, no space; of kind `Interrupted`
+/// where `stop` said so.
 pub(crate) fn masks(
     folder: &Path,
     from: &Path,
@@ -107,7 +107,7 @@ fn numbers(pictures: &Pictures, begin: Begin) -> Result<Vec<usize>> {
     Ok(pictures.shots.iter().map(|s| (s.time / pictures.clock.interval).round() as usize).collect())
 }
 
-/// Stores a mask in a size, black and white as it is, and returns what changes with it; a file that is there is of
+/// Stores a mask in a size, black and white, and returns what changes with it; a file that is there is of
 /// another run and is written again.
 fn store(from: &Path, to: &Path, [width, height]: [usize; 2]) -> Result<u64> {
     let mask = Rgb8::read(from)?;

@@ -78,7 +78,7 @@ impl Format {
 pub(crate) struct Clip<'a> {
     /// The camera's name; see `camera_names`.
     pub name: String,
-    /// Where frames come from.
+    /// Source of frames.
     pub source: &'a dyn Source,
     /// Which of them, on the source's own clock.
     pub selection: Selection,
@@ -155,10 +155,10 @@ pub(crate) fn camera_names(wanted: &[&str]) -> Vec<String> {
     wanted.iter().map(one).collect()
 }
 
-/// Stores the frames of all cameras below `folder`, as `images/NAME/000000.jpg` and so on. What is there already, made of the
-/// same and in the same way, is left; `stop` is asked after every few frames.
+/// Stores the frames of all cameras below `folder`, as `images/NAME/000000.jpg` and so on. What is there already, made
+/// of the same and in the same way, is kept; `stop` is called after every few frames.
 ///
-/// Errors: a source that cannot be read, no space; of kind `Interrupted` where `stop` said so.
+/// Errors: a source that cannot be read, no space; of kind `Interrupted` if `stop` requested it.
 pub(crate) fn pictures(
     folder: &Path,
     clips: &[Clip<'_>],
@@ -181,7 +181,7 @@ pub(crate) fn pictures(
     Ok(out)
 }
 
-/// Pixels of the shorter side at which a video is looked through for transparent ones.
+/// Pixels of the shorter side for the search for transparent ones in a video.
 const LOOKED_AT: usize = 32;
 
 /// Whether any pixel of a clip is transparent: many formats have alpha, and few files use it.
@@ -316,7 +316,7 @@ fn read(path: &Path) -> Option<Note> {
 
 /// Removes the images that were written into a folder of a capture before. `noted`: whether a note records such
 /// images, which
-/// captures without a list of their files go by. Errors: it holds images of such names without a note; nothing is
+/// captures without a list of their files are read by. Errors: it holds images of such names without a note; nothing is
 /// removed then.
 fn clear(capture: &Path, folder: &Path, noted: bool) -> Result<()> {
     let Ok(entries) = std::fs::read_dir(folder) else { return Ok(()) };

@@ -12,17 +12,17 @@ const LEFT: usize = 100;
 /// Images in which a point is searched for next to those that show it, at most: a walk has hundreds.
 const LOOKED_IN: usize = 32;
 
-/// What windows about a track's point say.
+/// Findings of windows around a track's point.
 struct Laid {
     /// How far each of its sightings is off, by its place in the track; none where windows do not agree.
     offs: Vec<(usize, Option<[f64; 2]>)>,
-    /// Sights that show it too, and where.
+    /// Further sights of it, and the positions there.
     found: Vec<(usize, Feature)>,
 }
 
 impl Map<'_> {
     /// Sights and tracks with features where windows about the points agree best, also in cameras that did not find
-    /// them. Sightings whose windows do not agree go, but of cameras that would be left with few.
+    /// them. Sightings whose windows do not agree are removed, except in cameras that would be left with few.
     pub(super) fn overlaid(&self) -> (Vec<CameraView>, Vec<Track>) {
         let laid: Vec<Option<Laid>> = (0..self.tracks.len()).into_par_iter().map(|t| self.laid(t)).collect();
         let mut left = vec![0; self.sights.len()];
