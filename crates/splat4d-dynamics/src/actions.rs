@@ -20,7 +20,7 @@ pub struct Actions {
 impl Actions {
     /// Reads a table as CSV: a header of names, then a row per frame.
     ///
-    /// Errors: no header, too many columns, a name twice, a part of a vector without the others, a row of another
+    /// Errors: no header, too many columns, a duplicate name, a part of a vector without the others, a row of another
     /// length, a number that is none.
     pub fn parse(text: &str) -> Result<Self> {
         let bad = |what: String| {

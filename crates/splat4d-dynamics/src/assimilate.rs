@@ -1,4 +1,4 @@
-//! Correction by what comes in: predict, draw, compare, update.
+//! Correction by new images: predict, render, compare, update.
 //!
 //! A forecast of the next frame is rendered from the cameras and compared with their images; some steps of gradient
 //! descent on

@@ -9,7 +9,7 @@ pub(crate) const WINDOW: usize = 5;
 /// Share of the acceleration that is left after a frame.
 pub(crate) const DAMPING: f64 = 0.9;
 
-/// The last time forever.
+/// The last state, constant.
 pub(crate) fn freeze(paths: &Paths, horizon: usize) -> Vec<Moment> {
     vec![paths.last().clone(); horizon]
 }

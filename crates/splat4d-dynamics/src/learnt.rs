@@ -1,7 +1,7 @@
 //! Networks that predict accelerations: their interface, training over whole rollouts, and forecasts.
 //!
 //! Time is counted in frames: v ← v + a, x ← x + v (semi-implicit Euler). A network may remember (`hidden`): then it
-//! first sees the ticks before a window as they were observed.
+//! first processes the observed ticks before a window.
 
 use crate::actions::Actions;
 use crate::optimise::Optimiser;
@@ -51,7 +51,7 @@ pub trait Network: Clone {
     fn nodes(&self) -> usize;
     /// Sizes that it was made for.
     fn scales(&self) -> Scales;
-    /// Ticks that it needs to have seen before it forecasts.
+    /// Ticks that it needs before a forecast.
     fn warm_up(&self) -> usize {
         0
     }
@@ -116,17 +116,17 @@ const FADE: f64 = 0.95;
 const VELOCITY_WEIGHT: f64 = 0.1;
 /// Up to this share of L errors count by their square, beyond by themselves (Huber).
 const HUBER: f64 = 0.01;
-/// Noise on the positions that a window starts from, of L, and on its velocities, of S; gone after this share of the
+/// Noise on the positions that a window starts from, of L, and on its velocities, of S; zero after this share of the
 /// steps.
 const NOISE: [f64; 2] = [0.003, 0.1];
 const NOISE_UNTIL: f64 = 1.0 / 3.0;
-/// Rows that a step looks at, about: windows are as many as make them up, at most so many.
+/// Approximate rows of a step: the number of windows follows from it, at most this many.
 const ROWS: usize = 96;
 const MOST_WINDOWS: usize = 8;
 /// In forecasts no acceleration is larger than this multiple of the largest that was observed: what was never seen
 /// drifts and does not explode.
 const STEEPEST: f64 = 3.0;
-/// Smallest scale of velocities and accelerations, of L: what does not move has no scale of its own.
+/// Smallest scale of velocities and accelerations, of L: static nodes have no scale of their own.
 const STILLEST: f64 = 1e-6;
 
 /// A trained network.

@@ -13,13 +13,13 @@ use splat4d::scene::Params;
 /// Rungs of the ladder, lowest first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Model {
-    /// B0: the last time forever.
+    /// B0: the last state, constant.
     Freeze,
     /// B1: constant velocity and turn.
     Velocity,
     /// B2: acceleration that fades.
     Acceleration,
-    /// B3: what the motion model of the scene states of later times.
+    /// B3: the scene's motion model at later times.
     Extrapolate,
     /// M1: linear, with delays, stable by construction.
     Koopman,
@@ -61,12 +61,12 @@ impl Model {
     }
 }
 
-/// What is known of a world in addition to its paths, and how networks are trained.
+/// Data of a world next to its paths, and settings of training networks.
 #[derive(Clone, Debug, Default)]
 pub struct Settings {
     /// Steps and seed.
     pub training: Training,
-    /// Unit vector along which things fall, where it is to be used.
+    /// Unit vector of gravity, if it is used.
     pub gravity: Option<[f64; 3]>,
     /// Height of a floor, against gravity.
     pub floor: Option<f64>,

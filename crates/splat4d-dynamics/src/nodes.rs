@@ -1,7 +1,7 @@
 //! Nodes with identity on whatever moves in a scene, whichever motion model moves it.
 //!
 //! A node is tied to the Gaussians around it. From the last observed time it is followed tick by tick: its pose is the
-//! rigid motion that fits its members best. Where members fade (models whose Gaussians live for a moment), others
+//! rigid motion that fits its members best. Where members fade (models with short-lived Gaussians), others
 //! around the node take over at the tick before, so that the node continues although no Gaussian does.
 
 use crate::learnt::LEAST_TICKS;
@@ -33,7 +33,7 @@ const WORN: f32 = 0.5;
 const KEEP: f64 = 1e-3;
 /// A Gaussian farther from its neighbours than this multiple of the median carries no node: it floats alone.
 const LONELY: f32 = 3.0;
-/// Gaussians that were opaque at fewer ticks have no speed to speak of.
+/// Gaussians that were opaque at fewer ticks have no defined speed.
 const SEEN: u32 = 3;
 /// Neighbours whose majority states whether a Gaussian moves.
 const VOTERS: usize = 8;
@@ -71,7 +71,7 @@ fn look(scene: &Scene<f32>, t: f64) -> Snapshot {
 }
 
 /// At most `count` nodes on dynamic regions over the `ticks` (seconds, ascending, one per frame), of which the last is
-/// the last observed one. Nothing is asked of the scene at any other time.
+/// the last observed one. The scene is not evaluated at other times.
 ///
 /// Errors: too few ticks, no nodes or more than [`MAX_NODES`], nothing that moves.
 pub fn observe(scene: &Scene<f32>, ticks: &[f64], count: usize) -> Result<Observed> {
@@ -109,7 +109,7 @@ pub fn observe(scene: &Scene<f32>, ticks: &[f64], count: usize) -> Result<Observ
     Ok(Observed { moving: moving.collect(), paths: smooth(&Paths { moments }), size })
 }
 
-/// Follows nodes through a scene from where they are at the first of `ticks`, which may go either way: a time a tick.
+/// Follows nodes through a scene from their positions at the first of `ticks`, in either direction: one time per tick.
 /// So a motion model extrapolates to later times, and a scene that saw them what was true.
 pub fn follow(scene: &Scene<f32>, start: &Moment, ticks: &[f64]) -> Vec<Moment> {
     if ticks.len() < 2 {
@@ -210,7 +210,7 @@ impl Tie {
     }
 }
 
-/// The middle of the opaque Gaussians (medians), and within which distance of it most of them lie.
+/// The middle of the opaque Gaussians (medians), and the radius that contains most of them.
 fn extent(look: &Snapshot) -> ([f64; 3], f64) {
     let opaque: Vec<[f64; 3]> =
         (0..look.x.len()).filter(|&i| look.alpha[i] >= OPAQUE).map(|i| look.x[i].map(f64::from)).collect();
@@ -224,7 +224,7 @@ fn extent(look: &Snapshot) -> ([f64; 3], f64) {
 
 /// Which Gaussians are fast while they are opaque, and which move: of those that are opaque finally the ones most of
 /// whose
-/// neighbours are fast. Of a body all move; what drifts or flickers does so alone.
+/// neighbours are fast. All Gaussians of a body move; drifting or flickering ones do so alone.
 fn moving(scene: &Scene<f32>, ticks: &[f64], last: &Snapshot, size: f64) -> (Vec<bool>, Vec<bool>) {
     let n = last.x.len();
     let mut bounds = vec![[[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]]; n];

@@ -64,7 +64,7 @@ impl Paths {
         Self { moments: points.iter().map(|m| m.iter().map(|x| Pose::at(*x)).collect()).collect() }
     }
 
-    /// The same with rotations that follow from how neighbours lie, relative to the last tick.
+    /// The same with rotations derived from the positions of neighbours, relative to the last tick.
     pub fn turned_by_neighbours(mut self) -> Self {
         let rest = self.last().clone();
         let frames = Neighbours::new(&rest);
@@ -156,7 +156,7 @@ pub fn nearest(of: &Moment, count: usize) -> Vec<Vec<usize>> {
         .collect()
 }
 
-/// Where a point goes that is fixed to a node: R (x − p) + p'.
+/// The position of a point fixed to a node: R (x − p) + p'.
 pub fn carried(x: [f64; 3], from: &Pose, to: &Pose) -> [f64; 3] {
     let turn = quat::to_rotation(quat::product(to.q, quat::conjugate(from.q)));
     add(mat_vec(&turn, sub(x, from.x)), to.x)

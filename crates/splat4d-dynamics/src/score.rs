@@ -63,9 +63,9 @@ pub fn ensemble(members: &[Vec<Moment>]) -> (Vec<Moment>, Vec<Vec<f64>>) {
 /// How an ensemble's spread fits its errors.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Calibration {
-    /// Root mean square of the error over that of the spread: 1 is right, above is too sure of itself.
+    /// Root mean square of the error over that of the spread: 1 is right, above 1 is overconfident.
     pub ratio: f64,
-    /// Share of the nodes and frames whose error is at most the spread, and twice it.
+    /// Share of the nodes and frames whose error is at most the spread, and at most twice the spread.
     pub within: [f64; 2],
 }
 

@@ -14,7 +14,7 @@ const ORDER: usize = 3;
 /// Strengths that are tried: 10^(i/2), from nothing that is seen to whole clips as parabolas.
 const STRENGTHS: std::ops::Range<i32> = -8..11;
 
-/// Smooth paths. Too few ticks for differences stay as they are.
+/// Smooth paths. With too few ticks for differences they are unchanged.
 pub(crate) fn smooth(paths: &Paths) -> Paths {
     let (ticks, nodes) = (paths.len(), paths.nodes());
     if ticks <= ORDER + 1 || nodes == 0 {

@@ -1,4 +1,4 @@
-//! Worlds with known physics, whose nodes and actions are known at every frame: what forecasts are measured by.
+//! Worlds with known physics, with ground-truth nodes and actions at every frame, for tests of forecasts.
 
 use crate::actions::Actions;
 use crate::paths::exp;
@@ -20,7 +20,7 @@ const SUBSTEPS: usize = 40;
 /// Nodes along each side of the cloth.
 pub const CLOTH: usize = 9;
 
-/// What a body looks like, about its own origin.
+/// Shape and colour of a body, about its own origin.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Shape {
     /// A ball of this radius.
@@ -34,7 +34,7 @@ pub enum Shape {
 /// A body and the nodes on it.
 #[derive(Clone, Debug)]
 pub struct Body {
-    /// Its look.
+    /// Its appearance.
     pub shape: Shape,
     /// Nodes, in the body's own axes; of cloth none.
     pub points: Vec<[f64; 3]>,
