@@ -18,7 +18,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use tokio::sync::Semaphore;
 
-/// Listeners of live news at a time; each keeps a connection for itself.
+/// Concurrent listeners of live events; each keeps a connection for itself.
 const MAX_LISTENERS: usize = 64;
 /// Name of the route of the scene.
 const SCENE: &str = "scene.s4d";
@@ -83,7 +83,7 @@ fn policy(origin: &str) -> String {
     )
 }
 
-/// Answers one request.
+/// Handles one request.
 pub(crate) async fn answer(shared: &Arc<Shared>, request: &Parts, body: Incoming) -> Response<Body> {
     let editing = match request.uri.path() {
         edit::ROUTE => shared.editing.as_ref(),
@@ -263,7 +263,7 @@ async fn photo(shared: &Arc<Shared>, request: &Parts) -> Response<Body> {
     response
 }
 
-/// Whether a list of entity tags holds ours. Weak comparison, as `If-None-Match` has it.
+/// Whether a list of entity tags holds ours. Weak comparison, as for `If-None-Match`.
 fn matches(list: &HeaderValue, etag: &str) -> bool {
     let list = list.to_str().unwrap_or_default();
     list.split(',').map(str::trim).any(|tag| tag == "*" || tag.trim_start_matches("W/") == etag)

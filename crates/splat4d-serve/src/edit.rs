@@ -1,8 +1,8 @@
-//! The one thing that a page may send: requests on a list of edits, if the program was started to edit.
+//! The only request with a body that a page may send: requests on a list of edits, if the program was started to edit.
 //!
 //! A page of any origin in the user's browser can send a form to loopback. This requires more than a form can send: a
-//! token that only the address which the program printed holds, JSON (for which a browser asks leave first, and gets
-//! none), and our own origin. What is done with it is the program's business; it may answer with another scene.
+//! token that only the address which the program printed holds, JSON (which needs a preflight request, and gets
+//! none), and our own origin. The program decides what to do with it; it may return another scene.
 
 use crate::body::Body;
 use crate::reply::{text, whole};
@@ -48,7 +48,7 @@ pub struct EditAnswer {
 /// Does what a page requests.
 type Answer = dyn Fn(Value) -> Result<EditAnswer> + Send + Sync;
 
-/// Leave for pages that bring a token to ask a program for edits.
+/// Permission for pages with a token to request edits from a program.
 #[derive(Clone)]
 pub struct Editing {
     token: String,
@@ -106,7 +106,7 @@ fn same(a: &[u8], b: &[u8]) -> bool {
     a.len() == b.len() && a.iter().zip(b).fold(0, |sum, (a, b)| sum | (a ^ b)) == 0
 }
 
-/// Answers what a page sent. Must be called on the server's runtime.
+/// Handles a page's request. Must be called on the server's runtime.
 pub(crate) async fn answer(scene: &Scene, editing: &Editing, request: &Parts, body: Incoming) -> Response<Body> {
     if let Some((status, why)) = editing.refuses(request) {
         return text(status, why);

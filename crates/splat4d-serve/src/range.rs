@@ -18,7 +18,7 @@ pub(crate) enum Wanted {
 
 /// Reads a `Range` header for a file of `length` bytes.
 ///
-/// Several ranges are answered with the whole file, which RFC 9110 allows: a list of them is the classic way to make a
+/// Several ranges are served as the whole file, which RFC 9110 allows: a list of them is the classic way to make a
 /// server do much work for a small request.
 pub(crate) fn parse(header: &str, length: u64) -> Wanted {
     let Some((unit, list)) = header.trim().split_once('=') else { return Wanted::Whole };

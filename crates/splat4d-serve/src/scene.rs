@@ -1,4 +1,4 @@
-//! The one thing that is served: a file on disk, or bytes in memory that may be replaced.
+//! The served scene: a file on disk, or bytes in memory that may be replaced.
 
 use crate::body::Body;
 use hyper::body::Bytes;
@@ -19,7 +19,7 @@ const VERSIONS: usize = 2;
 #[derive(Clone, Debug, Default)]
 #[non_exhaustive]
 pub enum Content {
-    /// Nothing yet: a live run before its first snapshot, or a page that shows a scene from elsewhere.
+    /// No scene yet: a live run before its first snapshot, or a page that shows a scene from elsewhere.
     #[default]
     Nothing,
     /// A `.s4d` file, read by range and never as a whole. It is opened once: a file that takes its place later is
@@ -52,7 +52,7 @@ pub(crate) struct Scene {
     versions: Mutex<(u64, Vec<Version>)>,
 }
 
-/// Looked for, not found.
+/// Searched, not found.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Missing {
     /// There is no scene yet, or no such version was ever there.

@@ -45,7 +45,7 @@ const MAX_HEADERS: usize = 64;
 const READERS: usize = 2;
 /// Time for responses in flight to finish when the server stops.
 const GRACE: Duration = Duration::from_millis(500);
-/// Pause after the system had no room for a connection.
+/// Pause after the system could not open a connection.
 const NO_ROOM: Duration = Duration::from_millis(100);
 /// How much the server's thread steps back for training (19 is most): a page still loads at once, training never waits.
 #[cfg(target_os = "linux")]
@@ -200,7 +200,7 @@ fn runtime(background: bool) -> io::Result<Runtime> {
         .build()
 }
 
-/// Lowers this thread's priority. Where that fails it runs as it is.
+/// Lowers this thread's priority. If that fails the priority is unchanged.
 fn step_back(background: bool) {
     #[cfg(target_os = "linux")]
     if background {

@@ -34,7 +34,7 @@ impl WriteTimeout {
         Self { stream, window, clock: None, taken: 0 }
     }
 
-    /// Passes on what a write came to, and keeps the time.
+    /// Returns the result of a write, and keeps the time.
     fn judge(&mut self, cx: &mut Context<'_>, written: Poll<io::Result<usize>>) -> Poll<io::Result<usize>> {
         match written {
             Poll::Ready(Ok(n)) => {
