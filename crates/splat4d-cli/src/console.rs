@@ -1,4 +1,4 @@
-//! What the user sees while work continues: a progress bar on a terminal, plain lines elsewhere, JSON lines for
+//! Output during work: a progress bar on a terminal, plain lines elsewhere, JSON lines for
 //! machines. Results go to stdout; progress, warnings and errors go to stderr (with `--json`, all of them are lines on
 //! stdout).
 
@@ -35,7 +35,7 @@ const PLAIN_INTERVAL: Duration = Duration::from_secs(10);
 const JSON_INTERVAL: Duration = Duration::from_secs(1);
 /// A shorter phase shows no time left.
 const LEAST_PACE: Duration = Duration::from_secs(3);
-/// Redraws of a bar a second: often enough to look alive, cheap over slow remote shells.
+/// Redraws of a bar a second: frequent enough for a terminal, cheap over slow remote shells.
 const BAR_RATE: u8 = 8;
 
 /// The one place that prints.
@@ -128,12 +128,12 @@ impl Console {
         }
     }
 
-    /// Prints the result that the verb was asked for: on stdout whatever the loudness.
+    /// Prints the verb's result on stdout at every level of output.
     pub fn result(&self, text: &str) {
         self.above_bar(|| print(text));
     }
 
-    /// The same of a report on something's health: its lines of trouble (`! …`) and its last line, the verdict, have
+    /// The same for a health report: its lines of problems (`! …`) and its last line, the verdict, have
     /// colours on a terminal.
     pub(crate) fn report(&self, text: &str, healthy: bool) {
         let text = text::shown(text);
@@ -320,7 +320,7 @@ impl Console {
         due
     }
 
-    /// Seconds that are left of a phase, by its pace so far; none: too early to say.
+    /// Seconds that are left of a phase, by its average pace; none: too early to estimate.
     fn left(&self, name: &str, done: usize, total: usize) -> Option<f64> {
         let mut state = self.state.borrow_mut();
         let fresh = state.pace.as_ref().is_none_or(|p| p.name != name || done < p.first);
@@ -401,7 +401,7 @@ fn one_json_line(value: &Value) -> String {
     line.chars().map(|c| if text::acts(c) { format!("\\u{:04x}", u32::from(c)) } else { c.into() }).collect()
 }
 
-/// A report in colours of ECMA-48: lines of trouble yellow, the verdict green or red.
+/// A report in colours of ECMA-48: lines of problems yellow, the verdict green or red.
 fn painted(report: &str, healthy: bool) -> String {
     let paint = |line: &str, colour: u8| format!("\x1b[{colour}m{line}\x1b[0m");
     let verdict = paint(report.lines().last().unwrap_or_default(), if healthy { 32 } else { 31 });
@@ -418,7 +418,7 @@ fn print(line: &str) {
     print_shown(&text::shown(line));
 }
 
-/// Prints on stdout what is safe. A reader that has gone (`| head`) ends the program in peace; a full disk is an error.
+/// Prints sanitised text on stdout. A closed reader (`| head`) ends the program without an error; a full disk is an error.
 fn print_shown(line: &str) {
     let mut out = std::io::stdout().lock();
     if let Err(error) = writeln!(out, "{line}").and_then(|()| out.flush()) {

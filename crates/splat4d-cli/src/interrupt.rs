@@ -1,6 +1,6 @@
-//! Ctrl-C: the first asks to stop (training saves a checkpoint), the second ends the program at once.
+//! Ctrl-C: the first requests a stop (training saves a checkpoint), the second ends the program at once.
 //!
-//! Work that does not ask whether it should stop (`ends`) is ended after a moment: all files are written under
+//! Work that does not poll for the stop (`ends`) is ended after a moment: all files are written under
 //! temporary names, and locks of dead processes are taken over, so that the same command continues.
 
 use std::borrow::Cow;
@@ -12,7 +12,7 @@ use std::time::Duration;
 const ENDED_BY_INTERRUPT: i32 = 130;
 /// Exit code of interrupted work (docs/exit-codes.md).
 const INTERRUPTED: i32 = 1;
-/// Time for work that asks; people wait two seconds.
+/// Time for work that polls; users accept two seconds.
 const PATIENCE: Duration = Duration::from_millis(1200);
 
 /// What a Ctrl-C does now.
@@ -38,9 +38,9 @@ fn state() -> MutexGuard<'static, State> {
 enum Reaction {
     /// The program ends now.
     Exit,
-    /// The work stops by itself.
+    /// The work stops on request.
     Stops,
-    /// The work may stop by itself; if it does not soon, the program ends with these words.
+    /// The work may stop on request; otherwise the program soon ends with this message.
     Ends(String),
 }
 
@@ -85,7 +85,7 @@ pub(crate) fn stop_polled(first: impl Into<Cow<'static, str>>) {
 }
 
 /// From now on a Ctrl-C ends the program after a moment, also where the work does not read the flag; `last` states what
-/// is kept and how to go on. A Ctrl-C that came before, and that nothing has followed, ends it now.
+/// is kept and how to continue. An earlier Ctrl-C without effect ends it now.
 pub(crate) fn stop_not_polled(last: impl Into<String>) {
     let last = last.into();
     let mut state = state();

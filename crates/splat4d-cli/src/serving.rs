@@ -18,7 +18,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-/// How often a waiting program looks whether Ctrl-C was pressed.
+/// How often a waiting program checks for Ctrl-C.
 const LOOK: Duration = Duration::from_millis(50);
 /// A new image of the scene in training about so often: shorter than a user waits before reloading, longer than a page
 /// needs to update.
@@ -120,7 +120,7 @@ pub(crate) struct Control {
     stop: Arc<AtomicBool>,
     paused: AtomicBool,
     began: Instant,
-    /// Time of all pauses so far.
+    /// Total time of pauses.
     waited: Mutex<Duration>,
 }
 

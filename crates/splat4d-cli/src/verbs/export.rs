@@ -1,5 +1,5 @@
-//! `export`: moments of a scene as plain 3DGS .ply files, the whole of it as one page with its player, or where its
-//! Gaussians, or points that are requested, go as JSON or CSV.
+//! `export`: times of a scene as plain 3DGS .ply files, the whole as one page with its player, or the positions of its
+//! Gaussians or of requested points as JSON or CSV.
 
 use crate::console::Console;
 use serde_json::json;

@@ -17,7 +17,7 @@ use std::path::PathBuf;
 
 /// What a run's lock names as its owner while it is continued.
 const RESUME: &str = "train --resume";
-/// What the first Ctrl-C is answered with in training.
+/// Message for the first Ctrl-C in training.
 const SAVING: &str = "stopping: a checkpoint is being saved";
 
 const EXAMPLES: &str = "\
