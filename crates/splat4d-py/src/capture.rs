@@ -30,7 +30,7 @@ pub(crate) struct Capture {
     _temporary: Option<Temporary>,
 }
 
-/// A temporary folder (Python's), removed with what is in it when this goes.
+/// A temporary folder (Python's), removed with its content when this is dropped.
 pub(crate) struct Temporary(Py<PyAny>);
 
 impl Drop for Temporary {

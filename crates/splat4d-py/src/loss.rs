@@ -12,7 +12,7 @@ use splat4d_train::run::OwnLoss;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 
-/// Where a run's Python functions leave what they raised, and say stop. The first exception counts.
+/// Exceptions of a run's Python functions, and its stop flag. The first exception counts.
 #[derive(Default)]
 pub(crate) struct Raised {
     pub(crate) stop: AtomicBool,
@@ -43,7 +43,7 @@ pub(crate) struct View {
     iteration: usize,
 }
 
-/// The term that asks the function.
+/// The term that calls the function.
 struct RunRequest {
     function: Py<PyAny>,
     raised: Arc<Raised>,

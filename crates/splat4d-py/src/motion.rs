@@ -1,4 +1,4 @@
-//! Motion models written in Python (`splat4d.Motion`): the library asks one for the Gaussians at a time, and hands it
+//! Motion models written in Python (`splat4d.Motion`): the library requests the Gaussians at a time, and passes it
 //! the gradient to them. Its tables are the library's: density control copies and removes their rows, Adam moves them,
 //! checkpoints and scenes hold them.
 
@@ -134,7 +134,7 @@ struct PyMotion {
     hook: Arc<Hook>,
     per_gaussian: Vec<Key>,
     shared: Vec<Key>,
-    /// The canonical Gaussians are all there is, and Python is not asked.
+    /// There are only the canonical Gaussians, and Python is not called.
     rests: bool,
 }
 
@@ -188,7 +188,7 @@ impl PyMotion {
         Ok(out)
     }
 
-    /// Asks Python for the Gaussians at a time.
+    /// Calls Python for the Gaussians at a time.
     fn request(&self, py: Python<'_>, q: &At<'_>) -> PyResult<Answer> {
         let n = q.len();
         let answer = self.hook.object.bind(py).call_method1("forward", (self.arguments(py, q)?, q.t.0))?;
@@ -239,7 +239,7 @@ impl PyMotion {
         Ok(Answer { tape: Some(tape.clone().unbind()), raw, colors: table })
     }
 
-    /// Hands Python the gradient to a result, and adds what comes back to the tables'. Returns dL/dt.
+    /// Passes Python the gradient to a result, and adds the returned gradients to the tables'. Returns dL/dt.
     fn hand_back(
         &self,
         py: Python<'_>,
@@ -395,7 +395,7 @@ impl Motion for PyMotion {
     }
 }
 
-/// Raises what a motion of the scene has raised while it was asked.
+/// Raises the exception that a motion of the scene has raised.
 pub(crate) fn raise(scene: &splat4d::layers::Scene<f32>) -> PyResult<()> {
     for layer in &scene.layers {
         let motion: &dyn std::any::Any = &*layer.motion;

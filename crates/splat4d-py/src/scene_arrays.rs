@@ -22,7 +22,7 @@ const NO_DIRECTION: f64 = 1e-20;
 /// Highest order of the polynomials that positions may follow.
 const MAX_ORDER: usize = 3;
 
-/// Numbers of one Gaussian each, as they came: `rows` times `width`, and the axis of times before them, if there is
+/// Numbers of one Gaussian each, unconverted: `rows` times `width`, and the axis of times before them, if there is
 /// one.
 pub(crate) struct Given {
     what: &'static str,
@@ -166,7 +166,7 @@ impl Shapes {
     }
 }
 
-/// How Gaussians move and how long they live.
+/// Motion and lifespans of Gaussians.
 pub(crate) struct Moving<'a, 'py> {
     /// [T] seconds of the poses.
     pub(crate) times: Option<&'a Bound<'py, PyAny>>,
