@@ -371,7 +371,7 @@ fn tracks_npz() -> Vec<Vec<u8>> {
     [false, true].map(|deflate| zip(&[("tracks.npy", &tracks), ("visibility.npy", &seen)], deflate)).into()
 }
 
-/// Columns of 0 and of this value in turn.
+/// Alternating columns of 0 and of this value.
 fn grey(value: u8) -> Vec<u8> {
     encoded(&ImageBuffer::from_fn(WIDTH, HEIGHT, |x, _| Luma([value * (x % 2) as u8])), ImageFormat::Png)
 }
