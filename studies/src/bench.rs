@@ -241,7 +241,7 @@ fn play(args: &Args, console: &Console) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Measures what grows, on the most threads, and draws it.
+/// Measures growth with size, on the most threads, and plots it.
 fn grow(
     scenes: &[Pinned],
     args: &Args,

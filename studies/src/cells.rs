@@ -3,7 +3,7 @@
 use splat4d_train::compress::Compression;
 use splat4d_train::maintenance::importance::{Combine, Spatial, Temporal};
 
-/// Share of the Gaussians that goes where something else is varied, as 4DGS-1K on N3V.
+/// Share of pruned Gaussians where something else is varied, as 4DGS-1K on N3V.
 const AT: f64 = 0.8;
 /// Frames between key times where something else is varied, as there.
 const INTERVAL: usize = 20;
@@ -23,7 +23,7 @@ const OVERHEAD: f64 = 300.0;
 /// One treatment of the source.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Cell {
-    /// Share of the Gaussians that goes, in so many rounds.
+    /// Share of pruned Gaussians, in this many rounds.
     pub prune: f64,
     pub rounds: usize,
     pub score: Score,
@@ -71,7 +71,7 @@ impl Score {
 }
 
 impl Cell {
-    /// The source as it is.
+    /// The unchanged source.
     pub(crate) const fn source() -> Self {
         Self { prune: 0.0, rounds: 1, score: DEFAULT, steps: 0, interval: 0 }
     }

@@ -59,7 +59,7 @@ pub(crate) enum Scene {
     Mixed,
     /// Points left of x = 0 are static, those right of it move up: the edge of an occluding object.
     Edge,
-    /// Every second point is somewhere else from t = ½ on: something appears, something goes.
+    /// Every second point is somewhere else from t = ½ on: one appears, one vanishes.
     Jump,
 }
 
@@ -80,7 +80,7 @@ pub(crate) struct Findings {
     pub mse: f64,
     /// The same at the edge or the jump and elsewhere, where the scene has one.
     pub parts: Option<[f64; 2]>,
-    /// Truth and network's positions of every point at every time, to draw.
+    /// Truth and network's positions of every point at every time, to plot.
     pub paths: [Vec<Path>; 2],
 }
 

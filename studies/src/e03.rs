@@ -237,7 +237,7 @@ fn plain(name: &str) -> String {
     name.chars().map(|c| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '-' }).collect()
 }
 
-/// Refuses two runs whose results would go by one name.
+/// Refuses two runs whose results would have one name.
 fn check_names(trials: &[Trial]) -> Result<()> {
     let mut seen = BTreeSet::new();
     match trials.iter().find(|b| !seen.insert(b.name.as_str())) {

@@ -229,7 +229,7 @@ fn steps(path: &[[f64; 3]]) -> Vec<[f64; 3]> {
     path.windows(2).map(|w| std::array::from_fn(|k| w[1][k] - w[0][k])).collect()
 }
 
-/// Mean of every three neighbours in time, of two at the ends; the sum over all steps stays what it was but for the
+/// Mean of every three neighbours in time, of two at the ends; the sum over all steps is unchanged except for the
 /// ends.
 fn average(flow: &[[f64; 3]]) -> Vec<[f64; 3]> {
     let mean = |n: usize| {

@@ -1,4 +1,4 @@
-//! What a study has found so far. It is written after every cell, so that nothing is measured twice.
+//! The present results of a study. It is written after every cell, so that nothing is measured twice.
 
 use crate::cells::Cell;
 use serde::{Deserialize, Serialize};
@@ -98,7 +98,7 @@ pub(crate) struct Judged {
 }
 
 /// Makes and measures every cell that is missing. `make`: None where it was stopped. `keep` hears of every new cell,
-/// with the findings so far. Returns whether all are there now.
+/// with the present results. Returns whether all are complete.
 pub(crate) fn fill(
     findings: &mut Findings,
     cells: &[Cell],
@@ -127,7 +127,7 @@ pub(crate) fn fill(
 pub(crate) struct Place {
     pub number: usize,
     pub of: usize,
-    /// Seconds, estimated from the cells so far; None before the first.
+    /// Seconds, estimated from the finished cells; None before the first.
     pub left: Option<f64>,
 }
 

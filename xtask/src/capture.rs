@@ -30,7 +30,7 @@ pub(crate) const HELD_OUT: [usize; 4] = [3, 8, 11, 16];
 /// Quantisation step 13 at all frequencies: about 20 KB and 40 dB per image, so that 600 of them stay below 13 MB.
 /// (Lossless PNG takes 68 KB each.)
 const JPEG_QUALITY: u8 = 60;
-/// Views that come with depth and flow.
+/// Views with depth and flow.
 const TRUTH_CAMERAS: [usize; 4] = [2, 8, 11, 17];
 const TRUTH_FRAMES: [usize; 4] = [3, 10, 17, 24];
 

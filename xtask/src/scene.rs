@@ -19,7 +19,7 @@ pub(crate) const FRAMES: usize = 30;
 pub(crate) const FPS: f64 = 30.0;
 /// First frame in which the orb exists.
 pub(crate) const ORB_APPEARS: usize = 9;
-/// First frame in which the painted crate is gone.
+/// First frame without the painted crate.
 pub(crate) const CRATE_LEAVES: usize = 18;
 /// Number of objects, the static set (0) included: knight 1, mage 2, ball 3, crate 4, orb 5.
 pub(crate) const OBJECTS: usize = 6;
@@ -58,7 +58,7 @@ pub(crate) struct Frame {
     pub skinned: [Range<usize>; 2],
     /// The light with its shadow map.
     pub light: Light,
-    /// Where each moving thing is on the floor, for contact shade.
+    /// Floor position of each moving object, for contact shade.
     pub feet: Vec<V3>,
 }
 

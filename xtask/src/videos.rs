@@ -18,7 +18,7 @@ const HEIGHT: usize = 360;
 const FOCAL: [f64; 8] = [372.0, 360.0, 366.0, 380.0, 355.0, 368.0, 374.0, 362.0];
 const RADIUS: [f64; 8] = [5.7, 5.9, 5.5, 6.0, 5.8, 5.6, 6.1, 5.7];
 const HEIGHTS: [f64; 8] = [1.6, 2.3, 1.9, 2.6, 1.7, 2.4, 1.8, 2.2];
-/// Degrees of the arc on which they stand.
+/// Degrees of the arc of the cameras.
 const ARC: f64 = 98.0;
 const TARGET: V3 = v3(0.0, 0.95, 0.1);
 /// Seconds after the first camera's beginning at which each one's video begins: whole frames and parts of them.
@@ -34,7 +34,7 @@ const JPEG_QUALITY: u8 = 78;
 
 /// Samples of sound a second.
 const RATE: u32 = 48_000;
-/// Metres of a scene unit, and what sound goes in a second.
+/// Metres of a scene unit, and the speed of sound.
 const METRES: f64 = 0.7;
 const SOUND: f64 = 343.0;
 /// A clap, steps, bounces, the blow: seconds of the film, place, loudness, seconds until it is faint.

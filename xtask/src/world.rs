@@ -1,5 +1,5 @@
 //! `capture --world NAME [--truth] FOLDER`: a world whose physics is known, filmed by eight cameras, with the true
-//! paths of its nodes, what was done to it, and masks that say which body a pixel shows.
+//! paths of its nodes, what was done to it, and masks of the body at each pixel.
 
 use crate::camera::Camera;
 use crate::files::{png, write_file};

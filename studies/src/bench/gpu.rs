@@ -102,7 +102,7 @@ const FILM: &str = "frame, nothing read back";
 /// best counts.
 const FRAMES: usize = 200;
 const FILMS: usize = 3;
-/// How far a camera looks to either side, radians: five degrees.
+/// How far a camera turns to either side, radians: five degrees.
 const SWING: f64 = 0.087;
 /// Stages that only whole training steps on the GPU have.
 const OF_STEPS: [&str; 4] = ["answer", "loss", "answer backward", "adam"];
@@ -323,7 +323,7 @@ fn film(pinned: &Pinned, way: Way, renderer: &mut GpuRenderer, stages: &[Row]) -
     Ok(vec![Row { ceiling_share: Some(floor / best), ..row }])
 }
 
-/// The camera and the time after a share of the film: every view in turn, of which each looks from side to side,
+/// The camera and the time after a share of the film: every view in turn, of which each turns from side to side,
 /// through the whole clip.
 fn along(pinned: &Pinned, share: f64) -> (Camera, Time) {
     let place = share * pinned.views.len() as f64;

@@ -59,7 +59,7 @@ const STEPS: usize = 60;
 /// As the bundled capture's images.
 const JPEG_QUALITY: u8 = 90;
 
-/// Measures what was asked for, in a pool of `way.threads` threads.
+/// Measures the requested quantities, in a pool of `way.threads` threads.
 pub(super) fn measure(
     base: &Pinned,
     axes: &[Axis],
@@ -132,7 +132,7 @@ fn own_degree(base: &Pinned) -> usize {
     sh::degree_of(columns / 3).unwrap_or(0)
 }
 
-/// Steps on a capture of `count` images, on disk, through the trainer's own store: the first look at each decodes it.
+/// Steps on a capture of `count` images, on disk, through the trainer's own store: the first use of each decodes it.
 fn frames(base: &Pinned, count: usize, side: usize, way: Way) -> Result<Vec<Row>> {
     let pinned = grown(base, base.scene.len(), own_degree(base), side);
     let folder = Folder::new()?;
@@ -223,7 +223,7 @@ fn write_pictures(folder: &Path, pictures: &[Planes<f32>]) -> Result<Vec<PathBuf
     pictures.iter().enumerate().map(write).collect()
 }
 
-/// A folder of this process that goes when it is dropped.
+/// A folder of this process that is deleted when dropped.
 struct Folder(PathBuf);
 
 impl Folder {

@@ -56,7 +56,7 @@ struct Ran {
     losses: Vec<f64>,
 }
 
-/// The limits that other programs draw with.
+/// The limits of other programs' renderers.
 pub(super) fn config() -> RenderConfig {
     RenderConfig { alpha_max: ALPHA_MAX, ..RenderConfig::default() }
 }

@@ -52,7 +52,7 @@ pub(super) struct Row {
 }
 
 impl Row {
-    /// Whether two rows measure the same thing.
+    /// Whether two rows measure the same quantity.
     fn twin(&self, other: &Self) -> bool {
         let key = |r: &Self| (r.threads, r.x.map(f64::to_bits), r.tuning.clone());
         self.scene == other.scene && self.stage == other.stage && self.simd == other.simd && key(self) == key(other)
@@ -108,7 +108,7 @@ fn distinct<T: PartialEq>(values: impl Iterator<Item = T>) -> Vec<T> {
     out
 }
 
-/// A line for each thing that grew and how far, with its stages side by side; a line for each place where memory is.
+/// A line for each quantity and size, with its stages side by side; a line for each place where memory is.
 fn grown_cells(rows: &[Row]) -> Vec<Vec<String>> {
     let stages = distinct(rows.iter().filter(|r| r.bytes.is_none()).map(|r| r.stage.as_str()));
     let memory = rows.iter().any(|r| r.bytes.is_some());

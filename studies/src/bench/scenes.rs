@@ -70,7 +70,7 @@ impl Name {
     }
 }
 
-/// Where scenes lie, if not in their usual places.
+/// Folder of scenes, if not the usual one.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Places {
     pub playbot: Option<PathBuf>,

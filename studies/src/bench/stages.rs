@@ -14,7 +14,7 @@ use std::time::Instant;
 pub(super) struct Way {
     pub threads: usize,
     pub simd: Simd,
-    /// Rounds over all views, after one that makes room.
+    /// Rounds over all views, after a warm-up round.
     pub rounds: usize,
 }
 

@@ -23,7 +23,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-/// Every rate is multiplied by this: the scene stays what it is, the work is the same.
+/// Every rate is multiplied by this: the scene does not change, the work is the same.
 const STANDSTILL: f64 = 1e-6;
 /// Steps of the stage: never reached.
 const FOR_EVER: usize = 1 << 40;

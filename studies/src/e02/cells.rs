@@ -11,7 +11,7 @@ pub(crate) struct Variant {
     /// For people.
     pub name: &'static str,
     settings: &'static [&'static str],
-    /// Whether a glance looks at it too.
+    /// Whether the quick study includes it.
     quick: bool,
 }
 

@@ -31,9 +31,9 @@ const SEED: u64 = 18;
 const POINTS: usize = 500;
 /// Cosine of the least angle between two rays to a point: COLMAP keeps no point below 1.5°.
 const PARALLAX: f64 = 0.999_657;
-/// A point counts as seen where what its pixel shows is at most this share of its distance nearer.
+/// A point counts as seen if the depth at its pixel is smaller by at most this share.
 const SEEN: f64 = 0.01;
-/// Error of a point along each axis, pixels at its distance, at most: what good structure from motion has.
+/// Error of a point along each axis, pixels at its distance, at most: as from good structure from motion.
 const NOISE: f64 = 0.5;
 
 /// Renders a synthetic capture into a folder. `capture.json` is written last: where it is, all is.
@@ -149,7 +149,7 @@ fn description(name: &str, scene: &Scene) -> Value {
 type Point = (V3, [u8; 3]);
 
 /// A sparse cloud as structure from motion would find it: random pixels of the training images of the first time (of
-/// a moving camera: of all times), kept where a second training image sees the place from a different direction.
+/// a moving camera: of all times), kept where a second training image sees the point from a different direction.
 fn cloud(scene: &Scene) -> Vec<Point> {
     let training = scene.viewers.iter().filter(|v| !v.held);
     let views: Vec<(&Pinhole, usize)> =

@@ -1,18 +1,18 @@
-//! The synthetic captures: what is there, who looks at it, and what is hard about it. Nothing here was chosen by how
+//! The synthetic captures: contents, cameras and difficulty. Nothing here was chosen by how
 //! well it
 //! is learnt.
 
 use super::world::{Pinhole, Shape, Texture, Thing, V3, World, sin_cos};
 use splat4d::math::Se3;
 
-/// Images, pixels; the focal length gives 59° across, as an ordinary camera has it.
+/// Images, pixels; the focal length gives 59° across, as of an ordinary camera.
 const SIZE: [usize; 2] = [160, 120];
 const FOCAL: f64 = 140.0;
-/// Distance of the cameras from what they look at, scene units.
+/// Distance of the cameras from their target, scene units.
 const RADIUS: f64 = 4.0;
 /// Heights of neighbouring cameras, in turns.
 const HEIGHTS: [f64; 2] = [1.1, 1.9];
-/// What rigs look at.
+/// Target of rigs.
 const TARGET: V3 = [0.0, 0.7, -0.3];
 /// Half the arc of rigs that are before the scene, and of one that is all round it, radians.
 const HALF_ARC: f64 = 0.9;
@@ -63,7 +63,7 @@ pub(crate) struct Scene {
     pub fps: f64,
     /// Units of the files in units of the world.
     pub units: f64,
-    /// Whether points of moving things belong to the cloud.
+    /// Whether points of moving objects belong to the cloud.
     pub moving_points: bool,
     /// Whether depth and flow of the images to train on are written next to them.
     pub truth: bool,
@@ -129,7 +129,7 @@ pub(crate) fn scene(name: &str) -> Option<Scene> {
     Some(scene)
 }
 
-/// Colours of things, dark and light, in turns.
+/// Colours of objects, alternately dark and light.
 const COLORS: [[V3; 2]; 5] = [
     [[0.12, 0.16, 0.28], [0.52, 0.54, 0.46]],
     [[0.30, 0.10, 0.08], [0.60, 0.46, 0.18]],
@@ -218,7 +218,7 @@ fn arc(count: usize, half: f64, held: &[usize]) -> Vec<Viewer> {
     (0..count).map(viewer).collect()
 }
 
-/// Twelve cameras side by side, all looking straight ahead; two of the inner ones are held out.
+/// Twelve cameras side by side, all pointing straight ahead; two of the inner ones are held out.
 fn grid() -> Vec<Viewer> {
     let viewer = |i: usize| {
         let (column, row) = ((i % 4) as f64, (i / 4) as f64);

@@ -101,7 +101,7 @@ fn lattice(rng: Rng, p: V3) -> [f64; 4] {
     out
 }
 
-/// The form of a thing, about its own origin.
+/// The shape of an object, about its own origin.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Shape {
     /// Of this radius; seen from inside it is a dome.
@@ -164,12 +164,12 @@ impl Thing {
 pub(crate) struct Seen {
     pub point: V3,
     pub color: V3,
-    /// The thing's number.
+    /// The object's number.
     pub thing: usize,
 }
 
 impl World {
-    /// Where the point of a thing that was seen at a share of the capture is at another one.
+    /// The position of an object's point, seen at a share of the capture, at another one.
     pub(crate) fn later(&self, seen: &Seen, at: f64, then: f64) -> V3 {
         let place = self.things[seen.thing].place;
         add(sub(seen.point, place(at)), place(then))
@@ -216,7 +216,7 @@ impl Pinhole {
         self.cam_from_world.inverse().translation
     }
 
-    /// The direction (of length 1) in which a place in the image lies.
+    /// The direction (of length 1) of an image position.
     pub(crate) fn ray(&self, [x, y]: [f64; 2]) -> V3 {
         let [width, height] = self.size.map(|s| s as f64);
         let own = [(x - 0.5 * width) / self.focal, (y - 0.5 * height) / self.focal, 1.0];
@@ -259,7 +259,7 @@ impl Pinhole {
         self.pixels().map(|place| seen(self.ray(place))).collect()
     }
 
-    /// Where what the pixels' centres show goes by another time as another camera sees it, pixels; `None`: behind that.
+    /// Displacement of the points at pixel centres to another time and camera, pixels; `None`: behind that.
     pub(crate) fn flow(&self, world: &World, [at, then]: [f64; 2], to: &Self) -> Vec<Option<[f64; 2]>> {
         let eye = self.center();
         let way = |place: V2| {

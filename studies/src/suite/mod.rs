@@ -79,7 +79,7 @@ pub(crate) struct Args {
     baseline: Option<PathBuf>,
 }
 
-/// What one capture came to in so many steps. Values are dB unless named otherwise.
+/// Result of one capture after this many steps. Values are dB unless named otherwise.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 struct FolderContent {
@@ -90,7 +90,7 @@ struct FolderContent {
     /// Why there are not finite.
     refused: Option<String>,
     motion: String,
-    /// Held-out views: whole images, where things move, and (from these two and the share that moves) elsewhere.
+    /// Held-out views: whole images, dynamic regions, and (from these two and the dynamic share) static ones.
     psnr: Option<f64>,
     /// Whole images after each camera's colour matrix.
     psnr_cc: Option<f64>,
@@ -99,11 +99,11 @@ struct FolderContent {
     ssim: Option<f64>,
     flicker: Option<f64>,
     psnr_train: Option<f64>,
-    /// Training views on the way.
+    /// Training views during the run.
     probes: Vec<Probe>,
     fall: Option<Fall>,
     gaussians: usize,
-    /// Of training, without the looks on the way.
+    /// Of training, without the evaluations during the run.
     seconds: f64,
     /// The playback file against its model.
     playback_psnr: Option<f64>,
@@ -224,7 +224,7 @@ fn orders<'a>(args: &Args, list: &List, entries: &[&'a Entry], console: &Console
     Ok(orders)
 }
 
-/// The recipe of a capture: the default one, with what the list and the user say.
+/// The recipe of a capture: the default one, with settings of the list and the user.
 fn recipe(entry: &Entry, steps: usize, args: &Args) -> Result<Recipe> {
     let mut recipe = Recipe::default();
     recipe.set("run.motion=auto")?;
@@ -337,11 +337,11 @@ fn elsewhere(whole: Option<f64>, moving: Option<f64>, share: Option<f64>) -> Opt
     (rest > 0.0 && rest.is_finite()).then(|| -10.0 * rest.log10())
 }
 
-/// What a run is measured on, opened when it has begun: points that it found in its images say from how near its
+/// The views that a run is measured on, opened after its start: points found in its images set the near plane of its
 /// cameras see.
 struct Judges {
     whole: Judge,
-    /// The same at half the size. While images of half the size are trained on, they are what training views are: at
+    /// The same at half the size. While images of half the size are trained on, they are the training views: at
     /// full
     /// size a scene that has never seen one gets worse and better at random.
     coarse: Judge,

@@ -1,5 +1,5 @@
 //! The rule that a recipe must keep on every capture: more steps do not cost quality, and training views do not get
-//! worse on the way.
+//! worse during the run.
 
 use super::FolderContent;
 use serde::{Deserialize, Serialize};
@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 pub(crate) const MORE: usize = 4;
 /// What the longer run may lose on held-out views, dB: about what two seeds differ by.
 const LOSS: f64 = 0.1;
-/// What training views may lose on the way, dB.
+/// What training views may lose during the run, dB.
 const FALL: f64 = 1.0;
 
 /// Training views after so many steps.
@@ -19,7 +19,7 @@ pub(crate) struct Probe {
     pub psnr: f64,
 }
 
-/// The largest loss of training views on the way.
+/// The largest loss of training views during the run.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Fall {
     pub db: f64,

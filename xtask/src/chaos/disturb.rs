@@ -21,7 +21,7 @@ pub(super) enum Disturbance {
     Full,
     /// The same command a second time at once.
     TwoOwners,
-    /// A kill, and clocks that jump a day forth or back; or that jump under a process that lives.
+    /// A kill, and clocks that jump a day forth or back; or that jump while a process runs.
     Clock,
     /// The folder becomes read-only at a random time.
     ReadOnly,
@@ -127,8 +127,8 @@ fn set_times(place: &Path, at: SystemTime) {
     }
 }
 
-/// A folder that is read-only for so long. Of root, who may write anywhere, the folders become immutable where the file system
-/// knows that; else nothing happens to it.
+/// A folder that is read-only for so long. Of root, who may write anywhere, the folders become immutable where the file
+/// system handles that; else it is not disturbed.
 struct ReadOnly(Vec<(PathBuf, Permissions)>, bool);
 
 impl ReadOnly {

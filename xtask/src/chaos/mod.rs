@@ -174,7 +174,7 @@ impl Bench<'_> {
     }
 }
 
-/// Refusals say why, and nothing panics, hangs or is ended by the system.
+/// Refusals state the reason, and nothing panics, hangs or is ended by the system.
 pub(super) fn check_said(ended: &Ending) -> Result<()> {
     ensure!(!ended.said.contains("panicked"), "it panics: {}", ended.said);
     match ended.code {

@@ -7,18 +7,18 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// Processor time from which a call hangs: undisturbed ones take below two seconds (studies/records/2026-11-27-reliability.md). Time
-/// on the clock states nothing on a machine that is shared.
+/// Processor time from which a call hangs: undisturbed ones take below two seconds
+/// (studies/records/2026-11-27-reliability.md). Time on the clock states nothing on a machine that is shared.
 const BUSY: f64 = 60.0;
 /// A call that waits so long without using a processor hangs.
 const IDLE: Duration = Duration::from_secs(60);
-/// Where the system does not say how much processor time a process has used, a call hangs after this time.
+/// Time after which a call counts as hanging if the system does not report processor time.
 const HANGS: Duration = Duration::from_secs(120);
 /// Time between two readings of the processor time.
 const READING: Duration = Duration::from_millis(500);
 /// Ticks a second in which Linux counts processor time, on all of its architectures.
 const TICKS: f64 = 100.0;
-/// Time between two looks whether a call has ended.
+/// Time between two checks whether a call has ended.
 const LOOK: Duration = Duration::from_millis(2);
 /// Threads of a call: the machine may be shared.
 const THREADS: &str = "2";
@@ -26,7 +26,7 @@ const THREADS: &str = "2";
 /// How a call ended.
 pub(crate) struct Ending {
     pub(crate) code: Option<i32>,
-    /// What it said on stderr.
+    /// Its stderr.
     pub(crate) said: String,
 }
 
@@ -88,7 +88,7 @@ impl Call {
         Ok(self.child.try_wait()?.is_none())
     }
 
-    /// Processor time of the process and of those that it waited for, seconds; `None`: the system does not say.
+    /// Processor time of the process and of those that it waited for, seconds; `None`: the system does not report it.
     fn seconds(&self) -> Option<f64> {
         processor_time(&std::fs::read_to_string(format!("/proc/{}/stat", self.child.id())).ok()?)
     }
@@ -134,7 +134,7 @@ fn processor_time(stat: &str) -> Option<f64> {
     Some(ticks?.iter().sum::<f64>() / TICKS)
 }
 
-/// A folder of this process that goes at the end.
+/// A folder of this process that is deleted at the end.
 pub(crate) struct Scratch(PathBuf);
 
 impl Scratch {

@@ -1,4 +1,4 @@
-//! A tiny capture: four cameras on an arc look at a bright square that crosses a grey wall.
+//! A tiny capture: four cameras on an arc film a bright square that crosses a grey wall.
 
 use crate::files::{png, write_file};
 use anyhow::Result;

@@ -73,7 +73,7 @@ impl Setup {
     }
 }
 
-/// Words of a text; `{}` are these paths in turn.
+/// Words of a text; `{}` are replaced by these paths in order.
 fn words(text: &str, paths: &[&Path]) -> Vec<OsString> {
     let mut paths = paths.iter();
     let word = |w: &str| match w {
