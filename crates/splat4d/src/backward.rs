@@ -32,7 +32,7 @@ impl<F: Real> RenderGrads<F> {
             second.data_mut().iter_mut().zip(&head.second).for_each(|(d, x)| *d += *x);
         }
         for (layer, part) in self.parts.iter_mut().enumerate() {
-            let i = evaluation.find(layer, Space::Gaussians, t).expect("every layer was asked at this time");
+            let i = evaluation.find(layer, Space::Gaussians, t).expect("every layer was queried at this time");
             evaluation.add_gradient(i, &mut part.out, &mut part.color, &mut part.weights);
         }
     }

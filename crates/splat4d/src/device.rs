@@ -80,7 +80,7 @@ pub fn open_to_train(device: Device, config: RenderConfig) -> Opened {
 
 /// The CPU instead of the requested GPU.
 pub fn on_cpu(config: RenderConfig, reason: &dyn std::fmt::Display) -> Opened {
-    Opened { backend: cpu(config), name: CPU.into(), why: format!("drawing on {CPU}: {reason}"), fell_back: true }
+    Opened { backend: cpu(config), name: CPU.into(), why: format!("rendering on {CPU}: {reason}"), fell_back: true }
 }
 
 /// Renders. If the backend fails, the CPU takes over and the error is returned.
@@ -139,7 +139,7 @@ impl WithCpu {
     fn leave(&mut self, error: &Error) {
         self.other = None;
         self.name = CPU.into();
-        self.notices.push(format!("training goes on on the CPU: {}", error.cause()));
+        self.notices.push(format!("training continues on the CPU: {}", error.cause()));
     }
 }
 

@@ -20,7 +20,7 @@ fn the_cpu_is_always_there() {
         let (splats, camera, mut image) = (Splats::default(), view(), Image::default());
         assert!(draw(&mut opened.backend, &Shot::new(&splats, &camera, BACKGROUND), &mut image).is_none());
         assert_eq!(image.color.data[..7], [0.25, 0.25, 0.25, 0.25, 0.25, 0.25, 0.5]);
-        assert!(opened.why.starts_with("drawing on "), "{}", opened.why);
+        assert!(opened.why.starts_with("rendering on "), "{}", opened.why);
         assert_eq!(opened.fell_back, device != Device::Cpu && opened.backend.name() == "the CPU");
     }
 }
@@ -122,7 +122,7 @@ fn training_continues_on_the_cpu_with_equal_gradients() {
         // Its failure is reported too, and nothing of the step is lost.
         assert!(returned(&mut backend, &plain) == without && backend.name() == CPU);
         let notice = backend.notice().expect("it is told");
-        assert!(notice.contains("goes on on the CPU") && notice.contains("the driver is gone"), "{notice}");
+        assert!(notice.contains("continues on the CPU") && notice.contains("the driver is gone"), "{notice}");
         assert!(returned(&mut backend, &plain) == without && backend.notice().is_none());
     }
 }
@@ -209,7 +209,7 @@ fn a_driver_that_fails_the_self_test_is_tried_without_subgroups_and_left_then() 
     }
     let (attempts, opened) = tried(2);
     assert!(attempts == 2 && opened.fell_back && opened.name == CPU && opened.backend.name() == CPU);
-    let first = format!("drawing on the CPU: {whole}: 1: it fails a self-test");
+    let first = format!("rendering on the CPU: {whole}: 1: it fails a self-test");
     assert_eq!(opened.why, first, "what failed first is told");
 }
 

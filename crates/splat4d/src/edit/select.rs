@@ -311,8 +311,8 @@ impl Parser<'_> {
                 self.at += 1;
                 self.named(&word)
             }
-            Some(other) => Err(self.wrong(&format!("`{other}` stands where a predicate should"))),
-            None => Err(self.wrong("it ends where a predicate should stand")),
+            Some(other) => Err(self.wrong(&format!("expected a predicate, found `{other}`"))),
+            None => Err(self.wrong("expected a predicate, found the end")),
         }
     }
 

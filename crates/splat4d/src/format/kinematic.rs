@@ -168,7 +168,7 @@ pub(super) fn rows(
             out.push(moving.recentered(there));
         }
     }
-    let what = "have a life with a flat top, or one that ends at once: smooth fades were fitted (--exact refuses them)";
+    let what = "have a lifespan with a flat top, or one that ends at once: smooth fades were fitted (--exact refuses them)";
     warnings.counted(fitted, scene.len(), what);
     warnings.counted(unseen, scene.len(), "are never seen within the clip and were left out");
     if shaded > 0 {
@@ -316,7 +316,7 @@ pub(super) mod tests {
             let rows = rows(&scene, clock, ".splatv", false, &mut warnings).unwrap();
             assert_eq!(rows.len(), 30);
             let said = warnings.lines().join("\n");
-            assert!(said.contains("of 30 Gaussians have a life with a flat top"), "{said}");
+            assert!(said.contains("of 30 Gaussians have a lifespan with a flat top"), "{said}");
             // Paths and shapes are unchanged, about another centre.
             let back = super::scene(&rows, clock).unwrap();
             let whole = Scene { layers: vec![Layer { span: ALWAYS, ..scene.layers[0].clone() }], ..scene.clone() };

@@ -127,7 +127,7 @@ pub fn spec_from_json(v: &Value) -> Result<Spec> {
         )
         .remedy("Open it with the splat4d that wrote it, or a newer one"));
     }
-    serde_json::from_value(v.clone()).map_err(|e| broken(format!("its motion `{model}` is not as it should be: {e}")))
+    serde_json::from_value(v.clone()).map_err(|e| broken(format!("invalid motion `{model}`: {e}")))
 }
 
 /// All arrays of a scene, ready to be written (also into a checkpoint).

@@ -172,7 +172,7 @@ impl GpuRenderer {
 
     /// Refuses what the shaders cannot do, without opening a GPU.
     pub(crate) fn refuses(wanted: &Wanted) -> Result<()> {
-        let lacks = [(wanted.head, "draw scenes with a pixel head"), (wanted.extra, "blend further channels")];
+        let lacks = [(wanted.head, "render scenes with a pixel head"), (wanted.extra, "blend further channels")];
         lacks.iter().find(|(wanted, _)| *wanted).map_or(Ok(()), |(_, what)| Err(refusal("the GPU", what)))
     }
 

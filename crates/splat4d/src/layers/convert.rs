@@ -40,7 +40,7 @@ pub fn to_spacetime<F: Real>(layer: &Layer<F>) -> Result<Layer<F>> {
     };
     if spec.harmonics > 0 {
         return Err(cannot(
-            "colours that change with time have no place in spacetime",
+            "spacetime does not support colours that change with time",
             "Train with sh_harmonics=0, or bake the scene",
         ));
     }
@@ -72,7 +72,7 @@ pub fn to_spacetime<F: Real>(layer: &Layer<F>) -> Result<Layer<F>> {
 pub fn to_native4d<F: Real>(layer: &Layer<F>, spec: Native4dSpec) -> Result<Layer<F>> {
     let own_spec = match layer.motion.spec() {
         Spec::Spacetime(SpacetimeSpec { features: Some(_), .. }) => {
-            return Err(cannot("features have no place in native4d", "Train with features=none"));
+            return Err(cannot("native4d does not support features", "Train with features=none"));
         }
         Spec::Spacetime(s) if s.order <= 1 && !s.rotation => s,
         _ => {
@@ -88,7 +88,7 @@ pub fn to_native4d<F: Real>(layer: &Layer<F>, spec: Native4dSpec) -> Result<Laye
         LifeKind::GaussOne => FRAC_1_SQRT_2,
         _ => {
             return Err(cannot(
-                "only a Gaussian life is one of native4d",
+                "native4d supports only Gaussian lifespans",
                 "Train with life=gauss-half or life=gauss-one",
             ));
         }

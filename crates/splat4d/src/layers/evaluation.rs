@@ -156,7 +156,7 @@ impl<F: Real> Evaluation<F> {
     /// The splats of a time at which all layers of `scene` were queried.
     pub fn splats<'a>(&'a self, scene: &'a Scene<F>, t: Time) -> Splats<'a, F> {
         let part = |(index, layer): (usize, &'a Layer<F>)| {
-            let i = self.find(index, Space::Gaussians, t).expect("every layer was asked at the time of these splats");
+            let i = self.find(index, Space::Gaussians, t).expect("every layer was queried at the time of these splats");
             layer.part(&self.questions[i].tape)
         };
         Splats { parts: scene.layers.iter().enumerate().map(part).collect(), head: scene.head_weights() }
@@ -283,7 +283,7 @@ fn reset_like<F: Real>(d: &mut Table<F>, like: &Table<F>) {
 }
 
 fn add_table<F: Real>(to: &mut Table<F>, from: &Table<F>) {
-    assert_eq!((to.rows(), to.width()), (from.rows(), from.width()), "gradients of one answer have one shape");
+    assert_eq!((to.rows(), to.width()), (from.rows(), from.width()), "gradients of one result have one shape");
     par_split([to.view_mut()], &|[to]| {
         let from = &from.data()[to.first * to.width..];
         to.data.iter_mut().zip(from).for_each(|(a, b)| *a += *b);

@@ -489,7 +489,7 @@ impl<F: Real> Scene<F> {
                 ErrorKind::Unsupported,
                 format!("{what} cannot hold this scene: a network makes its colours, pixel by pixel (features = full)"),
             )
-            .remedy("Train with --set features=none for that; `render` and `eval` draw the scene as it is")),
+            .remedy("Train with --set features=none for that; `render` and `eval` render the scene with it")),
         }
     }
 }

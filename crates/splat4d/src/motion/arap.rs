@@ -148,7 +148,7 @@ impl Elastic {
         let mut held: Vec<Option<Handle>> = vec![None; n];
         for h in handles {
             if h.node >= n || held[h.node].is_some() {
-                return Err(Error::input(format!("handle {} is not one of {n} nodes, or stands twice", h.node))
+                return Err(Error::input(format!("handle {} is not one of {n} nodes, or is given twice", h.node))
                     .remedy("Give every node at most one target"));
             }
             let turns = h.rotation.iter().flatten().flatten();

@@ -373,7 +373,7 @@ impl<F: Real> Motion<F> for Hexplane {
         }
         let n = q.len();
         let own: &mut Own<F> = tape.own.get_or_default();
-        assert_eq!(own.x.len(), n, "a backward follows the forward of the same question");
+        assert_eq!(own.x.len(), n, "a backward follows the forward of the same query");
         let lines = self.planes.lines(q.p, self.share(q.t.0));
         let mut d_rows = Table::new(&[("d_rows", 11)], n);
         fill(&Activated { moved: &own.moved, d_out: d_out.out }, [&mut d_rows], Rows::All);

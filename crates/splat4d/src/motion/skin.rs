@@ -125,7 +125,7 @@ impl SkinSpec {
         for (name, value, low, high) in ranges {
             if !(low..=high).contains(&value) {
                 return Err(Error::input(format!(
-                    "a skin with {name} = {value} cannot be: {low} to {high} is possible"
+                    "invalid skin: {name} = {value}, expected {low} to {high}"
                 ))
                 .remedy("The file is damaged or was written by another program; export it again"));
             }
@@ -309,7 +309,7 @@ impl<F: Real> Skinned<F> {
     }
 
     fn prepared<'a>(&self, cache: &'a Cache, t: Time) -> (&'a Prepared<F>, &'a Frames<F>) {
-        let c: &Prepared<F> = cache.get().expect("prepare comes before every question");
+        let c: &Prepared<F> = cache.get().expect("`prepare` precedes every query");
         let i = c.times.iter().position(|x| same(*x, t)).expect("every time of a step was prepared");
         (c, &c.frames[i])
     }

@@ -142,7 +142,7 @@ impl SsmSpec {
         for (name, value, low, high) in ranges {
             if !(low..=high).contains(&value) {
                 return broken(format!(
-                    "a state-space model of {name} = {value} cannot be: {low} to {high} is possible"
+                    "invalid state-space model: {name} = {value}, expected {low} to {high}"
                 ));
             }
         }
@@ -314,7 +314,7 @@ impl<F: Real> Trajectory<F> for Field {
     }
 
     fn poses(&self, _p: &Params<F>, t: Time, cache: &Slot, out: &mut Table<F>) {
-        let scan: &Scan<F> = cache.get().expect("prepare comes before every question");
+        let scan: &Scan<F> = cache.get().expect("`prepare` precedes every query");
         let (knots, width) = (self.knots(t), self.tick_width());
         for node in 0..out.rows() {
             let own = &scan.out[node * scan.ticks * width..(node + 1) * scan.ticks * width];
@@ -331,7 +331,7 @@ impl<F: Real> Trajectory<F> for Field {
         d_cache: &mut Slot,
         _d: &mut Grads<F>,
     ) -> f64 {
-        let scan: &Scan<F> = cache.get().expect("prepare comes before every question");
+        let scan: &Scan<F> = cache.get().expect("`prepare` precedes every query");
         let d_scan = &mut d_cache.get_or_default::<Pending<F>>().0;
         d_scan.resize(scan.out.len(), F::ZERO);
         let (knots, width) = (self.knots(t), self.tick_width());

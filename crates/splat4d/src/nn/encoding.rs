@@ -37,7 +37,7 @@ pub(crate) fn encode<F: Real>(x: &[F], levels: usize, out: &mut [F]) {
 #[inline]
 pub(crate) fn encode_backward<F: Real>(x: &[F], levels: usize, d_out: &[F], d_x: &mut [F]) {
     let d = x.len();
-    assert_eq!((d_x.len(), d_out.len()), (d, encoded(d, levels)), "a gradient has the shape of what it is of");
+    assert_eq!((d_x.len(), d_out.len()), (d, encoded(d, levels)), "a gradient has the shape of its value");
     d_x.copy_from_slice(&d_out[..d]);
     for (i, x) in x.iter().enumerate() {
         let (mut s, mut c, mut factor) = (x.sin(), x.cos(), F::ONE);

@@ -59,7 +59,7 @@ impl HashShape {
             && (2..=self.finest).contains(&self.base)
             && (1..=MAX_DIMS).contains(&dims);
         let bad = || {
-            Error::input(format!("a hash grid cannot be {self:?}"))
+            Error::input(format!("invalid hash grid: {self:?}"))
                 .remedy("The file is damaged or was written by another program; export it again")
         };
         if !sound {
@@ -205,7 +205,7 @@ impl HashGrid {
             );
         });
         let Some(d_points) = d_points else { return };
-        assert_eq!(d_points.len(), points.len(), "a gradient has the shape of what it is of");
+        assert_eq!(d_points.len(), points.len(), "a gradient has the shape of its value");
         let chunks = points.par_chunks(ROWS * self.stride).zip(d_out.data.par_chunks(ROWS * d_out.width));
         chunks.zip(d_points.par_chunks_mut(ROWS * self.stride)).for_each(|((points, data), d_points)| {
             for (l, (level, &key)) in self.levels.iter().zip(&self.keys).enumerate() {

@@ -227,7 +227,7 @@ impl Planes {
         let width = self.shape.features();
         assert!(
             d_out.len() == x.len() * width && d_x.len() == x.len(),
-            "gradients have the shapes of what they are of"
+            "gradients have the shapes of their values"
         );
         let (levels, blocks, simd) = (self.levels(p, lines, unlocked), self.blocks(), Simd::detect());
         let keys: Vec<Key> = self.keys[..levels.len()].as_flattened().to_vec();

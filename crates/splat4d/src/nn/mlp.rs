@@ -257,7 +257,7 @@ impl Mlp {
             InputGrad::Add(d_x) => (d_x, false),
         };
         let wanted = !rest.is_empty();
-        assert!(!wanted || rest.len() == x.len(), "a gradient has the shape of what it is of");
+        assert!(!wanted || rest.len() == x.len(), "a gradient has the shape of its value");
         let mut parts: Vec<&mut [F]> = Vec::new();
         for run in ends.windows(2) {
             let (head, tail) = rest.split_at_mut(if wanted { (run[1] - run[0]) * inputs } else { 0 });

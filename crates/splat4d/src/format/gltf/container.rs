@@ -164,7 +164,7 @@ pub(super) fn buffers(text: &[u8]) -> Result<Vec<String>> {
 /// The bytes of a data URI.
 fn data(uri: &str) -> Result<Vec<u8>> {
     let (_, text) = uri.split_once(BASE64).ok_or_else(|| damaged("a data URI is not in base64"))?;
-    base64::decode(text.as_bytes()).ok_or_else(|| damaged("a data URI holds characters that base64 has not"))
+    base64::decode(text.as_bytes()).ok_or_else(|| damaged("a data URI contains characters outside base64"))
 }
 
 fn elsewhere(uri: &str) -> Error {

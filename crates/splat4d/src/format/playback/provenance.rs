@@ -41,9 +41,9 @@ pub fn provenance(bytes: &[u8]) -> Result<Option<Provenance>> {
         return Err(broken("the checksum of its provenance is wrong".into()));
     }
     if entry.codec != Codec::Raw {
-        return Err(broken("its provenance is stored in a way that is not known".into()));
+        return Err(broken("its provenance has an unknown encoding".into()));
     }
-    let wrong = |e| broken(format!("its provenance is not what it must be: {e}"));
+    let wrong = |e| broken(format!("its provenance is invalid: {e}"));
     serde_json::from_slice(stored).map(Some).map_err(wrong)
 }
 

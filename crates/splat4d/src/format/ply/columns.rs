@@ -85,7 +85,7 @@ fn lacking(vertex: &Element, missing: &[&str], rgb: bool) -> Error {
     if let Some((_, what)) = NETWORKS.iter().find(|(begin, _)| names().any(|n| n.starts_with(begin))) {
         let what = format!("this file holds {what}: a network makes the Gaussians of them for each view");
         return Error::new(ErrorKind::Unsupported, what).remedy(
-            "Such a scene cannot be drawn without its network. Export the Gaussians of one view, or train with 3DGS",
+            "Such a scene cannot be rendered without its network. Export the Gaussians of one view, or train with 3DGS",
         );
     }
     let is_position = |n: &&str| ["x", "y", "z"].contains(n);
@@ -96,7 +96,7 @@ fn lacking(vertex: &Element, missing: &[&str], rgb: bool) -> Error {
             "this is a point cloud without Gaussians: its points have {} only, no scale, rotation or opacity",
             names.join(", ")
         ))
-        .remedy("A point cloud can start a training, but it cannot be drawn; give a trained .ply");
+        .remedy("A point cloud can start a training, but it cannot be rendered; give a trained .ply");
     }
     Error::input(format!("the element `vertex` lacks the properties {}", missing.join(", ")))
         .remedy("A file of 3D Gaussians has x y z, f_dc_0..2 (or red green blue), opacity, scale_0..2 and rot_0..3")

@@ -113,7 +113,7 @@ fn write_ftgs(scene: &Scene<f32>, options: &WriteOptions, out: &mut impl Write) 
     }
     warnings.counted(curved, rows.len(), "have curved paths: the tangents at the middle of their lifespans are stored");
     warnings.counted(turning, rows.len(), "rotate: the rotation at the middle of their lifespans is stored");
-    warnings.counted(brief, rows.len(), "live for less than 0.02 of the clip, the shortest that players support");
+    warnings.counted(brief, rows.len(), "have lifespans below 0.02 of the clip, the shortest that players support");
     let absorbed: Vec<_> = scene.layers.iter().map(|layer| layer.with_frame_absorbed()).collect();
     let width = scene.layers.iter().map(|l| l.params[SH].width()).max().unwrap_or(3);
     let rest = F_REST_COUNTS.into_iter().find(|n| n + 3 >= width).unwrap_or(0);

@@ -148,7 +148,7 @@ impl Header {
                 Some("element") => header.elements.push(element(line, words).map_err(at)?),
                 Some("property") => {
                     let Some(element) = header.elements.last_mut() else {
-                        return Err(at(broken("a property stands before the first element")));
+                        return Err(at(broken("a property precedes the first element")));
                     };
                     element.properties.push(property(line, words).map_err(at)?);
                 }

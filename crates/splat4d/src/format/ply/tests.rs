@@ -319,7 +319,7 @@ fn inconsistent_headers_are_errors_with_a_reason() {
         (counted("18446744073709551616"), "not a number of rows"),
         (counted("-1"), "not a number of rows"),
         (counted("1e3"), "not a number of rows"),
-        (headed(&[little, "property float x"]), "before the first element"),
+        (headed(&[little, "property float x"]), "precedes the first element"),
         (headed(&[little, "element vertex 1", "property float x", "property float x"]), "two properties called `x`"),
         (headed(&[little, "element vertex 1", "element vertex 1"]), "two elements called `vertex`"),
         (headed(&[little, "element vertex 1", "property quad x"]), "`quad`"),

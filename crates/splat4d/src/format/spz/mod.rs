@@ -83,7 +83,7 @@ impl Header {
     fn checked(self) -> Result<Self> {
         if self.version == 1 {
             return Err(Error::new(ErrorKind::Unsupported, "the file has version 1 of .spz, which was never released")
-                .remedy("Export it again with a program of today."));
+                .remedy("Export it again with a current program."));
         }
         if !VERSIONS.contains(&self.version) {
             let what = format!("the file has version {} of .spz, this splat4d reads 2 to 4", self.version);

@@ -74,7 +74,7 @@ impl Stage {
                 break;
             }
             if l.eat(b'}') {
-                open.pop().ok_or_else(|| l.error("a bracket closes that none opened"))?;
+                open.pop().ok_or_else(|| l.error("a closing bracket has no opening one"))?;
                 continue;
             }
             match l.word() {
@@ -100,10 +100,10 @@ impl Stage {
                         }
                     }
                 }
-                "" => return Err(l.error(format_args!("`{}` stands where a name should", char::from(l.peek())))),
+                "" => return Err(l.error(format_args!("expected a name, found `{}`", char::from(l.peek())))),
                 first => {
                     let Some(&prim) = open.last() else {
-                        return Err(l.error(format_args!("`{first}` stands outside of all prims")));
+                        return Err(l.error(format_args!("`{first}` is outside all prims")));
                     };
                     stage.prims[prim].property(&mut l, first)?;
                 }

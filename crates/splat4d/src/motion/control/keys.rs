@@ -38,10 +38,10 @@ impl Timeline {
     pub(crate) fn new(curve: Curve, keys: usize, clip: [f64; 2]) -> Result<Self> {
         let least = if curve == Curve::Cubic { REACH } else { 2 };
         if !(least..=MAX_KEYS).contains(&keys) {
-            return Err(refuse(format!("a curve of {keys} keys cannot be: {least} to {MAX_KEYS} are possible")));
+            return Err(refuse(format!("invalid curve of {keys} keys: expected {least} to {MAX_KEYS}")));
         }
         if !(clip[0].is_finite() && clip[1].is_finite() && clip[0] <= clip[1]) {
-            return Err(refuse(format!("a clip from {} to {} seconds cannot be", clip[0], clip[1])));
+            return Err(refuse(format!("invalid clip from {} to {} seconds", clip[0], clip[1])));
         }
         Ok(Self { curve, keys, clip })
     }

@@ -28,7 +28,7 @@ impl LowRank {
     /// Errors: too many bases, tables that would be too large, loaded arrays of the wrong shape.
     pub(crate) fn new<F: Real>(line: Timeline, count: usize, skin: &Skin, p: &mut Params<F>) -> Result<Self> {
         if !(1..=MAX_BASES).contains(&count) {
-            return Err(refuse(format!("{count} shared motions cannot be: 1 to {MAX_BASES} are possible")));
+            return Err(refuse(format!("invalid number of shared motions {count}: expected 1 to {MAX_BASES}")));
         }
         let (rows, width, keys) = (skin.count(p), POSE * count, line.keys());
         check_size("node_coefficients", rows, width)?;

@@ -66,7 +66,7 @@ impl Network {
         p: &mut Params<F>,
     ) -> Result<Self> {
         if shape.levels.iter().any(|&l| l > MAX_LEVELS) {
-            return Err(refuse(format!("an encoding of more than {MAX_LEVELS} levels cannot be")));
+            return Err(refuse(format!("invalid encoding: more than {MAX_LEVELS} levels")));
         }
         let units = p.entry("node_units", Space::Fixed, &[("node_units", 1)], 4, |_| {})?;
         p.info_mut(units).trainable = false;
@@ -185,7 +185,7 @@ impl<F: Real> Trajectory<F> for Network {
 }
 
 fn pass_of<F: Real>(cache: &Slot, t: Time) -> &Pass<F> {
-    let passes: &Passes<F> = cache.get().expect("prepare comes before every question");
+    let passes: &Passes<F> = cache.get().expect("`prepare` precedes every query");
     let same = |pass: &&Pass<F>| pass.t.0.to_bits() == t.0.to_bits();
     passes.0.iter().find(same).expect("every time of a step was prepared")
 }
