@@ -66,7 +66,7 @@ impl Blended {
         let grads = ImageGrads { color: &d_color, alpha: None, depth: None, extra: Some(d_extra) };
         let mut no_sh: Vec<Option<&mut Table<f32>>> = splats.parts.iter().map(|_| None).collect();
         self.renderer.backward(&shot, &grads, &mut no_sh, &mut self.grads);
-        let d = self.grads.extra.as_ref().expect("the channels were drawn");
+        let d = self.grads.extra.as_ref().expect("the channels were rendered");
         let mut first = 0;
         for (layer, tape) in self.instant.tapes().enumerate() {
             let rows = tape.out().rows();

@@ -122,7 +122,7 @@ impl Timeline {
                     .collect()
             }
             Sampler::Frame(k) => {
-                assert!(k < times, "the clip has {times} distinct times, frame {k} was asked");
+                assert!(k < times, "the clip has {times} distinct times, frame {k} was requested");
                 let group = &self.frames[k];
                 (0..batch).map(|b| group[(step * batch + b + step_rng.below(0, 2)) % group.len()] as usize).collect()
             }

@@ -52,7 +52,7 @@ pub(super) fn advice(root: &Path, named: &Path, is_capture: &dyn Fn(&Path) -> bo
     if let Some(video) = first_video(root) {
         return Some(format!(
             "It holds videos, but no camera poses that are known here. Make a capture of them with `splat4d import {} -o TAKE`, \
-             which finds clocks and poses, or reads a calibration that you have (docs/filming.md); or extract frames with `{}` \
+             which finds time offsets and poses, or reads a calibration that you have (docs/filming.md); or extract frames with `{}` \
              and write a capture.json (docs/capture-format.md).",
             in_command(named),
             ffmpeg_command(&video)

@@ -83,7 +83,7 @@ pub fn compress(
     let (stage, codec) = file.unzip();
     stages.extend(stage);
     if stages.is_empty() {
-        return Err(Error::input("nothing is to be done").remedy("Prune, filter or quantise."));
+        return Err(Error::input("no operation is selected").remedy("Prune, filter or quantise."));
     }
     let refined = refine(
         Refine {

@@ -117,7 +117,7 @@ fn pruning(prepared: Prepared, share: f64, filter: bool) -> Hook {
 fn masks(scene: &mut Scene<f32>, prepared: &Prepared, progress: &mut Progress<'_>) -> Result<()> {
     let config = MaskConfig { interval: prepared.settings.mask_interval, antialias: prepared.antialias() };
     key_masks(scene, prepared.frames.as_ref(), &config, &mut |done, total| {
-        progress.phase("looking which are seen", done, total);
+        progress.phase("searching visible Gaussians", done, total);
     })
 }
 

@@ -100,5 +100,5 @@ fn a_target_size_selects_the_gentlest_sufficient_settings() {
     let nothing = Compression { codec: false, ..Compression::default() };
     let stop = AtomicBool::new(false);
     let refused = compress(&bed.job(&nothing), &bed.place.run("no"), &TrainOptions::default(), &stop, &mut |_| {});
-    assert!(refused.unwrap_err().to_string().contains("nothing is to be done"));
+    assert!(refused.unwrap_err().to_string().contains("no operation is selected"));
 }

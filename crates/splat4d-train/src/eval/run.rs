@@ -317,7 +317,7 @@ impl<'a> Judge<'a> {
             for &place in &camera.places {
                 if self.stop.load(Ordering::SeqCst) {
                     return Err(Error::new(ErrorKind::Interrupted, "evaluation was stopped")
-                        .remedy("The same command begins it again."));
+                        .remedy("Run the same command again."));
                 }
                 let Drawn { view, image, truth, sums } = self.view(&file_name(place), frames[place], mean.as_ref())?;
                 colours.push(sums);

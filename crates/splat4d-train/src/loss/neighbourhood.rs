@@ -93,7 +93,7 @@ impl<F: Real> ProbeLoss<F> for Neighbourhood<F> {
 
     fn eval(&self, _scene: &Scene<F>, probes: &[Probe], seen: &[Vec<Table<F>>], d: &mut [Vec<Table<F>>]) -> f64 {
         let graphs = self.graphs.lock().expect("no thread panics while it holds the graphs");
-        assert_eq!(graphs.len(), probes.len(), "eval answers the probes of the same step");
+        assert_eq!(graphs.len(), probes.len(), "`eval` gets the probes of the same step");
         let clip = (self.clip[1] - self.clip[0] + self.frame) / self.frame;
         // From scene units per frame to extents a clip.
         // In the order of time: before, at, after, after that.

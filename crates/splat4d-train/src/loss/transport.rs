@@ -210,13 +210,13 @@ impl<F: Real> ProbeLoss<F> for Transport {
     }
 
     fn eval(&self, _: &Scene<F>, _: &[Probe], seen: &[Vec<Table<F>>], d: &mut [Vec<Table<F>>]) -> f64 {
-        let [a, b, c] = &seen[0][..] else { unreachable!("the loss asked for three times") };
+        let [a, b, c] = &seen[0][..] else { unreachable!("the loss requested three times") };
         if a.rows() == 0 {
             return 0.0;
         }
         let factor = f64::from_bits(self.now.load(Ordering::Relaxed));
         let weight = factor / (self.settings.every.min(1.0) * a.rows() as f64);
-        let [d_a, d_b, d_c] = &mut d[0][..] else { unreachable!("a gradient has its answers' shape") };
+        let [d_a, d_b, d_c] = &mut d[0][..] else { unreachable!("a gradient has its results' shape") };
         par_split([d_a, d_b, d_c].map(Table::view_mut), &|mut views| {
             let mut sum = 0.0;
             for j in views[0].first..views[0].first + views[0].rows {

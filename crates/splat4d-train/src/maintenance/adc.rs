@@ -205,7 +205,7 @@ impl AdcSettings {
 
 /// Makes a row one half of its lifespan: its centre `shift` seconds later, but within the clip, and shorter.
 fn shorten(layer: &mut Layer<f32>, row: usize, shift: f64, [first, last]: [f64; 2]) {
-    let path = layer.motion.polynomial().expect("who was asked how far it goes has a path");
+    let path = layer.motion.polynomial().expect("a model with a reach has a path");
     let center = f64::from(layer.params[LIFE].get(row, CENTER));
     path.recentre(&mut layer.params, row, (center + shift).clamp(first, last) - center);
     layer.params[LIFE].set(row, LOG_WIDTH, (shift.abs() / TIME_SHIFT / SPLIT_SHRINK).ln() as f32);

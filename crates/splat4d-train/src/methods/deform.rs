@@ -138,7 +138,7 @@ fn check(plan: &TrainContext, deform: &DeformSettings) -> Result<()> {
             .remedy("Train it with --motion still"));
     }
     Deform::new(spec(plan, deform), &mut Params::<f32>::new(0, 1, &[])).map(drop).map_err(|e| {
-        Error::input(format!("the network that the recipe asks for cannot be made: {e}"))
+        Error::input(format!("the recipe's network is invalid: {e}"))
             .remedy("Change deform_width, deform_layers, deform_x_levels or deform_t_levels")
     })
 }

@@ -107,7 +107,7 @@ impl Method for FilteredMethod {
         let off_early = filter.until < 1.0;
         if filter.fusion != Fusion::Off && off_early && (filter.until <= filter.start || filter.keep) {
             return Err(crate::Error::input(format!("the filter is taken off at filter.until={}", filter.until))
-                .remedy("Let filter.start be less, and do not ask for filter.keep"));
+                .remedy("Lower filter.start, and leave filter.keep out"));
         }
         self.inner.check(plan)
     }

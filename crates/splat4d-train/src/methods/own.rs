@@ -58,7 +58,7 @@ pub(crate) fn name(name: &str) -> Option<&'static str> {
 /// The program of a model from outside.
 pub(crate) fn program(name: &str) -> Option<Box<dyn Method>> {
     let own = OWN.read().unwrap_or_else(PoisonError::into_inner).get(name).cloned()?;
-    assert!(is_registered(name), "a model that training knows is known to readers");
+    assert!(is_registered(name), "a model registered with training is registered with readers");
     Some(Box::new(OwnMethod(own)))
 }
 

@@ -193,14 +193,14 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
     let followed = json!(trainer.replans_before(progress.iteration));
     if followed != *meta.get("replans").unwrap_or(&json!([])) {
         // No damage: an older checkpoint, from before the first of them, would continue as if nothing were wrong.
-        let what = "the checkpoint followed other changes of plan than `run.replans` in recipe.toml says";
+        let what = "the checkpoint followed other changes of plan than those in `run.replans` of recipe.toml";
         return Err(Error::new(ErrorKind::Unsupported, what)
             .remedy("Put recipe.toml back as the run wrote it, or start a new run with -o"));
     }
     let fits = progress.stage <= trainer.stages.len()
         && trainer.stages.get(progress.stage).is_none_or(|s| progress.stage_step < s.iterations.max(1));
     if !fits {
-        return Err(damaged("it stands beyond the recipe's last step".into()));
+        return Err(damaged("it is beyond the recipe's last step".into()));
     }
     let mut train_state = TrainState::resumed(scene, moments, stats);
     train_state.exposure = trainer.train_state.exposure.take();

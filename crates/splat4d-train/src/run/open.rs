@@ -214,7 +214,7 @@ impl OpenCapture {
 
     /// The recipe with a motion model that suits the capture, and why it is that one.
     pub(super) fn chosen(&self, recipe: Recipe, listen: &mut dyn FnMut(&Event)) -> Result<(Recipe, auto::Choice)> {
-        listen(&Event::Phase { name: "looking at the capture".into(), done: 0, total: 0 });
+        listen(&Event::Phase { name: "examining the capture".into(), done: 0, total: 0 });
         let choice = auto::choose(&self.plan(&recipe), recipe.programs(), self.frames.as_ref())?;
         Ok((recipe.with(|r| r.run.motion = MotionName::of(choice.motion)), choice))
     }

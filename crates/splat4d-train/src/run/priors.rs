@@ -254,7 +254,7 @@ pub(super) fn after(opened: &OpenCapture, scene: &Scene<f32>, recipe: &Recipe) -
         let Some(apart) = apart([&image.depth, &image.alpha], Depth::truth(depth)) else { continue };
         let told = match apart {
             Apart::Ratio(ratio, off) if off > METRIC_OFF => {
-                format!("by {:.0} % (it draws {ratio:.2} times the depth)", 100.0 * off)
+                format!("by {:.0} % (it renders {ratio:.2} times the depth)", 100.0 * off)
             }
             Apart::Correlation(r) if r < CORRELATED => format!("(correlation {r:.2})"),
             _ => continue,

@@ -67,7 +67,7 @@ pub(crate) fn refine(
 ) -> Result<Refined> {
     job.recipe.check()?;
     if job.stages.is_empty() {
-        return Err(Error::input("there is not one stage to run").remedy("Ask for at least one step"));
+        return Err(Error::input("there is no stage to run").remedy("Request at least one step"));
     }
     let total: usize = job.stages.iter().map(|s| s.iterations).sum();
     let begun = !checkpoint::list(run).is_empty();

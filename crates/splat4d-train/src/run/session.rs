@@ -385,7 +385,7 @@ impl Session<'_> {
         let before = info["device"].as_str().unwrap_or(&trainer.device.name);
         let mut why = device.why.clone();
         if before != device.name {
-            why = format!("{why}; before it was {before}, and from here on last bits may be others");
+            why = format!("{why}; before it was {before}, and from here on the last bits may differ");
         } else if self.opened.device == Device::Cpu {
             return;
         }
@@ -481,7 +481,7 @@ impl Session<'_> {
         listen(&match blame {
             Blame::Numbers => Event::RolledBack { iteration: failed, to, what },
             Blame::Device => {
-                let message = format!("{what}: training goes on on the CPU, from its last checkpoint, of step {to}");
+                let message = format!("{what}: training continues on the CPU, from its last checkpoint, of step {to}");
                 Event::Warning { message }
             }
         });

@@ -171,7 +171,7 @@ impl<F: Real> Chain<F> {
     /// By layer the query for its Gaussians at a time of this step.
     fn asked(&self, scene: &Scene<F>, t: Time) -> Vec<usize> {
         let question =
-            |layer| self.evaluation.find(layer, Space::Gaussians, t).expect("every time of a step was asked");
+            |layer| self.evaluation.find(layer, Space::Gaussians, t).expect("every time of a step was queried");
         (0..scene.layers.len()).map(question).collect()
     }
 
@@ -223,14 +223,14 @@ impl<F: Real> Chain<F> {
             let mut tables = Vec::new();
             let mut place = Vec::new();
             for &t in &probe.times {
-                let i = self.evaluation.find(probe.layer, probe.of, t).expect("every probe's time was asked");
+                let i = self.evaluation.find(probe.layer, probe.of, t).expect("every probe's time was queried");
                 let tape = self.evaluation.tape(i);
                 let index: Vec<u32> = match (tape.rows(), &probe.rows) {
                     (_, None) => (0..tape.out().rows() as u32).collect(),
                     (Rows::All, Some(rows)) => rows.clone(),
                     (Rows::Some(ids), Some(rows)) => rows
                         .iter()
-                        .map(|r| ids.binary_search(r).expect("the asked rows hold the probe's rows") as u32)
+                        .map(|r| ids.binary_search(r).expect("the requested rows contain the probe's rows") as u32)
                         .collect(),
                 };
                 tables.push(tape.out().gather(&index));

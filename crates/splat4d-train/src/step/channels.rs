@@ -95,11 +95,11 @@ impl<F: Real> Channels<F> {
     }
 
     fn flow(&mut self, column: usize, channel: &Channel, source: Source<'_, F>, evaluation: &Evaluation<F>) {
-        let truth = channel.way(source.view).expect("only views that know their flow ask for it");
+        let truth = channel.way(source.view).expect("only views with flow request it");
         let (mut first, mut all) = (0, Vec::new());
         for (layer, &i) in source.asked.iter().enumerate() {
             let now = evaluation.tape(i);
-            let question = evaluation.find(layer, Space::Gaussians, truth.to).expect("a flow's time was asked");
+            let question = evaluation.find(layer, Space::Gaussians, truth.to).expect("a flow's time was queried");
             let then = evaluation.tape(question);
             let row = |id: usize| match then.rows() {
                 Rows::All => Some(id),
@@ -128,7 +128,7 @@ impl<F: Real> Channels<F> {
         source: Source<'_, F>,
         evaluation: &mut Evaluation<F>,
     ) {
-        let truth = channel.way(source.view).expect("only views that know their flow ask for it");
+        let truth = channel.way(source.view).expect("only views with flow request it");
         let (_, all) = self.later.iter().find(|(c, _)| c == channel).expect("what is backpropagated was rendered");
         let mut first = 0;
         for (&i, later) in source.asked.iter().zip(all) {

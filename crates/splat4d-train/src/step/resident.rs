@@ -334,7 +334,7 @@ impl Engine for DeviceEngine<'_> {
                     self.report(&error.cause(), &mut notices);
                 } else {
                     self.cpu.leave_device();
-                    notices.push(format!("training goes on on the CPU: {}", error.cause()));
+                    notices.push(format!("training continues on the CPU: {}", error.cause()));
                 }
                 return self.step_on_cpu(train_state, plan, notices);
             }

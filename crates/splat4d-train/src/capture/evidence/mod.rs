@@ -231,7 +231,7 @@ impl Capture {
         );
         let (written_as, remedy) = match self.poses == Poses::STATED {
             true => (Some(poses), format!("Read them so: --poses {poses}.")),
-            false => (None, format!("They are read as --poses {} says: leave it out, or give another.", self.poses)),
+            false => (None, format!("They are read by --poses {}: leave it out, or give another.", self.poses)),
         };
         PoseCheck {
             written_as,
@@ -262,7 +262,7 @@ fn check_masks(looks: &[SmallImage], poses: &[Se3]) -> Option<Finding> {
             Severity::Warning,
             Aspect::Assumed,
             format!(
-                "Masks are probably inverted (white counts): what they hide is at one place, which the cameras look at, in {:.0} % of \
+                "Masks are probably inverted (white counts): what they hide is at one place, which the cameras point at, in {:.0} % of \
                  the images; they show {:.0} % of the images and {:.0} % of their edges.",
                 percent(part),
                 percent(share),

@@ -16,7 +16,7 @@ impl<F: Real> ImageTerm<F> for DepthNormal {
     }
 
     fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
-        let (first, normals) = shown.channel(&Channel::Normals).expect("normals are drawn where they are needed");
+        let (first, normals) = shown.channel(&Channel::Normals).expect("normals are rendered where they are needed");
         let mut d_normals = Planes::new(3, normals.height, normals.width);
         let pictures = [shown.depth, shown.alpha, &normals];
         let value = depth_normal(view.camera, pictures, self.0, [d.depth.add(), d.alpha.add(), &mut d_normals]);

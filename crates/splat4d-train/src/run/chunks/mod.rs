@@ -76,7 +76,7 @@ impl std::fmt::Display for Part {
 }
 
 /// The right to write what workers share; given back when it is dropped.
-pub struct Turn(#[expect(dead_code, reason = "it is held, not looked at")] Owner);
+pub struct Turn(#[expect(dead_code, reason = "it is held, not read")] Owner);
 
 /// A run of a long capture.
 pub struct Chunked {
@@ -153,7 +153,7 @@ impl Chunked {
         let recipe = Recipe::from_toml(&read_text(&file)?).map_err(|e| e.at(file.display()))?;
         let print = identity::recipe_print(&recipe, "");
         if print != plan.recipe {
-            return Err(Error::input("the recipe is another than the one that its chunks were planned for")
+            return Err(Error::input("the recipe differs from the one that its chunks were planned for")
                 .at(file.display())
                 .remedy("Put it back as the run wrote it, or train into another folder"));
         }
@@ -269,7 +269,7 @@ impl Chunked {
                     ErrorKind::Interrupted,
                     "stopped while another worker writes the playback file",
                 )
-                .remedy("The same command goes on"));
+                .remedy("Run the same command again to continue"));
             }
             std::thread::sleep(TURNS);
         }
@@ -315,7 +315,7 @@ impl Chunked {
             }
             if stop.load(Ordering::Relaxed) {
                 return Err(Error::new(ErrorKind::Interrupted, "stopped while other workers train")
-                    .remedy("The same command goes on"));
+                    .remedy("Run the same command again to continue"));
             }
             if !busy {
                 listen(&Event::Phase { name: "waiting for other workers".into(), done: 0, total: 0 });
@@ -417,7 +417,7 @@ fn check(recipe: &Recipe) -> Result<()> {
     } else if learnt.poses || learnt.focal || learnt.times {
         ("cameras that are refined", "Refine them on a part of the capture first (--set max_frames=60)")
     } else if recipe.capture.observe < 1.0 {
-        ("a future that is not looked at (--observe)", "Leave --observe away")
+        ("an unobserved future (--observe)", "Leave --observe away")
     } else {
         return Ok(());
     };

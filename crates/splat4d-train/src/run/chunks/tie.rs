@@ -61,7 +61,7 @@ impl ImageTerm for Tie {
         scene.at(view.t, &mut self.seen);
         let splats = scene.splats(&self.seen);
         let shot = Shot::new(&splats, view.camera, view.background);
-        self.backend.render(&shot, &mut self.image).expect("the processor draws whatever a scene holds");
+        self.backend.render(&shot, &mut self.image).expect("the CPU renders every scene");
         if let Some(exposure) = &self.exposure {
             exposure.respond(view.rig, &mut self.image.color);
         }

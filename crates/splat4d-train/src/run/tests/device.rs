@@ -56,7 +56,7 @@ fn a_gpu_that_is_lost_costs_a_run_one_line_and_no_step() {
         };
         let outcome = place.train_with(name, &recipe, draw, &AtomicBool::new(false), &mut listen).unwrap();
         assert!(!outcome.interrupted && outcome.iteration == STEPS);
-        let line = "the GPU that kept the tables failed (the driver is gone): training goes on on the CPU, from its last \
+        let line = "the GPU that kept the tables failed (the driver is gone): training continues on the CPU, from its last \
                     checkpoint, of step 10";
         assert!(warnings == [line] && rolled == 0, "{name}: {warnings:?}");
         let info: Value = serde_json::from_str(&read_text(&place.run(name).join("run.json")).unwrap()).unwrap();

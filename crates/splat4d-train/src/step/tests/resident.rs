@@ -292,7 +292,7 @@ fn a_failing_device_loses_only_steps_since_the_last_settle() {
         if left[1] == 0 {
             // The learner had everything: the CPU has taken the same step, and all that follow.
             notices.extend(finish(&mut trainer, "on the CPU").1);
-            assert_eq!(notices, [format!("training goes on on the CPU: {GONE}")]);
+            assert_eq!(notices, [format!("training continues on the CPU: {GONE}")]);
             assert!(bytes(trainer.scene()) == expected);
             continue;
         }
