@@ -85,7 +85,7 @@ pub fn extract(root: &Path, progress: &mut Progress<'_>, stop: &dyn Fn() -> bool
     let pictures = write::pictures(root, &clips, Format::default(), progress, stop).map_err(|e| match e.kind() {
         ErrorKind::Interrupted => e,
         _ => e.remedy(
-            "Frames are stored in the folder `images` of the capture: copy it to a disk with room where you may write.",
+            "Frames are stored in the folder `images` of the capture: copy it to a disk with space where you may write.",
         ),
     })?;
     let mut warnings: Vec<String> = Vec::new();

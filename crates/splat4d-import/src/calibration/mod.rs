@@ -158,7 +158,7 @@ pub fn read(path: &Path) -> Result<Calibration> {
         return Err(Error::new(ErrorKind::Unsupported, format!("no calibration of cameras is found ({why:.600})"))
             .at(path.display())
             .remedy(format!(
-                "Known are: a COLMAP reconstruction, {}; see docs/filming.md.",
+                "Supported are: a COLMAP reconstruction, {}; see docs/filming.md.",
                 DIALECTS.map(|d| d.name).join(", ")
             )));
     }

@@ -103,7 +103,7 @@ pub(super) fn alone(capture: &Capture, camera: usize, s: &CameraObservations, re
                 who,
                 (soft as f64, "frames"),
                 what,
-                ("Softness that comes and goes.", "Shorter exposure, fixed focus; leave these images out."),
+                ("Sharpness that varies.", "Shorter exposure, fixed focus; leave these images out."),
             );
         }
     }

@@ -125,7 +125,7 @@ fn take(capture: &Capture, seen: &[CameraObservations], report: &mut Report) {
             others.map(|(_, o)| angle_at(target, view.center(), o.center()).to_degrees()).fold(f64::MAX, f64::min);
         if let Some(g) = grade(nearest, ANGLE) {
             let name = &capture.cameras[fixed[k]].name;
-            let what = format!("Camera {name} stands {nearest:.0}° from its nearest neighbour.");
+            let what = format!("Camera {name} is {nearest:.0}° from its nearest neighbour.");
             FindingList { report }.add(
                 (g.min(Grade::Warning), "angle"),
                 Some(name),
@@ -154,7 +154,7 @@ pub(super) fn volume_of(seen: &[&CameraObservations], target: [f64; 3], report: 
     if let Some(g) = grade(1.0 / share.max(f64::MIN_POSITIVE), VOLUME.map(|v| 1.0 / v)) {
         let what = format!("Three cameras see {:.0} % of the space in which something moves.", 100.0 * share);
         let words =
-            ("Moving things that dissolve between the views.", "Turn the cameras to the action, or film with more.");
+            ("Moving objects dissolve between the views.", "Turn the cameras to the action, or film with more.");
         FindingList { report }.add((g, "volume"), None, (100.0 * share, "%"), what, words);
     }
 }

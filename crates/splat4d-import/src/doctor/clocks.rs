@@ -105,7 +105,7 @@ pub(super) fn clocks(capture: &Capture, seen: &[CameraObservations], report: &mu
                 Some(name),
                 (1e3 * off, "ms"),
                 what,
-                ("Moving things blurred or doubled.", &remedy),
+                ("Moving objects are blurred or doubled.", &remedy),
             );
         }
     }

@@ -208,7 +208,7 @@ pub fn examine(capture: &Capture, options: &Options, progress: &mut Progress<'_>
     }
     let mut seen = Vec::new();
     for camera in 0..capture.cameras.len() {
-        progress.phase("looking at cameras", camera, capture.cameras.len());
+        progress.phase("examining cameras", camera, capture.cameras.len());
         seen.push(look::camera(capture, &store, camera, options)?);
     }
     check::all(capture, &seen, options, &mut report, progress);

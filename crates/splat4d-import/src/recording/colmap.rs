@@ -165,7 +165,7 @@ fn run(step: &Step, help: &str, work: &Path, masks: bool, stop: &dyn Fn() -> boo
             drop(child.kill());
             drop(child.wait());
             return Err(Error::new(ErrorKind::Interrupted, "stopped while COLMAP was at work")
-                .remedy("The same command goes on from there."));
+                .remedy("Run the same command again to continue."));
         }
         std::thread::sleep(LOOK);
     };

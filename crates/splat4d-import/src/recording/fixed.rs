@@ -36,7 +36,7 @@ pub(crate) fn is_fixed(
         images.push(Grey::of(&frame.picture));
         progress.phase("checking that the camera moves", images.len(), EXAMINED);
         if stop() {
-            return Err(Error::new(ErrorKind::Interrupted, "stopped").remedy("The same command goes on from there."));
+            return Err(Error::new(ErrorKind::Interrupted, "stopped").remedy("Run the same command again to continue."));
         }
     }
     Ok(stays(&images))

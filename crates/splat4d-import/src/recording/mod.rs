@@ -187,7 +187,7 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
     corrections.write(folder)?;
     if request.colmap && (moving || request.calibration.is_some()) {
         let why = if moving { "cameras move" } else { "a calibration is given" };
-        return Err(Error::input(format!("COLMAP is asked for poses, but {why}")).remedy(
+        return Err(Error::input(format!("COLMAP poses were requested, but {why}")).remedy(
             "Leave --colmap out. A COLMAP reconstruction of a moving camera's frames is a capture as it is: splat4d train FOLDER.",
         ));
     }
@@ -208,7 +208,7 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
         .zip(selections)
         .map(|(c, selection)| Clip { name: c.name.clone(), source: &*c.source, selection })
         .collect();
-    let stopped = || Error::new(ErrorKind::Interrupted, "stopped").remedy("The same command goes on from there.");
+    let stopped = || Error::new(ErrorKind::Interrupted, "stopped").remedy("Run the same command again to continue.");
     // A terminal's Ctrl-C ends ffmpeg too, whose video then seems to be damaged.
     let mut pictures = write::pictures(folder, &clips, request.format, progress, stop)
         .map_err(|e| if stop() && e.kind() != ErrorKind::Interrupted { stopped() } else { e })?;
@@ -416,12 +416,12 @@ fn crop(
     let Some(cropping) = request.crop else { return Ok(()) };
     for (k, (camera, selection)) in cameras.iter().zip(selections).enumerate() {
         if stop() {
-            return Err(Error::new(ErrorKind::Interrupted, "stopped").remedy("The same command goes on from there."));
+            return Err(Error::new(ErrorKind::Interrupted, "stopped").remedy("Run the same command again to continue."));
         }
         selection.crop = match cropping {
             Cropping::At(crop) => Some(crop),
             Cropping::Auto => {
-                progress.phase("looking for black bars", k, cameras.len());
+                progress.phase("searching for black bars", k, cameras.len());
                 let found = video::without_bars(&*camera.source, selection);
                 found.map_err(|e| e.at(format!("camera {}", camera.name)))?
             }

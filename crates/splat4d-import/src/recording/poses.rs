@@ -189,7 +189,7 @@ pub(super) fn standing(
         }
         let moved = refined(&solution, &mut current, &mut offsets, told, frame);
         if stop() {
-            return Err(Error::new(ErrorKind::Interrupted, "stopped").remedy("The same command goes on from there."));
+            return Err(Error::new(ErrorKind::Interrupted, "stopped").remedy("Run the same command again to continue."));
         }
         if moved < RESTED * frame || round == ROUNDS {
             break;

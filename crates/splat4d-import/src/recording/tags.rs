@@ -84,7 +84,7 @@ pub(super) fn measured(
     let mut seen: Vec<(usize, TagView)> = Vec::new();
     const AT_ONCE: usize = 8;
     for (k, some) in looks.chunks(AT_ONCE).enumerate() {
-        progress.phase("looking for tags", k * AT_ONCE, looks.len());
+        progress.phase("searching for tags", k * AT_ONCE, looks.len());
         let found: Vec<Vec<(usize, TagView)>> =
             some.par_iter().map(|look| look.tags(board, &clock, solved)).collect::<Result<_>>()?;
         seen.extend(found.into_iter().flatten());

@@ -50,7 +50,7 @@ pub(super) fn settle(
         let at = mat_vec(&turned.rotation, origin);
         solved.place(&Sim3 { translation: at.map(|v| -v), ..Sim3::default() });
         let stands = if request.board.is_some_and(|b| b.lies == Some(Lies::Floor)) { "lies" } else { "hangs" };
-        report.guesses.push(format!("Upwards (+z) and the origin are the board's, as it {stands}."));
+        report.guesses.push(format!("The up direction (+z) and the origin are the board's, which {stands}."));
     } else if let Origin::Calibrated { .. } = origin {
         match along_axis(solved.up) {
             Some((axis, name)) => {
@@ -76,7 +76,7 @@ pub(super) fn settle(
         let by = metres / height(solved, stored, name)?;
         solved.place(&Sim3 { scale: by, ..Sim3::default() });
         report.guesses.push(format!(
-            "The unit of length is the metre: {name} stands {metres} m above the floor among the points. Tags or the \
+            "The unit of length is the metre: {name} is {metres} m above the floor among the points. Tags or the \
              distance of two cameras are more accurate."
         ));
     }

@@ -481,7 +481,7 @@ fn moved(bundle: &Bundle, cameras: &[f64], points: &[[f64; 3]], held: &[bool]) -
 /// The first view's pose stays, and one number of another's translation: they fix place, direction and size of the
 /// world.
 pub(crate) fn adjust(bundle: &mut Bundle, settings: &Settings) -> Report {
-    assert!(bundle.sightings.is_sorted_by_key(|s| s.point), "sightings come in the order of their points");
+    assert!(bundle.sightings.is_sorted_by_key(|s| s.point), "sightings are ordered by their points");
     assert_eq!(settings.priors.lenses.len(), bundle.lenses.len(), "every lens has its prior");
     /// Marquardt's λ: where it starts, how it grows and shrinks, and where nothing helps any more.
     const START: f64 = 1e-4;

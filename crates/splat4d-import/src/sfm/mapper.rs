@@ -276,7 +276,7 @@ impl Map<'_> {
     /// How far from there a place is seen, of the tolerance.
     fn off(&self, track: usize, k: usize, x: [f64; 3]) -> f64 {
         let sight = self.tracks[track].seen[k].0;
-        let pose = self.poses[sight].as_ref().expect("only placed sights are asked");
+        let pose = self.poses[sight].as_ref().expect("only placed sights are queried");
         off(self.lens(sight), pose, x, self.pixel(track, k)) / self.tolerance(sight)
     }
 
@@ -286,7 +286,7 @@ impl Map<'_> {
     }
 
     fn center(&self, sight: usize) -> [f64; 3] {
-        self.poses[sight].as_ref().expect("only placed sights are asked").inverse().translation
+        self.poses[sight].as_ref().expect("only placed sights are queried").inverse().translation
     }
 
     /// The largest angle between the rays of these sights of a track at a point, degrees.

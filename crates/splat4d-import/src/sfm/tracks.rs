@@ -78,7 +78,7 @@ struct Rows {
 
 fn rows(features: &[Feature]) -> Vec<Rows> {
     let last = features.iter().map(|f| f.moment).max().unwrap_or(0);
-    assert!(features.is_sorted_by_key(|f| f.moment), "features come in the order of moments");
+    assert!(features.is_sorted_by_key(|f| f.moment), "features are ordered by time");
     let of = |m: usize| {
         let from = features.partition_point(|f| f.moment < m);
         let to = features.partition_point(|f| f.moment <= m);

@@ -60,7 +60,7 @@ impl Selection {
     pub(crate) fn check(&self) -> Result<()> {
         let bad = |what: String, remedy: &str| Err(Error::input(what).remedy(remedy));
         if self.every == 0 {
-            return bad("every 0th frame is asked for".into(), "Take every frame (1), every second (2) and so on.");
+            return bad("every 0th frame was requested".into(), "Take every frame (1), every second (2) and so on.");
         }
         if self.size.is_some_and(|s| s < MIN_SIDE) {
             return bad(format!("images of less than {MIN_SIDE} pixels are requested"), "Take 1080, for example.");
@@ -76,7 +76,7 @@ impl Selection {
         if let (Some(from), Some(to)) = (self.from, self.to)
             && from >= to
         {
-            return bad(format!("the part from {from} s to {to} s is empty"), "Let the end come after the beginning.");
+            return bad(format!("the part from {from} s to {to} s is empty"), "Give an end after the beginning.");
         }
         Ok(())
     }

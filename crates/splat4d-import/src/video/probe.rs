@@ -118,7 +118,7 @@ pub(super) fn parse(json: &str, name: String) -> Result<Probe> {
     let text = |key: &str| film[key].as_str().unwrap_or("");
     let codec = text("codec_name").to_owned();
     if codec.is_empty() || codec == "unknown" || codec == "none" {
-        let what = format!("ffmpeg does not know its codec ({})", text("codec_tag_string"));
+        let what = format!("ffmpeg does not support its codec ({})", text("codec_tag_string"));
         return Err(Error::new(ErrorKind::Unsupported, what)
             .remedy("Convert it with the camera maker's program to H.264 in mp4."));
     }

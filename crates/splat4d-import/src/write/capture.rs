@@ -129,7 +129,7 @@ fn camera(camera: &Placed) -> Result<Value> {
         Poses::Moving(all) => (0..all.len()).filter(|&k| all[k].is_some()).collect(),
     };
     if known.is_empty() {
-        return Err(place(Error::input("no place of it is known").remedy("Leave the camera out.")));
+        return Err(place(Error::input("it has no known position").remedy("Leave the camera out.")));
     }
     let times: Vec<f64> = known.iter().map(|&k| tick(pictures.shots[k].time * (1.0 + offset.rate))).collect();
     let images = if known.len() == pictures.shots.len() {

@@ -49,7 +49,7 @@ pub(crate) fn masks(
         progress.phase("masks", k, pictures.len());
         if stop() {
             return Err(Error::new(ErrorKind::Interrupted, "stopped while masks were stored")
-                .remedy("The same command goes on from there."));
+                .remedy("Run the same command again to continue."));
         }
         out.push(camera(folder, from, p, *begin).map_err(|e| e.at(format!("camera {}", p.name)))?);
     }

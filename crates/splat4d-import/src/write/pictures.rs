@@ -262,7 +262,7 @@ fn camera(folder: &Path, clip: &Clip<'_>, format: Format, stop: &dyn Fn() -> boo
         }
         if stop() {
             return Err(Error::new(ErrorKind::Interrupted, "stopped while frames were stored")
-                .remedy("The same command goes on from there."));
+                .remedy("Run the same command again to continue."));
         }
     }
     let clock = Clock::of(reader.times(), &differences);
