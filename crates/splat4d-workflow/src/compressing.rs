@@ -356,7 +356,7 @@ impl Work {
 
     /// What is reported where a Ctrl-C ends it.
     fn kept(&self) -> String {
-        format!("what was tuned is kept: splat4d compress --resume {} continues", in_command(&self.dir))
+        format!("finished work is kept: splat4d compress --resume {} continues", in_command(&self.dir))
     }
 
     /// Scores before and after, measured together.
@@ -429,7 +429,7 @@ impl Work {
         };
         let folder = self.dir.join(UNPRUNED);
         files::make_folder(&folder)?;
-        console.say("training the unpruned scene on for as many steps, to compare");
+        console.say("training the unpruned scene for as many more steps, to compare");
         let job = original.job(&settings);
         let options = TrainOptions { device: self.device, ..TrainOptions::default() };
         let done = compress::compress(&job, &folder, &options, stop, &mut |event| {
@@ -467,7 +467,7 @@ impl Work {
             &mut |done, total| console.phase("searching for the size", done, total),
         )?;
         console.clear();
-        let last = trials.iter().rev().find(|t| t.prune == chosen.prune).expect("what was chosen was tried");
+        let last = trials.iter().rev().find(|t| t.prune == chosen.prune).expect("the chosen one was tried");
         console.say(&format!(
             "to fit into {}, {:.0} % of the Gaussians are pruned ({} before fine-tuning)",
             files::human_bytes(most),

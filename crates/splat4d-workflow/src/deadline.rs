@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 /// An error where `stop` was raised.
 pub(crate) fn unless_stopped(stop: &AtomicBool) -> Result<()> {
     if stop.load(Ordering::SeqCst) {
-        return Err(Error::new(ErrorKind::Interrupted, "stopped").remedy("The same command begins again."));
+        return Err(Error::new(ErrorKind::Interrupted, "stopped").remedy("Run the same command again."));
     }
     Ok(())
 }

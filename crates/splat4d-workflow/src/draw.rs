@@ -287,9 +287,9 @@ impl<'a> Painter<'a> {
             }
             Channel::Velocity => flow::velocity_columns(scene, &self.instant),
             Channel::Normal => channels::normal_columns(&self.instant, camera),
-            Channel::Label => channels::label_columns(scene, &self.instant).expect("a scene with labels was asked for"),
+            Channel::Label => channels::label_columns(scene, &self.instant).expect("a scene with labels was requested"),
             Channel::Feature => {
-                channels::feature_columns(scene, &self.instant).expect("a scene with features was asked for")
+                channels::feature_columns(scene, &self.instant).expect("a scene with features was requested")
             }
             _ => channels::number_columns(&self.instant, &self.numbers),
         };

@@ -157,7 +157,7 @@ pub fn in_turns(
     measured_views: &[MeasuredView],
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Vec<Side>> {
-    assert!(!measured_views.is_empty(), "a measurement needs something to look at");
+    assert!(!measured_views.is_empty(), "a measurement needs at least one view");
     let mut seats = subjects.iter().map(|s| Seat::new(s, measured_views.len())).collect::<Result<Vec<_>>>()?;
     let total = DECODES + ROUNDS + 1;
     for round in 0..DECODES {

@@ -28,8 +28,8 @@ enum Column {
 }
 
 fn remedy() -> String {
-    "The first line names the columns: camera,x,y,time for pixels, or time,x,y,z for points, with camera where its \
-     visibility is wanted."
+    "The first line names the columns: camera,x,y,time for pixels, or time,x,y,z for points, \
+     with camera where its visibility is needed."
         .into()
 }
 

@@ -359,7 +359,7 @@ impl Work {
         let asked = |f: &&Forecast| self.order.models.contains(&f.model);
         let error = |f: &Forecast| f.backtest.unwrap_or(f64::INFINITY);
         let all = forecasts.iter().filter(asked);
-        all.min_by(|a, b| error(a).total_cmp(&error(b))).expect("one model was asked for at least")
+        all.min_by(|a, b| error(a).total_cmp(&error(b))).expect("at least one model was requested")
     }
 }
 

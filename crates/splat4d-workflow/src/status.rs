@@ -179,7 +179,7 @@ impl PartStatus {
     }
 
     fn failure(&self) -> String {
-        format!("{} stopped at step {}, and no worker has it", self.name(), grouped(self.iteration.unwrap_or(0)))
+        format!("{} stopped at step {}, and no worker is training it", self.name(), grouped(self.iteration.unwrap_or(0)))
     }
 
     fn text(&self) -> String {
@@ -189,7 +189,7 @@ impl PartStatus {
             State::Done => "done".to_owned(),
             State::Training => format!("{step}, {}", self.worker.as_deref().unwrap_or_default()),
             State::Waiting => format!("waits for {}", self.waits_for.join(", ")),
-            State::Stopped => format!("stopped at {step}: no worker has it"),
+            State::Stopped => format!("stopped at {step}: no worker is training it"),
             State::Open => "not begun".to_owned(),
         };
         if let Some([from, to]) = self.frames {
