@@ -108,7 +108,7 @@ impl Fitted {
             Model::Velocity => Self::Ballistic(None),
             Model::Acceleration => Self::Ballistic(Some(DAMPING)),
             Model::Extrapolate => {
-                return Err(Error::input("forecasts of a motion model come from the scene, not from nodes")
+                return Err(Error::input("forecasts of a motion model are evaluated on the scene, not on nodes")
                     .remedy("Follow the nodes through the scene"));
             }
             Model::Koopman => Self::Koopman(Box::new(Linear(Koopman::fit(paths)))),
