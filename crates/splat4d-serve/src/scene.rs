@@ -145,7 +145,7 @@ impl Version {
     pub(crate) fn body(&self, start: u64, end: u64) -> Body {
         match &self.source {
             Source::Bytes(bytes) => {
-                let [start, end] = [start, end].map(|i| usize::try_from(i).expect("it lies within memory"));
+                let [start, end] = [start, end].map(|i| usize::try_from(i).expect("it is in memory"));
                 Body::Bytes(bytes.slice(start..end))
             }
             Source::File(file) => {
