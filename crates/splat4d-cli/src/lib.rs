@@ -220,7 +220,7 @@ fn threads(count: Option<u16>) -> anyhow::Result<()> {
         rayon::ThreadPoolBuilder::new()
             .num_threads(count.into())
             .build_global()
-            .map_err(|e| anyhow::anyhow!("{count} threads could not be started ({e}). Ask for fewer."))?;
+            .map_err(|e| anyhow::anyhow!("{count} threads could not be started ({e}). Request fewer."))?;
     }
     Ok(())
 }

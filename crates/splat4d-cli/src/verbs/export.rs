@@ -98,7 +98,7 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
-    let path = args.source.as_ref().or(args.model.as_ref()).expect("clap asks for a source");
+    let path = args.source.as_ref().or(args.model.as_ref()).expect("clap requires a source");
     for (name, value) in [("--time", args.time), ("--fps", args.fps), ("--from", args.from), ("--to", args.to)] {
         if value.is_some_and(|v| !v.is_finite() || (name == "--fps" && !(0.01..=1000.0).contains(&v))) {
             return Err(Error::input(format!("{name} is out of range"))
@@ -123,7 +123,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
                 .remedy("First write a file with that label only: splat4d edit RUN --crop 'label(NAME)' -o part.s4d.")
                 .into());
         }
-        let out = args.output.as_ref().expect("clap asks for an output");
+        let out = args.output.as_ref().expect("clap requires an output");
         return Ok(exporting::page(path, out, args.link.as_deref(), console)?);
     }
     if args.link.is_some() {
@@ -146,7 +146,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         exporting::frames(path, &source, folder, &frames, [args.world, args.force], console)?;
         return Ok(());
     }
-    let out = args.output.as_ref().expect("clap asks for an output");
+    let out = args.output.as_ref().expect("clap requires an output");
     if out.extension().is_none_or(|e| !e.eq_ignore_ascii_case("ply")) && !out.starts_with("/dev") {
         return Err(Error::input("a time of the scene is written as .ply, and a page as .html")
             .at(out.display())

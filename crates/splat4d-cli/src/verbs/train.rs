@@ -193,7 +193,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
             training::resume(run, &options, &stop, &watched)?
         }
         None => {
-            let source = args.capture.as_ref().or(args.source.as_ref()).expect("clap asks for a capture");
+            let source = args.capture.as_ref().or(args.source.as_ref()).expect("clap requires a capture");
             let recipe = recipe(args)?;
             let typed = args.set.iter().filter_map(|a| Some(a.split_once('=')?.0));
             recipe.refuse_unused(typed).map_err(|e| e.at("--set"))?;
