@@ -171,7 +171,7 @@ impl Filmed<'_, '_> {
 fn items<'py>(value: &Bound<'py, PyAny>, what: &str) -> PyResult<Vec<Bound<'py, PyAny>>> {
     let all = value.try_iter().and_then(|all| all.collect::<PyResult<Vec<_>>>());
     all.map_err(|e| {
-        bad_input(format!("{what} cannot be gone through ({e})"), "Give a list, or an array with one axis more")
+        bad_input(format!("{what} cannot be iterated ({e})"), "Give a list, or an array with one axis more")
     })
 }
 

@@ -105,7 +105,7 @@ impl Gaussians {
     #[getter]
     fn sh(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
         let made = self.sh.get_or_try_init(py, || {
-            let (source, seen) = self.seen.as_ref().expect("who was given colours has them");
+            let (source, seen) = self.seen.as_ref().expect("colours that were given are stored");
             let (sh, k) = py.detach(|| layers::Gaussians::sh(&source.scene, seen));
             shaped(py, sh, &[self.count, k, 3])
         })?;

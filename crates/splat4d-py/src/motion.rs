@@ -192,7 +192,7 @@ impl PyMotion {
     fn request(&self, py: Python<'_>, q: &At<'_>) -> PyResult<Answer> {
         let n = q.len();
         let answer = self.hook.object.bind(py).call_method1("forward", (self.arguments(py, q)?, q.t.0))?;
-        let wrong = || bad_input("the motion's forward did not return six things", "Return a splat4d.Motion's forward");
+        let wrong = || bad_input("the motion's forward did not return six arrays", "Return a splat4d.Motion's forward");
         let answer: [Bound<'_, PyAny>; 6] = answer.extract().map_err(|_| wrong())?;
         let [means, quats, scales, opacities, colors, tape] = &answer;
         let read = |value: &Bound<'_, PyAny>, what: &str, width: usize| -> PyResult<Vec<f32>> {

@@ -200,6 +200,6 @@ impl Listener {
 
 /// Adds the run's folder to an exception, if Python supports notes (3.11).
 fn note(py: Python<'_>, error: &PyErr, run: &Path) {
-    let text = format!("The run is saved in {0}; go on with splat4d.resume({0:?})", run.display());
+    let text = format!("The run is saved in {0}; continue with splat4d.resume({0:?})", run.display());
     let _ = error.value(py).call_method1("add_note", (text,));
 }
