@@ -173,7 +173,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         let Some(found) = judge(order, &capture, &truths, &folder, &stop, console)? else {
             return Err(Error::new(ErrorKind::Interrupted, "the study is unfinished; finished runs are kept")
                 .at(args.output.display())
-                .remedy("The same command goes on with it.")
+                .remedy("Run the same command again to continue.")
                 .into());
         };
         console.emit(&json!({"type": "cell", "cell": found}));

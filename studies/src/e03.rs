@@ -45,7 +45,7 @@ Every cell prunes a share of the run's Gaussians and measures what is left \
 32-bit floats: shares from 0 to 95 %, the temporal \
                         filter, fine-tuning, the scores of 4DGS-1K, frames between key times,
 rounds. What was found \
-                        is in DIR/e03.json (after every cell: the same command goes on where it was stopped), \
+                        is in DIR/e03.json (after every cell: the same command continues), \
                         DIR/e03.md and
 DIR/e03-*.svg. With --json every cell is a line.";
 
@@ -101,7 +101,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         if !all {
             return Err(Error::new(ErrorKind::Interrupted, "the study is unfinished; finished cells are kept")
                 .at(args.output.display())
-                .remedy("The same command goes on with it.")
+                .remedy("Run the same command again to continue.")
                 .into());
         }
         let _ = std::fs::remove_dir_all(&work);

@@ -106,7 +106,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         if stop.load(Ordering::SeqCst) {
             return Err(Error::new(ErrorKind::Interrupted, "the comparison is unfinished; finished cells are kept")
                 .at(args.output.display())
-                .remedy("The same command goes on with it.")
+                .remedy("Run the same command again to continue.")
                 .into());
         }
         let cell = match refused {

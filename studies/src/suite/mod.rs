@@ -43,7 +43,7 @@ Examples:
   studies suite --data sets -o runs/mcmc --set strategy=mcmc
 
 Steps are fixed (studies/suite.toml), so that results of machines with more or less to do compare. What was found is in
-DIR/results.json (after every capture: the same command goes on where it was stopped) and DIR/suite.md, runs are in
+DIR/results.json (after every capture: the same command continues) and DIR/suite.md, runs are in
 DIR/runs. A cell is measured again when the program, its recipe or its capture's place has changed.";
 
 /// Train the recipe on a list of captures, each in so many steps, and compare
@@ -258,7 +258,7 @@ fn measure(order: &Order<'_>, args: &Args, stop: &AtomicBool, console: &Console)
     let interrupted = |e: &Error| e.kind() == ErrorKind::Interrupted;
     let mut found = match found {
         Err(error) if !interrupted(&error) => return Ok(FolderContent { refused: Some(error.to_string()), ..blank }),
-        found => found.map_err(|e| e.at(args.output.display()).remedy("The same command goes on with it."))?,
+        found => found.map_err(|e| e.at(args.output.display()).remedy("Run the same command again to continue."))?,
     };
     if args.playback || args.tier == Tier::Full {
         evaluating::playback(&run, console)?;
