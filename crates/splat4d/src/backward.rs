@@ -21,8 +21,8 @@ pub fn sh_grads<'a, F: Real>(splats: &Splats<'_, F>, d: &'a mut [Grads<F>]) -> V
 
 impl<F: Real> RenderGrads<F> {
     /// Adds the gradients to the splats to the results of `evaluation` at the time `t`, and those to the weights of the
-    /// head to `d`, one per layer. [`Evaluation::backward`] passes them to the tables. `parts` may be
-    /// exchanged for other tables, whose numbers mean nothing.
+    /// head to `d`, one per layer. [`Evaluation::backward`] passes them to the tables. `parts` may be exchanged for
+    /// other tables, whose numbers mean nothing.
     ///
     /// Panics: `evaluation` holds no result for every layer's Gaussians at `t`.
     pub fn add_to(&mut self, scene: &Scene<F>, t: Time, evaluation: &mut Evaluation<F>, d: &mut [Grads<F>]) {

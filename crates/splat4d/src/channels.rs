@@ -1,8 +1,7 @@
 //! Image channels next to colour, alpha and depth: normals, labels, features, lifespans and uncertainty, each as
-//! further channels of the
-//! renderer ([`Shot::extra`](crate::render::Shot::extra)) with a last column that is 1 where a splat has a value, so
-//! that [`divided`](crate::flow::divided) gives the mean over what a pixel shows. Velocity and flow are in
-//! [`flow`](crate::flow).
+//! further channels of the renderer ([`Shot::extra`](crate::render::Shot::extra)) with a last column that is 1 where a
+//! splat has a value, so that [`divided`](crate::flow::divided) gives the mean over what a pixel shows. Velocity and
+//! flow are in [`flow`](crate::flow).
 
 use crate::layers::{Evaluation, Scene};
 use crate::math::{Real, sym3};
@@ -127,12 +126,11 @@ pub struct Witness<'a> {
     pub t: Time,
 }
 
-/// The standard deviation of each Gaussian's place that its images leave open, scene units, by layer and row:
-/// √(tr (Σ_views H/σ² + I/ρ²)⁻¹ / 3), H the mean's 3x3 block of the Fisher information of an image
+/// The standard deviation of each Gaussian's place that its images leave open, scene units, by layer and row: √(tr
+/// (Σ_views H/σ² + I/ρ²)⁻¹ / 3), H the mean's 3x3 block of the Fisher information of an image
 /// ([`Sensitivity::fisher`](crate::render::Sensitivity::fisher)), σ `PIXEL_NOISE` and ρ `reach`, how far a Gaussian may
 /// be from where it is when no image shows it. Each witness represents `share` images. Other Gaussians are taken for
-/// known,
-/// so that it states too little where several could explain a pixel.
+/// known, so that it states too little where several could explain a pixel.
 ///
 /// Source: the Fisher blocks of PUP 3D-GS (Hanson et al. 2025), read as the precision of a Laplace approximation with a
 /// Gaussian prior as in Bayes' Rays (Goli et al. 2024).
@@ -235,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn lives_and_labels_are_those_of_what_is_seen() {
+    fn lifespans_and_labels_are_those_of_visible_surfaces() {
         let [long, short] = shown(&number_columns(&instant(), &lifetimes(&scene())));
         assert!((long[0] - 1.0).abs() < 1e-5 && (0.1..0.5).contains(&short[0]), "{long:?} {short:?}");
         let [hand, nobody] = shown(&label_columns(&scene(), &instant()).unwrap());

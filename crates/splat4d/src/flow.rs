@@ -94,8 +94,7 @@ pub fn render_flow<F: Real>(scene: &Scene<F>, from: Shot<'_>, to: Shot<'_>, rend
 }
 
 /// The displacement of every splat on the screen as further channels of an image: [splats, 3], u, v in pixels and 1, or
-/// zeros for a
-/// splat that is behind a camera ([`divided`]).
+/// zeros for a splat that is behind a camera ([`divided`]).
 ///
 /// Panics: `start` is not this scene's.
 pub fn flow_columns<F: Real>(scene: &Scene<F>, start: &Evaluation<F>, from: &Camera, to: Shot<'_>) -> Table<F> {

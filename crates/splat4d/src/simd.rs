@@ -3,8 +3,8 @@
 //! A kernel is one `#[inline(always)]` body over fixed-size lane arrays. It is compiled three times, inside functions
 //! that enable nothing, AVX2 with FMA, and AVX-512; LLVM turns the lane loops into that level's vectors. Levels differ
 //! in the rounding of fused multiply-adds (the scalar level) and of what steps from row to row (the blend under
-//! AVX-512). On ARM the baseline has NEON and fused multiply-add already. All SIMD code is dispatched here:
-//! this is the one file of the workspace that states `unsafe`.
+//! AVX-512). On ARM the baseline has NEON and fused multiply-add already. All SIMD code is dispatched here: this is the
+//! one file of the workspace that states `unsafe`.
 #![allow(unsafe_code)] // calling a function that enables a target feature, after that feature was found present
 
 use std::sync::atomic::{AtomicU8, Ordering};
@@ -84,9 +84,9 @@ pub trait Kernel {
     }
 }
 
-/// Work that writes to two buffers of the caller. They are arguments of the compiled function itself, since only
-/// then can LLVM assume that they do not overlap with the inputs: plain loops over slices inside a
-/// [`Kernel`] stay scalar (measured on the loss: five times slower). `run` must be `#[inline(always)]`.
+/// Work that writes to two buffers of the caller. They are arguments of the compiled function itself, since only then
+/// can LLVM assume that they do not overlap with the inputs: plain loops over slices inside a [`Kernel`] stay scalar
+/// (measured on the loss: five times slower). `run` must be `#[inline(always)]`.
 pub trait Pass {
     /// Working memory.
     type Scratch: ?Sized;

@@ -41,7 +41,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_a_terminal_would_obey_is_spelt_out() {
+    fn terminal_control_characters_are_escaped() {
         let title = "knight\u{1b}]52;c;ZXZpbA==\u{7}\u{9b}2J\rname\u{202e}gpj.exe";
         let shown = shown(title);
         assert!(!shown.chars().any(acts), "{shown}");

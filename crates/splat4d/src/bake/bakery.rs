@@ -150,8 +150,7 @@ impl<'a> Curved<'a> {
 }
 
 impl<'a> Bakery<'a> {
-    /// A scene before sampling. Errors: a scene with a pixel head; options out of range; an invalid
-    /// clip.
+    /// A scene before sampling. Errors: a scene with a pixel head; options out of range; an invalid clip.
     pub fn new(scene: &'a Scene<f32>, options: &'a Options) -> Result<Self> {
         scene.without_head("a playback file")?;
         // An endless tolerance is allowed: nothing is split then.

@@ -92,8 +92,8 @@ impl Fitter<'_> {
         }
     }
 
-    /// The best primitive of a node, and its error in pixels. None: no sample is finite, or the node is split
-    /// whatever its shape is.
+    /// The best primitive of a node, and its error in pixels. None: no sample is finite, or the node is split whatever
+    /// its shape is.
     fn fit(&self, subject: &Subject<'_>, span: Span) -> Option<(Primitive, f64)> {
         let looks = self.looks(subject, span);
         let single = span[1] - span[0] == 1;
@@ -148,8 +148,8 @@ impl Fitter<'_> {
         sound.then_some((primitive, error))
     }
 
-    /// The target shape of a segment's samples. That of a single frame turns on to the next one's, so that what
-    /// is seen between them is whole, where it then misses its own by no more than is allowed, and both by less.
+    /// The target shape of a segment's samples. That of a single frame turns on to the next one's, so that what is seen
+    /// between them is whole, where it then misses its own by no more than is allowed, and both by less.
     fn shape(
         &self,
         subject: &Subject<'_>,
@@ -241,8 +241,7 @@ impl Fitter<'_> {
 /// An envelope about the strongest sample that falls as the samples do: σ = exp(−½y²), y = (x − h)/s beyond h, is a
 /// line through √(−2 ln(α/α_max)).
 fn tail(looks: &[FrameSample]) -> Option<(Envelope, f64)> {
-    /// Samples close to full strength or close to zero, carry little information about the
-    /// slope.
+    /// Samples close to full strength or close to zero, carry little information about the slope.
     const TELLING: std::ops::Range<f64> = 0.02..0.98;
     let peak = looks.iter().max_by(|a, b| a.alpha.total_cmp(&b.alpha))?;
     let share = |l: &FrameSample| l.alpha / peak.alpha;

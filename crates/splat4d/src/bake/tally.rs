@@ -66,8 +66,7 @@ pub(super) fn bounded(primitives: usize) -> Result<()> {
         .remedy("Raise --tolerance, or bake a shorter clip or fewer Gaussians."))
 }
 
-/// A layer of a playback file: its segments are kept unchanged in their span. Their importance is not in the
-/// file.
+/// A layer of a playback file: its segments are kept unchanged in their span. Their importance is not in the file.
 pub(super) fn page(layer: &Layer<f32>, sampling: &Lookout, tally: &mut Tally) -> Result<Option<Node>> {
     let mut all = primitives(layer);
     let before = all.len();

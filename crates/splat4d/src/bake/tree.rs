@@ -12,8 +12,8 @@ const MAX_FRAMES: f64 = 1_000_000.0;
 const MAX_PARTS: f64 = 32.0;
 
 /// Borders of spans are on frames, so that a frame is shown by one node a level and by no two. Where the clip has few
-/// frames per second, a frame here is a part of one: a player also shows the times between them, and a
-/// model need not be straight there.
+/// frames per second, a frame here is a part of one: a player also shows the times between them, and a model need not
+/// be straight there.
 ///
 /// The tree halves the clip at the borders of segments, and a segment, where motion demands it, frame by frame. Its
 /// last border is one frame of the clip behind the clip's last second, so that this second is inside.

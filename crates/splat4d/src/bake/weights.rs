@@ -23,8 +23,8 @@ pub(super) const PATH_RENDERS: usize = 32;
 const SIDE: usize = 480;
 /// Share of an error that counts in every direction, also along a line of sight that no render crosses.
 const ISOTROPIC: f64 = 0.1;
-/// Share of the weight by size and opacity alone for Gaussians that no render sees, and of its greatest
-/// weight at times at which the moving camera does not.
+/// Share of the weight by size and opacity alone for Gaussians that no render sees, and of its greatest weight at times
+/// at which the moving camera does not.
 const UNSEEN: f64 = 0.02;
 /// Squared contrast to the surroundings, assumed where it is unknown, per channel.
 const CONTRAST: f64 = 0.05;

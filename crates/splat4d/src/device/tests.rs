@@ -14,7 +14,7 @@ fn view() -> Camera {
 const BACKGROUND: [f32; 3] = [0.25, 0.5, 0.75];
 
 #[test]
-fn the_cpu_is_always_there() {
+fn the_cpu_is_always_available() {
     for device in [Device::Cpu, Device::Auto, Device::Gpu] {
         let mut opened = open(device, RenderConfig::default(), &Wanted::default(), Tables::Constant);
         let (splats, camera, mut image) = (Splats::default(), view(), Image::default());

@@ -276,7 +276,9 @@ fn color_map(exposure: f64, tint: Option<[f64; 3]>, saturation: Option<f64>, cur
 fn retime_part(scene: &mut Scene<f32>, rate: f64, [from, to]: [f64; 2], context: &dyn Context) -> Result<()> {
     span(from, to)?;
     if !(rate != 0.0 && rate.is_finite()) {
-        return Err(Error::input(format!("a rate of {rate}")).remedy("1 keeps the speed, 0.5 halves it, -1 plays backwards"));
+        return Err(
+            Error::input(format!("a rate of {rate}")).remedy("1 keeps the speed, 0.5 halves it, -1 plays backwards")
+        );
     }
     let [start, end] = scene.clip;
     let longer = (to - from) / rate.abs() - (to - from);

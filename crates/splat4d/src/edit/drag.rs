@@ -202,9 +202,9 @@ fn unmoved(rest: &[[f64; 3]]) -> Vec<NodeOffset> {
     rest.iter().map(|x| (*x, [0.0; 3], [1.0, 0.0, 0.0, 0.0])).collect()
 }
 
-/// An interactive drag: one time of a scene whose nodes are pulled repeatedly. It shows what a step
-/// with the same nodes, handles and pins makes of that time; away from the second at which places are meant nearly so,
-/// because who follows which node then depends on their current positions.
+/// An interactive drag: one time of a scene whose nodes are pulled repeatedly. It shows what a step with the same
+/// nodes, handles and pins makes of that time; away from the second at which places are meant nearly so, because who
+/// follows which node then depends on their current positions.
 #[derive(Clone, Debug)]
 pub struct Dragging {
     scene: Scene<f32>,

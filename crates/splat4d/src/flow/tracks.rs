@@ -177,7 +177,7 @@ mod tests {
     }
 
     #[test]
-    fn gaussians_are_followed_while_they_live() {
+    fn gaussians_are_followed_during_their_lifespans() {
         let s = scene();
         let tracks = Tracks::follow(&s, &every(&s, 2), &[0.0, 1.0]);
         assert_eq!(tracks.members.iter().map(|m| m.row).collect::<Vec<_>>(), [0, 2, 4]);
@@ -193,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn the_nearest_are_the_nearest_of_the_living() {
+    fn the_nearest_are_chosen_among_active_gaussians() {
         let s = scene();
         let rows = |t: f64, count| -> Vec<u32> {
             nearest(&s, Time(t), &[[3.7, 0.0, 0.0]], count, 0.1)[0].iter().map(|m| m.row).collect()

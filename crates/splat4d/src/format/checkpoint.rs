@@ -186,7 +186,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn freetime_gaussians_move_and_live() {
+    fn freetime_gaussians_have_velocities_and_lifespans() {
         let p = gaussians(3, 4);
         let mut all = tensors(&p, ["sh0", "shN"], "");
         all.push(("times".into(), vec![3, 1], vec![0.5, 0.0, 1.0]));

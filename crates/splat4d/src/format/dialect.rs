@@ -185,8 +185,8 @@ impl Dialect {
         Err(Error::new(ErrorKind::Unsupported, format!("{} is read, but not written", self.name)).remedy(remedy))
     }
 
-    /// Writes a scene, whose axes are not changed; a dialect without motion gets the clip's
-    /// first time. Returns what was left out.
+    /// Writes a scene, whose axes are not changed; a dialect without motion gets the clip's first time. Returns what
+    /// was left out.
     ///
     /// Errors: it is only read; it cannot hold the scene, or what it should of it; a number is NaN or infinite; the
     /// sink's.

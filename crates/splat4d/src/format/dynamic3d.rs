@@ -136,7 +136,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn gaussians_are_where_each_frame_has_them() {
+    fn gaussians_have_the_positions_of_each_frame() {
         let opened = DIALECT.open(&sample()).unwrap();
         assert_eq!((opened.scene.len(), opened.scene.clip[1]), (2, 2.0 / DEFAULT_FPS));
         let said = opened.warnings.lines().join("\n");

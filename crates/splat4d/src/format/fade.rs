@@ -187,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn lives_that_are_fades_already_stay_exact() {
+    fn gaussian_fades_stay_exact() {
         let thin = interval(0.7, 1e-9, 0.2).exact().unwrap();
         assert!((thin.at(0.9) - 0.6 * (-0.5f64).exp()).abs() < 1e-12);
         let long = interval(1.0, 1e9, 0.1).exact().unwrap();
@@ -219,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn pieces_of_one_path_give_way_to_each_other() {
+    fn segments_of_one_path_fade_into_each_other() {
         // One Gaussian with an infinite lifespan, cut into four pieces: together they must stay near 0.6.
         let pieces: Vec<Fade> = (0..4)
             .map(|i| {

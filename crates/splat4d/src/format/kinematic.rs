@@ -168,7 +168,8 @@ pub(super) fn rows(
             out.push(moving.recentered(there));
         }
     }
-    let what = "have a lifespan with a flat top, or one that ends at once: smooth fades were fitted (--exact refuses them)";
+    let what =
+        "have a lifespan with a flat top, or one that ends at once: smooth fades were fitted (--exact refuses them)";
     warnings.counted(fitted, scene.len(), what);
     warnings.counted(unseen, scene.len(), "are never seen within the clip and were left out");
     if shaded > 0 {

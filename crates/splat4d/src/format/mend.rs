@@ -90,7 +90,7 @@ mod tests {
     use crate::format::samples::gaussians;
 
     #[test]
-    fn infinities_that_mean_something_become_finite_and_are_counted() {
+    fn meaningful_infinities_become_finite_and_are_counted() {
         let mut p = gaussians(5, 3);
         p[GEOMETRY].set(0, OPACITY, f32::INFINITY);
         p[GEOMETRY].set(1, OPACITY, f32::NEG_INFINITY);
@@ -108,7 +108,7 @@ mod tests {
     }
 
     #[test]
-    fn coarse_coordinates_are_reported_only_where_they_show() {
+    fn coarse_coordinates_are_reported_only_if_visible() {
         let mut p = gaussians(50, 2);
         let mut warnings = Warnings::default();
         say_coarse(&p, &mut warnings);

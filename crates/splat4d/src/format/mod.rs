@@ -66,9 +66,8 @@ pub const DIALECTS: &[Dialect] = &[
     checkpoint::DIALECT,
 ];
 
-/// The scene in a file of any kind that its first bytes identify: `.s4d`, .ply (3DGS, compressed, Spacetime
-/// Gaussians), .spz, .splatv, zipped SOG, `scene.safetensors` and checkpoints. A .splat has no mark: [`splat::read`]
-/// it.
+/// The scene in a file of any kind that its first bytes identify: `.s4d`, .ply (3DGS, compressed, Spacetime Gaussians),
+/// .spz, .splatv, zipped SOG, `scene.safetensors` and checkpoints. A .splat has no mark: [`splat::read`] it.
 ///
 /// Assumptions are not returned; [`Dialect::open`] returns them. Errors: no such kind; the reader's.
 pub fn open(bytes: &[u8]) -> Result<Scene<f32>> {

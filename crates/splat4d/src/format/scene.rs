@@ -2,10 +2,10 @@
 //!
 //! Metadata `splat4d` holds JSON: version, clip, fps, up, background, head, `labels` (names) where Gaussians have some,
 //! `offset` (world coordinates of the scene's origin) where it is not zero, and a list of layers with name, rows, SH
-//! coefficients, life and motion, `frame` where the layer's axes are not the world's, and
-//! `cross_fade` (seconds at the span's beginning and end) where it fades. Every column group of every table is one
-//! row-major array: `layers.0.means` `[N,3]`, `layers.0.quats` `[N,4]` wxyz, `layers.0.sh` `[N,K,3]`,
-//! `layers.0.velocities` `[N,3·order]` … Seconds and scene units.
+//! coefficients, life and motion, `frame` where the layer's axes are not the world's, and `cross_fade` (seconds at the
+//! span's beginning and end) where it fades. Every column group of every table is one row-major array: `layers.0.means`
+//! `[N,3]`, `layers.0.quats` `[N,4]` wxyz, `layers.0.sh` `[N,K,3]`, `layers.0.velocities` `[N,3·order]` … Seconds and
+//! scene units.
 
 use super::arrays::MASKS;
 use super::safetensors::{Dtype, SafeTensors, Tensor, checksum, header, sealed};
@@ -475,7 +475,7 @@ mod tests {
     }
 
     #[test]
-    fn cross_fades_come_back_and_older_readers_refuse_them() {
+    fn cross_fades_round_trip_and_older_readers_refuse_them() {
         let mut s = scene();
         s.layers[1].cross_fade = [0.1 + 0.2, 0.0];
         let mut bytes = Vec::new();
@@ -507,7 +507,7 @@ mod tests {
     }
 
     #[test]
-    fn features_come_back_and_have_one_width() {
+    fn features_round_trip_and_have_one_width() {
         let mut s = scene();
         let key = features::claim(&mut s.layers[1].params, 3).unwrap();
         s.layers[1].params[key].write(2, 0, [0.5, -1.5, 2.0]);
@@ -523,7 +523,7 @@ mod tests {
     }
 
     #[test]
-    fn labels_come_back_and_older_readers_refuse_them() {
+    fn labels_round_trip_and_older_readers_refuse_them() {
         let mut s = scene();
         s.labels = vec!["floor".into(), "hand".into()];
         scene_labels::state(&mut s.layers[1].params, 2, &[Some(1); 37]);
@@ -562,7 +562,7 @@ mod tests {
     }
 
     #[test]
-    fn a_head_comes_back_and_must_fit_its_layers() {
+    fn a_head_round_trips_and_must_fit_its_layers() {
         let features = Some(crate::motion::spacetime::FeatureSpec { seed: 9 });
         let spec = Spec::Spacetime(SpacetimeSpec { features, ..SpacetimeSpec::default() });
         let mut params = Params::new(5, 1, LifeKind::GaussHalf.columns());
@@ -597,7 +597,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fit_is_named() {
+    fn mismatches_are_named() {
         let mut bytes = Vec::new();
         write(&scene(), &mut bytes).unwrap();
         let bytes = unsealed(bytes);
@@ -631,7 +631,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_finite_is_not_written() {
+    fn non_finite_scenes_are_not_written() {
         let refused = |s: &Scene<f32>| {
             let mut bytes = Vec::new();
             let error = write(s, &mut bytes).unwrap_err().to_string();

@@ -63,7 +63,7 @@ mod tests {
     use crate::scene::params::OPACITY;
 
     #[test]
-    fn each_frame_is_seen_in_its_time_and_alone() {
+    fn each_frame_is_visible_alone_at_its_time() {
         let mut frames = [gaussians(30, 1), gaussians(20, 4), gaussians(0, 1), gaussians(10, 9)];
         for f in &mut frames {
             (0..f.len()).for_each(|row| f[GEOMETRY].set(row, OPACITY, 3.0));

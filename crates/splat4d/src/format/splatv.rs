@@ -248,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn a_moving_scene_comes_back_within_f16() {
+    fn a_dynamic_scene_round_trips_within_f16() {
         for life in [LifeKind::Infinite, LifeKind::GaussHalf, LifeKind::GaussOne] {
             let scene = moving(1500, life, 3, true);
             let mut file = Vec::new();

@@ -75,8 +75,7 @@ pub(super) enum End {
 }
 
 impl GpuRenderer {
-    /// Compiles the kernels of the backward pass, and renders once to size its records. Errors: the driver
-    /// refuses one.
+    /// Compiles the kernels of the backward pass, and renders once to size its records. Errors: the driver refuses one.
     pub fn for_training(&mut self) -> Result<()> {
         // Lists may grow by a share more than they need; behind the records are a few sums.
         let room = super::largest_binding(&self.gpu) / (RECORD_BYTES + 1) * SPARE / (SPARE + 1);
@@ -243,8 +242,7 @@ impl GpuRenderer {
     }
 
     /// The backward pass of a band whose lists, planes and gradient are available after what `recorder` holds, and the
-    /// reading of
-    /// the copy of its results. `pairs`: their largest number.
+    /// reading of the copy of its results. `pairs`: their largest number.
     pub(super) fn come_back(
         &self,
         mut recorder: Recorder<'_>,

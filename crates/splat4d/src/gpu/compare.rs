@@ -173,8 +173,7 @@ impl GpuRenderer {
         b.d_planes.ensure(gpu, (4 * PLANES * w * h) as u64)
     }
 
-    /// One submission: rendering, comparison, backward pass. The results are invalid if there are more pairs than
-    /// fit.
+    /// One submission: rendering, comparison, backward pass. The results are invalid if there are more pairs than fit.
     fn there_and_back(
         &mut self,
         held: &Held,

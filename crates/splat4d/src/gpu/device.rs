@@ -1,6 +1,5 @@
-//! Choice and opening of the GPU: nothing beyond WebGPU's default limits is requested, so that what runs here runs in
-//! a browser too; except for the size of buffers, which natively is the driver's limit, and subgroups,
-//! where available.
+//! Choice and opening of the GPU: nothing beyond WebGPU's default limits is requested, so that what runs here runs in a
+//! browser too; except for the size of buffers, which natively is the driver's limit, and subgroups, where available.
 
 use super::tuning::Tuning;
 use crate::{Error, ErrorKind, Result};

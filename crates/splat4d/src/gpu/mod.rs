@@ -433,8 +433,7 @@ impl Backend<f32> for GpuRenderer {
     }
 
     /// Errors in addition: a gradient that is not finite. `None` in addition: the image must be rendered in bands, or
-    /// none of its pixels
-    /// counts.
+    /// none of its pixels counts.
     fn compare(
         &mut self,
         shot: &Shot<'_, f32>,

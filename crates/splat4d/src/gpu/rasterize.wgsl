@@ -2,11 +2,10 @@
 // equations and their sources stand. render/project.wgsl is put in front of this file.
 //
 // Bindings, group 0: 0 view; 1 blend; 2 ranges (three u32 per tile; the third is written: one past the last pair that
-// some pixel used), 3 values (pairs, sorted by tile, then nearest first), 4 owners (of a pair: splat and quadrants);
-// 5 shapes, 6 colors; out: 7 planes: red, green, blue over the background, alpha, depth (sum of z alpha T), each
-// [rows of the planes][width]. Six storage buffers, 12 KiB of workgroup memory.
-// A workgroup owns a tile of 16 x 16 pixels, 64 neighbouring threads a quadrant of it, a thread per pixel; splats are
-// read in batches by all threads together.
+// some pixel used), 3 values (pairs, sorted by tile, then nearest first), 4 owners (of a pair: splat and quadrants); 5
+// shapes, 6 colors; out: 7 planes: red, green, blue over the background, alpha, depth (sum of z alpha T), each [rows of
+// the planes][width]. Six storage buffers, 12 KiB of workgroup memory. A workgroup owns a tile of 16 x 16 pixels, 64
+// neighbouring threads a quadrant of it, a thread per pixel; splats are read in batches by all threads together.
 
 const TILE: u32 = 16u;
 const THREADS: u32 = 256u;

@@ -1,12 +1,12 @@
 // What a step on tables that stay leaves of itself: sums over the tiles of each view, the cameras' colour matrices, and
 // the record that the CPU reads some steps later. Twin of Exposure::step in splat4d-train's learner/exposure.rs.
 //
-// Three entries of one workgroup each: view_sums after each view, cameras and record after the step's last.
-// Bindings, group 0: 0 rule; 1 counts ([1]: visible splats, [2]: pairs, [3]: where steps stopped, [4]: pairs that were
-// requested then); 2 partials of loss.wgsl; 3 status: eight words of the step, eight a view, then those of the other
-// kernels; 4 responses: of every camera the twelve numbers that loss.wgsl reads, then in the same order their
-// gradients, first moments, second moments, and behind them all a step count a camera and 1 for each that is held about
-// the mean; 5 corrections of adam.wgsl. Five storage buffers.
+// Three entries of one workgroup each: view_sums after each view, cameras and record after the step's last. Bindings,
+// group 0: 0 rule; 1 counts ([1]: visible splats, [2]: pairs, [3]: where steps stopped, [4]: pairs that were requested
+// then); 2 partials of loss.wgsl; 3 status: eight words of the step, eight a view, then those of the other kernels; 4
+// responses: of every camera the twelve numbers that loss.wgsl reads, then in the same order their gradients, first
+// moments, second moments, and behind them all a step count a camera and 1 for each that is held about the mean; 5
+// corrections of adam.wgsl. Five storage buffers.
 
 const THREADS: u32 = 256u;
 const NUMBERS: u32 = 16u;  // of a tile

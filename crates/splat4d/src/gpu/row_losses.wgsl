@@ -4,8 +4,8 @@
 //
 // Bindings, group 0: 0 ask; 1 rule; 2 counts ([3]: stopped); 3 params; 4 alive, as answer.wgsl left it; in and out: 5
 // d_params, which is added to; 6 status, cleared to 0 before: rows alive at rule.count_at, and from rule.sums_at on the
-// loss of each workgroup's rows, as bits. Five storage buffers.
-// A thread owns one row; the rows of a workgroup are added in a fixed order.
+// loss of each workgroup's rows, as bits. Five storage buffers. A thread owns one row; the rows of a workgroup are
+// added in a fixed order.
 
 // Probabilities are kept this far from 0 and 1 (loss/image/entropy.rs).
 const MARGIN: f32 = 1e-4;

@@ -3,8 +3,8 @@
 // in front of this file.
 //
 // Bindings, group 0: 0 ask; 1 counts ([3]: stopped); 2 params; 3 back as colors_back.wgsl left it; 4 weights: the
-// gradients that it left there; out: 5 d_params, as answer_back.wgsl writes it. Five storage buffers.
-// A thread owns one row.
+// gradients that it left there; out: 5 d_params, as answer_back.wgsl writes it. Five storage buffers. A thread owns one
+// row.
 
 const TAU: f32 = 6.283185307179586;
 

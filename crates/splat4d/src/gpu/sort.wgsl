@@ -7,8 +7,8 @@
 //   scan        256 workgroups; 1 is enough for up to SORT_FEW blocks
 //   scatter     as histogram
 // A block is SORT_BLOCK pairs; blocks = ceil(pairs / SORT_BLOCK), at most 65,535. The number of pairs is read from
-// sort_count, so that an earlier dispatch decides it; dispatch indirectly, or for the most pairs there can be.
-// Pairs beyond the end of keys_in do not exist, whatever sort_count states.
+// sort_count, so that an earlier dispatch decides it; dispatch indirectly, or for the most pairs there can be. Pairs
+// beyond the end of keys_in do not exist, whatever sort_count states.
 //
 // Bindings, group 0; every entry point uses the ones in brackets:
 //   0 uniform sort_pass: shift = 0, 8, 16 or 24; count_index = where in sort_count the number of pairs is  [all]

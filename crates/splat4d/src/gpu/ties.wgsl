@@ -6,8 +6,8 @@
 // edges, four words each: where it leads to, length and weight as bits; 5 links: from 0 on the first edge to each point
 // and one past the last, from rule.back_at on the edges to points, from rule.rows_at on the rows of points and of the
 // background; in and out: 6 turns, a vec4 a point; 7 d_params, which is added to; 8 status: from rule.sums_at on the
-// loss of each workgroup, as bits; 9 counts ([3]: stopped). Eight storage buffers.
-// A thread owns one point, or one row of the background, and adds what its edges pull at both their ends.
+// loss of each workgroup, as bits; 9 counts ([3]: stopped). Eight storage buffers. A thread owns one point, or one row
+// of the background, and adds what its edges pull at both their ends.
 
 // Keeps the root's derivative finite (loss/rigid.rs).
 const UNDER_ROOT: f32 = 1e-20;

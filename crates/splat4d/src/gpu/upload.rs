@@ -125,8 +125,8 @@ impl Upload {
         Ok(())
     }
 
-    /// Allocates layers of this many rows, columns and blocks of SH, which kernels fill, and lists the dispatches.
-    /// What buffers held may be lost. Errors: no memory, or a table that is larger than a binding.
+    /// Allocates layers of this many rows, columns and blocks of SH, which kernels fill, and lists the dispatches. What
+    /// buffers held may be lost. Errors: no memory, or a table that is larger than a binding.
     pub(super) fn keep(&mut self, gpu: &Gpu, layers: &[(usize, usize, usize)]) -> Result<()> {
         self.draws.clear();
         self.parts.resize_with(layers.len(), PartBuffers::new);

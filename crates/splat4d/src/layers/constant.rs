@@ -67,8 +67,8 @@ impl<'a> Constant<'a> {
         &self.times
     }
 
-    /// Frame `i`, whose opacities are `HIDDEN` where a Gaussian is not alive. Frames are requested one after the
-    /// other; frame 0 begins again. Rotations keep the sign and the order of axes that are nearest to the frame before.
+    /// Frame `i`, whose opacities are `HIDDEN` where a Gaussian is not alive. Frames are requested one after the other;
+    /// frame 0 begins again. Rotations keep the sign and the order of axes that are nearest to the frame before.
     pub fn frame(&mut self, i: usize) -> &Params<f32> {
         if i == 0 {
             self.now = self.first.clone();
@@ -223,7 +223,7 @@ mod tests {
     }
 
     #[test]
-    fn rows_keep_their_gaussian_and_hide_it_outside_its_life() {
+    fn rows_keep_their_gaussian_and_hide_it_outside_its_lifespan() {
         let scene = moving();
         let times: Vec<f64> = (0..8).map(|i| scene.clip[0] + f64::from(i) / scene.fps).collect();
         let mut constant = Constant::new(&scene, times.clone()).unwrap();

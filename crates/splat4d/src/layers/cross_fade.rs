@@ -3,9 +3,9 @@
 //! one of them. Linear opacities o·s and o·(1 − s) would let a quarter of the background through an opaque surface
 //! half-way.
 //!
-//! It holds where a splat is densest. Around that its alpha is o'g, and two coinciding splats let through
-//! (1 − o₁g)(1 − o₂g), which is less than 1 − og by o₁o₂g(1 − g): never more transparent, and broader by at most a
-//! quarter of o₁o₂. No pair of opacities does better at every g; only a cut does.
+//! It holds where a splat is densest. Around that its alpha is o'g, and two coinciding splats let through (1 − o₁g)(1 −
+//! o₂g), which is less than 1 − og by o₁o₂g(1 − g): never more transparent, and broader by at most a quarter of o₁o₂.
+//! No pair of opacities does better at every g; only a cut does.
 
 use super::Layer;
 use crate::math::Real;

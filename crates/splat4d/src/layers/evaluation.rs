@@ -1,9 +1,8 @@
 //! [`Evaluation`]: the scene at these times, forth and back.
 //!
 //! A motion model needs all queries of a step at once (`prepare`), then computes them one by one (`at`); in the
-//! backward pass it
-//! takes a gradient a query (`backward`) and hears when that was the last one (`finish`). That order is written here,
-//! once, for training, playback, freezing, flow and baking.
+//! backward pass it takes a gradient a query (`backward`) and hears when that was the last one (`finish`). That order
+//! is written here, once, for training, playback, freezing, flow and baking.
 
 #[cfg(test)]
 mod tests;
@@ -63,8 +62,8 @@ impl<F: Real> Evaluation<F> {
         }
     }
 
-    /// Requests the Gaussians of a layer that are alive at t, next to those that were requested already. `of` is
-    /// that layer.
+    /// Requests the Gaussians of a layer that are alive at t, next to those that were requested already. `of` is that
+    /// layer.
     /// Returns the query's number.
     pub fn ask_active(&mut self, layer: usize, of: &Layer<F>, t: Time) -> usize {
         let i = match self.find(layer, Space::Gaussians, t) {

@@ -46,8 +46,8 @@ pub fn moment(scene: &Scene<f32>, time: Time) -> Result<Params<f32>> {
     }
 }
 
-/// These rows of a layer (strictly increasing) at `time`, lifespan and frame included, as a still layer's
-/// parameters; of Gaussians with features only the base colour is left.
+/// These rows of a layer (strictly increasing) at `time`, lifespan and frame included, as a still layer's parameters;
+/// of Gaussians with features only the base colour is left.
 pub fn freeze_rows(layer: &Layer<f32>, rows: &[u32], time: Time) -> Params<f32> {
     let seen = Evaluation::of_layer(layer, Space::Gaussians, Rows::Some(rows), time);
     let coefficients = (layer.params[SH].width() / 3).clamp(1, MAX_COEFFS);

@@ -61,8 +61,8 @@ pub struct Layer<F: Real = f32> {
     pub cross_fade: [f64; 2],
     /// Visibility masks of the rows over time; none: all rows alive are rendered.
     pub masks: Option<Arc<KeyMasks>>,
-    /// The layer's frame: `world_from_layer`, applied to Gaussians after motion and lifespan. Tables, the motion
-    /// model and nodes keep the layer's own axes and unit of length.
+    /// The layer's frame: `world_from_layer`, applied to Gaussians after motion and lifespan. Tables, the motion model
+    /// and nodes keep the layer's own axes and unit of length.
     pub frame: Sim3,
 }
 

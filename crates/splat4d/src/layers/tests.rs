@@ -203,7 +203,7 @@ fn infinite_life_equals_still_without_one() {
 }
 
 #[test]
-fn a_layer_is_seen_in_its_span_only() {
+fn a_layer_is_visible_in_its_span_only() {
     let mut a = layer(&Spec::Still, LifeKind::Infinite, 5, 1);
     let mut b = layer(&Spec::Still, LifeKind::GaussHalf, 20, 2);
     let whole = b.spans();

@@ -1,14 +1,13 @@
 //! `deform-mlp`: a canonical cloud that a network deforms.
 //!
-//! With x̂ = (sg(x) − c)/r and t̂ = (t − from)/(to − from) clamped to [0, 1], a network gives every Gaussian
-//! (δx 3, δq 4, δs 3), or with `rigid` a screw (w 3, v 3) in place of δx:
-//! x_t = x + r·δx or c + r·exp([w; v])((x − c)/r), q_t = q/|q| + δq, s_t = max(exp(log_scales) + r·δs, 1e-6) — scales
-//! are changed after the activation — each head times its constant of `GAINS`. Opacity and SH stay.
-//! `sg` stops the gradient: the network's input is detached from the mean, so that dL/dx = dL/dx_t (with a screw:
-//! turned by it). The inputs of the network are γ(x̂) and γ(t̂), t̂'s perhaps through a small network of its own, or
-//! hash grids over (x, y, z) and (x, y, t), (y, z, t), (x, z, t). What depends on t̂ alone enters as a shift of biases,
-//! which is the same as repeating it in every row.
-//! At the start the last map is zero: the result is then the canonical cloud bit for bit, as in `still`.
+//! With x̂ = (sg(x) − c)/r and t̂ = (t − from)/(to − from) clamped to [0, 1], a network gives every Gaussian (δx 3, δq
+//! 4, δs 3), or with `rigid` a screw (w 3, v 3) in place of δx: x_t = x + r·δx or c + r·exp([w; v])((x − c)/r), q_t =
+//! q/|q| + δq, s_t = max(exp(log_scales) + r·δs, 1e-6) — scales are changed after the activation — each head times its
+//! constant of `GAINS`. Opacity and SH stay. `sg` stops the gradient: the network's input is detached from the mean, so
+//! that dL/dx = dL/dx_t (with a screw: turned by it). The inputs of the network are γ(x̂) and γ(t̂), t̂'s perhaps
+//! through a small network of its own, or hash grids over (x, y, z) and (x, y, t), (y, z, t), (x, z, t). What depends
+//! on t̂ alone enters as a shift of biases, which is the same as repeating it in every row. At the start the last map
+//! is zero: the result is then the canonical cloud bit for bit, as in `still`.
 //! Source: Yang et al. 2024 (Deformable 3D Gaussians) §3; heads that start at zero as in SC-GS (Huang et al. 2024);
 //! hash grids after Müller et al. 2022 and Grid4D (Xu et al. 2024).
 

@@ -274,8 +274,7 @@ impl<F: Real> Edited<F> {
         });
     }
 
-    /// Colours of the result `inner` after the change at time t; leaves `out` empty where they are the model's
-    /// own.
+    /// Colours of the result `inner` after the change at time t; leaves `out` empty where they are the model's own.
     fn paint(&self, q: &At<'_, F>, t: f64, inner: &Tape<F>, out: &mut Table<F>) {
         if !self.change.paints() {
             return;

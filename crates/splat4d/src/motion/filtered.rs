@@ -10,8 +10,8 @@
 //!
 //! w = trust · gate. Trust rises from 0 to 1 over the frame in which the clip has become long enough to predict from;
 //! the gate closes where the innovation δᵀ(Σₚ+Σₒ)⁻¹δ leaves what chance explains, so that a sudden motion is followed
-//! at once. All is continuous in t, between frames too. With `history` the earlier states are filtered themselves,
-//! that many frames back: sequential inference with random access. Opacity and colour are the observation's.
+//! at once. All is continuous in t, between frames too. With `history` the earlier states are filtered themselves, that
+//! many frames back: sequential inference with random access. Opacity and colour are the observation's.
 //!
 //! Gradients: exact, through all of `history`; with `stop_gradient` (the default) earlier results are constants. Nodes
 //! are evaluated by the inner model.

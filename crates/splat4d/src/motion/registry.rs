@@ -104,9 +104,9 @@ impl Polynomial {
         out
     }
 
-    /// Moves the centre of a row's lifespan by `shift` seconds and keeps its path and rotation, for models of
-    /// every order: what it showed at any time it shows still, but for its lifespan. Colours that change with time
-    /// begin again at the centre.
+    /// Moves the centre of a row's lifespan by `shift` seconds and keeps its path and rotation, for models of every
+    /// order: what it showed at any time it shows still, but for its lifespan. Colours that change with time begin
+    /// again at the centre.
     ///
     /// Panics: the layer's Gaussians have infinite lifespans.
     pub fn recentre<F: Real>(&self, p: &mut Params<F>, row: usize, shift: f64) {

@@ -8,12 +8,12 @@
 //! > q_i(t) = normalize(Σ_k a_ik s_k u_k) ⊗ q_i,
 //!
 //! where u_k is the unit quaternion of R_k and s_k = ±1 aligns it to the nearest node's. Scales stay. With a motion
-//! mask m_i = sigmoid(`motion_mask`) a Gaussian moves by the share m_i: x_i + m_i (x_i(t) − x_i), and likewise
-//! for the quaternion, from the identity.
+//! mask m_i = sigmoid(`motion_mask`) a Gaussian moves by the share m_i: x_i + m_i (x_i(t) − x_i), and likewise for the
+//! quaternion, from the identity.
 //!
 //! Nothing is detached (the reference stops the gradient at x and p inside the blend): finite differences hold for
-//! every table. The choice of nodes is not learnt: every Gaussian has a list of the nearest ones,
-//! refreshed by `Skinned::bind` now and then; among them the weights choose again at every step, continuously.
+//! every table. The choice of nodes is not learnt: every Gaussian has a list of the nearest ones, refreshed by
+//! `Skinned::bind` now and then; among them the weights choose again at every step, continuously.
 
 mod blend;
 mod offset;
@@ -124,10 +124,8 @@ impl SkinSpec {
         ];
         for (name, value, low, high) in ranges {
             if !(low..=high).contains(&value) {
-                return Err(Error::input(format!(
-                    "invalid skin: {name} = {value}, expected {low} to {high}"
-                ))
-                .remedy("The file is damaged or was written by another program; export it again"));
+                return Err(Error::input(format!("invalid skin: {name} = {value}, expected {low} to {high}"))
+                    .remedy("The file is damaged or was written by another program; export it again"));
             }
         }
         Ok(())
@@ -236,8 +234,8 @@ fn start_nodes<F: Real>(t: &mut Table<F>, centers: &[[F; 3]], rng: Rng) {
     }
 }
 
-/// Motion by a skin and a model that drives its nodes. Queries of [`Space::Nodes`] return isotropic splats:
-/// the node's position, its radius, sigmoid(logit) as opacity.
+/// Motion by a skin and a model that drives its nodes. Queries of [`Space::Nodes`] return isotropic splats: the node's
+/// position, its radius, sigmoid(logit) as opacity.
 pub struct Skinned<F: Real> {
     /// Which Gaussian follows which nodes.
     pub skin: Skin,

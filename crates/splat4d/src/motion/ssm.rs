@@ -1,10 +1,10 @@
 //! `ssm`: control nodes driven by a diagonal state-space model (our design on S4D, Gu et al. 2022).
 //!
 //! The clip is cut into M ticks. Every node is a sequence: a clock γ(t) and an impulse at the ends, a learnt embedding,
-//! and its surroundings. A stack of residual blocks (`nn::sequence`) scans the sequence, one scan
-//! serving every time of a step, and a head that starts at zero gives a shift ρ and a rotation vector θ a tick. Between
-//! ticks both are interpolated (Catmull-Rom); the node moves to p + ρ and turns by exp(θ) about itself. Gaussians
-//! follow by skinning (`motion::skin`).
+//! and its surroundings. A stack of residual blocks (`nn::sequence`) scans the sequence, one scan serving every time of
+//! a step, and a head that starts at zero gives a shift ρ and a rotation vector θ a tick. Between ticks both are
+//! interpolated (Catmull-Rom); the node moves to p + ρ and turns by exp(θ) about itself. Gaussians follow by skinning
+//! (`motion::skin`).
 //!
 //! - `mode`: scans in both directions to reconstruct; the past alone to forecast, with ticks past the clip as
 //!   requested.
@@ -13,8 +13,8 @@
 //!   (`nn::frames`), so that a turned scene is a turned scene; `vector`: vector neurons (`nn::vector`), which mirror
 //!   exactly, too.
 //!
-//! A node's context (positions, frames, neighbours) is taken when nodes are placed or edited and held
-//! fixed: no gradient is propagated through it to the nodes' positions.
+//! A node's context (positions, frames, neighbours) is taken when nodes are placed or edited and held fixed: no
+//! gradient is propagated through it to the nodes' positions.
 
 mod context;
 mod net;
@@ -141,9 +141,7 @@ impl SsmSpec {
         ];
         for (name, value, low, high) in ranges {
             if !(low..=high).contains(&value) {
-                return broken(format!(
-                    "invalid state-space model: {name} = {value}, expected {low} to {high}"
-                ));
+                return broken(format!("invalid state-space model: {name} = {value}, expected {low} to {high}"));
             }
         }
         let span = self.clip[1] - self.clip[0];

@@ -72,8 +72,8 @@ pub struct Tracked {
 }
 
 impl Tracked {
-    /// Pages that are not loaded start as frame 0. Errors: times that do not increase; pages that are missing
-    /// or have another shape.
+    /// Pages that are not loaded start as frame 0. Errors: times that do not increase; pages that are missing or have
+    /// another shape.
     pub fn new<F: Real>(spec: &TrackedSpec, p: &mut Params<F>) -> Result<Self> {
         let times = &spec.times;
         let increase = times.windows(2).all(|w| w[0] < w[1]) && times.iter().all(|t| t.is_finite());

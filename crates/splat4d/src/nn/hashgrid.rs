@@ -1,11 +1,10 @@
 //! [`HashGrid`]: features on grids of several resolutions, blended between the corners of a cell; fine grids share
 //! their entries by a hash.
 //!
-//! Level l has R_l = ⌊base·g^l⌋ cells a side with g = (finest/base)^{1/(levels−1)}. A point u in \[0,1\]^d is at
-//! u·(R_l − 1) + ½, so that corners of no two levels coincide at 0. A level with (R_l + 1)^d ≤ 2^log2_size corners has
-//! an entry for each, any other finds its corners at (⊕ c_k π_k) mod 2^log2_size.
-//! A level's gradient is scattered by one task in the order of the rows: the bits do not depend on the number of
-//! threads.
+//! Level l has R_l = ⌊base·g^l⌋ cells a side with g = (finest/base)^{1/(levels−1)}. A point u in \[0,1\]^d is at u·(R_l
+//! − 1) + ½, so that corners of no two levels coincide at 0. A level with (R_l + 1)^d ≤ 2^log2_size corners has an
+//! entry for each, any other finds its corners at (⊕ c_k π_k) mod 2^log2_size. A level's gradient is scattered by one
+//! task in the order of the rows: the bits do not depend on the number of threads.
 //! Source: Müller et al. 2022 (Instant-NGP) §3 and its conventions in tiny-cuda-nn.
 
 use crate::math::{Real, Rng};

@@ -225,10 +225,7 @@ impl Planes {
         d: &mut Grads<F>,
     ) -> F {
         let width = self.shape.features();
-        assert!(
-            d_out.len() == x.len() * width && d_x.len() == x.len(),
-            "gradients have the shapes of their values"
-        );
+        assert!(d_out.len() == x.len() * width && d_x.len() == x.len(), "gradients have the shapes of their values");
         let (levels, blocks, simd) = (self.levels(p, lines, unlocked), self.blocks(), Simd::detect());
         let keys: Vec<Key> = self.keys[..levels.len()].as_flattened().to_vec();
         let mut tables = d.many(&keys);
@@ -270,8 +267,8 @@ impl Planes {
 }
 
 /// Fills a plane with bilinear blends of `points` by `points` random numbers per channel. Independent grid points, as
-/// in the released code, give neighbours unrelated features, and networks train for long before they can separate
-/// a motion of a region from noise: mutant at 200x200 reached 25.9 dB after 600 steps, and 30.1 dB from smooth planes.
+/// in the released code, give neighbours unrelated features, and networks train for long before they can separate a
+/// motion of a region from noise: mutant at 200x200 reached 25.9 dB after 600 steps, and 30.1 dB from smooth planes.
 fn smooth<F: Real>(data: &mut [F], size: [usize; 2], channels: usize, points: usize, stream: Rng) {
     let counts = size.map(|n| points.min(n));
     // The random point before a grid point, and how far that is on the way to the next.

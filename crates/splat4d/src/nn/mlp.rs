@@ -2,9 +2,9 @@
 //! are worked on while it is in the cache.
 //!
 //! a₀ = x, aᵢ₊₁ = max(0, aᵢ Wᵢᵀ + bᵢ), out = a_D W_Dᵀ + b_D; where `skip` = s the input of layer s + 1 is [a_{s+1}, x].
-//! Backward: dWᵢ = dYᵢᵀ aᵢ, dbᵢ = Σ_rows dYᵢ, daᵢ = dYᵢ Wᵢ, masked where aᵢ is not positive.
-//! Weight gradients are summed over a fixed number of runs of chunks and then in the order of the runs, so that the
-//! bits do not depend on the number of threads.
+//! Backward: dWᵢ = dYᵢᵀ aᵢ, dbᵢ = Σ_rows dYᵢ, daᵢ = dYᵢ Wᵢ, masked where aᵢ is not positive. Weight gradients are
+//! summed over a fixed number of runs of chunks and then in the order of the runs, so that the bits do not depend on
+//! the number of threads.
 //! Source: Yang et al. 2024 (Deformable 3D Gaussians) §3; weights start as He et al. 2015 §2.2.
 
 use super::matmul::{Matrix, product};

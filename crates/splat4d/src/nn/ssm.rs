@@ -1,9 +1,9 @@
 //! A diagonal complex state-space layer (S4D): sixteen sequences at a time, each with its own channels.
 //!
-//! h'(τ) = Λh + Bu, y = Re(Ch) + Du with Λ = −exp(a) + iω, held constant over a tick (zero-order hold):
-//! hₙ = Āhₙ₋₁ + B̄uₙ, z = ΔΛ·gap, Ā = e^z, B̄ = Δ·gap·φ(z)·B, φ(z) = (e^z − 1)/z. Real parts of Λ are negative by
-//! construction, hence |Ā| < 1. The backward is the reverse scan λₙ = conj(C)gₙ + conj(Āₙ₊₁)λₙ₊₁; states are not kept
-//! but made again, [`CHUNK`] ticks at a time, from marks that the forward scan leaves.
+//! h'(τ) = Λh + Bu, y = Re(Ch) + Du with Λ = −exp(a) + iω, held constant over a tick (zero-order hold): hₙ = Āhₙ₋₁ +
+//! B̄uₙ, z = ΔΛ·gap, Ā = e^z, B̄ = Δ·gap·φ(z)·B, φ(z) = (e^z − 1)/z. Real parts of Λ are negative by construction,
+//! hence |Ā| < 1. The backward is the reverse scan λₙ = conj(C)gₙ + conj(Āₙ₊₁)λₙ₊₁; states are not kept but made again,
+//! [`CHUNK`] ticks at a time, from marks that the forward scan leaves.
 //!
 //! Source: Gu et al. 2022 (S4D). Gradients of complex numbers are ∂L/∂Re + i·∂L/∂Im throughout.
 

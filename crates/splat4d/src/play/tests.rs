@@ -81,7 +81,7 @@ fn a_player_shows_exactly_what_the_scene_holds() {
 }
 
 #[test]
-fn a_layer_that_lives_for_ever_is_shown_whole() {
+fn a_layer_with_infinite_lifespans_is_shown_whole() {
     let mut params = crate::scene::Params::new(3, 1, &[]);
     let motion = crate::motion::build(&crate::motion::Spec::Still, &mut params).unwrap();
     // A model may raise an opacity that is next to nothing as it is learnt: the lookup must not judge by it.

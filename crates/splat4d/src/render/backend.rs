@@ -97,8 +97,7 @@ pub trait Backend<F: Real = f32>: Send {
     ) -> Result<()>;
 
     /// Renders, compares with the truth and takes the gradient of that loss back, without the image ever leaving the
-    /// device.
-    /// Targets, overwritten and added to, as of [`vjp`](Self::vjp). `None`: it cannot, and nothing was done.
+    /// device. Targets, overwritten and added to, as of [`vjp`](Self::vjp). `None`: it cannot, and nothing was done.
     ///
     /// Errors: as of `render`. Panics: the truth has another size than the camera's image.
     fn compare(

@@ -5,8 +5,8 @@
 //! W₁ 6x12, W₂ 3x6, no biases. Where W₂ is zero, which is the start, colours are those of a scene without a head.
 //!
 //! Source: Li et al. 2024 (Spacetime Gaussians) §4.1. Ours: theirs blends logits, ours blends colours and takes the
-//! logit of the output, so that the head starts as the identity, transparency mixes colours as everywhere else, and
-//! the background needs no logit; and origins are squashed, so that the unit of length matters little.
+//! logit of the output, so that the head starts as the identity, transparency mixes colours as everywhere else, and the
+//! background needs no logit; and origins are squashed, so that the unit of length matters little.
 
 use super::simd::{Kernel, Simd, dispatch, select};
 use super::{Image, RenderGrads, Renderer, Shot};

@@ -2,10 +2,9 @@
 //!
 //! *Contribution*: Σ over pixels of α_i T_i, T_i = Π_{j<i} (1 − α_j): the gradient of a channel's sum to that channel,
 //! which the backward pass would compute together with eleven other numbers. *Removal*: the change that it makes to be
-//! without the
-//! splat, Σ over pixels and channels of (α_i T_i (b_i − c_i))², b_i the colour of all that is behind: exact for one
-//! splat alone (pixels that had stopped stay stopped). A splat before others of its colour contributes much and changes
-//! little.
+//! without the splat, Σ over pixels and channels of (α_i T_i (b_i − c_i))², b_i the colour of all that is behind: exact
+//! for one splat alone (pixels that had stopped stay stopped). A splat before others of its colour contributes much and
+//! changes little.
 //!
 //! *Sensitivity*: how strongly the image depends on a splat. A pixel's channels depend on its shape through ln α alone,
 //! with the slope v_c = αT(c − b), and ln α = ln o − ½ dᵀ Q d, d = μ − p, Q the conic. Its gradient to (μ, Q) is a
@@ -98,9 +97,8 @@ impl<F: Real> Renderer<F> {
     /// Σ over pixels of α_i Π_{j<i} (1 − α_j) of every splat: how much of the image it is. No colour is examined.
     ///
     /// `out` is overwritten, one per splat; exactly 0 where no pixel shows it. Renders no image; no backward may
-    /// follow. Costs
-    /// less than a render's blend. Source: the significance of LightGaussian (Fan et al. 2024) and the spatial score of
-    /// 4DGS-1K (Yuan et al. 2025).
+    /// follow. Costs less than a render's blend. Source: the significance of LightGaussian (Fan et al. 2024) and the
+    /// spatial score of 4DGS-1K (Yuan et al. 2025).
     pub(crate) fn contributions(&mut self, splats: &Splats<'_, F>, camera: &Camera, out: &mut Vec<F>) {
         self.list(splats, camera);
         self.last_contributions(out);
@@ -112,19 +110,16 @@ impl<F: Real> Renderer<F> {
     }
 
     /// Σ over pixels and channels of the squared change that a splat's removal would make to the image, one per splat,
-    /// exact
-    /// for each alone.
+    /// exact for each alone.
     ///
     /// Neither head nor further channels are examined: it is the base colours' image that changes. `out` is
-    /// overwritten,
-    /// one per splat. Renders by itself; no backward may follow.
+    /// overwritten, one per splat. Renders by itself; no backward may follow.
     pub(crate) fn removals(&mut self, shot: &Shot<'_, F>, out: &mut Vec<F>) {
         self.list_and_blend(shot);
         self.score_all::<Removal>(Some(shot.background), out);
     }
 
-    /// The sensitivity of the image to each splat: exact sums over its pixels, for splats that stay in front
-    /// of and
+    /// The sensitivity of the image to each splat: exact sums over its pixels, for splats that stay in front of and
     /// behind the same others. Neither head nor further channels are examined: the image is that of the base colours.
     ///
     /// `out` is overwritten, one per splat; zeros where no pixel shows it. Renders by itself; no backward may follow.

@@ -215,8 +215,8 @@ pub struct ResidentNumbers {
 
 /// Keeps a scene's tables and takes steps on them: evaluate, render, compare, backward, Adam.
 ///
-/// Steps are asynchronous: several may be in flight, and their results are returned in order. The results do
-/// not depend on the time of reading.
+/// Steps are asynchronous: several may be in flight, and their results are returned in order. The results do not depend
+/// on the time of reading.
 pub trait Resident {
     /// Takes over all layers, in place of whatever was kept; steps under way are forgotten. `corrections`: Adam's 1/(1
     /// − β₁ⁿ) and 1/(1 − β₂ⁿ) by step count n, the last for all that follow.
@@ -229,9 +229,8 @@ pub trait Resident {
         corrections: &[[f32; 2]],
     ) -> Result<()>;
 
-    /// Begins a step. Returns the results of steps that are done; `None`: an image is too large to be compared in
-    /// one buffer, or no
-    /// pixel of it counts, and nothing was begun.
+    /// Begins a step. Returns the results of steps that are done; `None`: an image is too large to be compared in one
+    /// buffer, or no pixel of it counts, and nothing was begun.
     ///
     /// Errors: the device failed, and nothing kept is to be trusted. Panics: nothing is kept.
     fn step(&mut self, step: &ResidentStep<'_>) -> Result<Option<Vec<ResidentStepped>>>;

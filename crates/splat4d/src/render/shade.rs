@@ -222,9 +222,8 @@ impl<F: Real> Kernel for Forward<'_, F> {
 
 /// Colours of all splats: red, green, blue; culled splats get zeros.
 ///
-/// Shapes: `channels` [all splats]. SH of `degree` at most, clamped at 0 from below; direct colours are
-/// taken as they are, columns beyond the third are not rendered. The direction of view is taken to the axes of each
-/// part's SH.
+/// Shapes: `channels` [all splats]. SH of `degree` at most, clamped at 0 from below; direct colours are taken as they
+/// are, columns beyond the third are not rendered. The direction of view is taken to the axes of each part's SH.
 pub fn forward<F: Real>(projection: &Projection<'_, F>, degree: usize, channels: &mut [[F; CHANNELS]]) {
     let Projection { splats, view, simd, projected } = *projection;
     let (mut first, mut rest) = (0, channels);

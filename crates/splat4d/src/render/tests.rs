@@ -731,8 +731,8 @@ fn sensitivities_are_sums_of_squared_differences() {
     assert!(strong > 6, "{strong} splats matter");
 }
 
-/// Precision of f32 in the backward pass: behind many opaque splats, the remaining light is a small difference of
-/// large sums.
+/// Precision of f32 in the backward pass: behind many opaque splats, the remaining light is a small difference of large
+/// sums.
 #[test]
 fn f32_gradients_are_those_of_f64() {
     let mut s = scene(9, 150, 0.12);

@@ -1,5 +1,4 @@
-//! Feature channels: numbers per Gaussian learnt from images of features (outputs of a network on an image,
-//! or any
+//! Feature channels: numbers per Gaussian learnt from images of features (outputs of a network on an image, or any
 //! other numbers per pixel), in a table of the layer that follows every edit of rows.
 
 use super::{Key, Params, Space, Table};

@@ -134,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn stated_labels_come_back_and_names_are_checked() {
+    fn stated_labels_round_trip_and_names_are_checked() {
         let mut params = Params::<f32>::new(3, 1, &[]);
         state(&mut params, 2, &[Some(1), None, Some(0)]);
         assert_eq!(of(&params), [Some(1), None, Some(0)]);

@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn spacetime_and_freetime_lives_agree_at_width_times_sqrt_two() {
+    fn spacetime_and_freetime_lifespans_agree_at_width_times_sqrt_two() {
         for t in [-0.7, 0.0, 0.2, 1.5] {
             let free = LifeKind::GaussHalf.eval([0.2, -0.5, 0.0], Time(t)).sigma;
             let stg = LifeKind::GaussOne.eval([0.2, -0.5 + 2.0f64.sqrt().ln(), 0.0], Time(t)).sigma;

@@ -140,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn words_come_back_and_damage_is_noticed() {
+    fn mask_words_round_trip_and_damage_is_detected() {
         let m = random(3, 70);
         let again = |words: Vec<u32>| KeyMasks::from_words(m.times().to_vec(), 70, words);
         assert_eq!(again(m.words().to_vec()), Some(m.clone()));

@@ -362,7 +362,7 @@ mod tests {
     }
 
     #[test]
-    fn heavy_points_are_served_better() {
+    fn heavy_points_get_smaller_errors() {
         let points = clouds(3000, 9, 3000, 0.0);
         let weights: Vec<f32> = (0..3000).map(|i| if i < 300 { 50.0 } else { 1.0 }).collect();
         let c = cluster(&points, 9, &weights, 400, 6, Rng::new(1, "k", 0));

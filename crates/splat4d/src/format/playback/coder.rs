@@ -1,5 +1,5 @@
-//! Layers of pages as a reader decodes them, without a file: for training against the numbers
-//! that will be rendered (straight-through quantisation).
+//! Layers of pages as a reader decodes them, without a file: for training against the numbers that will be rendered
+//! (straight-through quantisation).
 
 use super::block::Words;
 use super::layer::{TABLES, columns, decode, keys, paint};

@@ -21,8 +21,7 @@ const STRATEGIES: [CompressionStrategy; 4] = [
 ];
 
 /// One raw deflate stream of `body`: its first `head` bytes, then runs of `run` bytes each, every one in blocks of its
-/// own.
-/// `level` is 0 to 10, 0 the fastest.
+/// own. `level` is 0 to 10, 0 the fastest.
 pub(super) fn deflate(body: &[u8], head: usize, run: usize, level: u32) -> Vec<u8> {
     let (first, rest) = body.split_at(head.min(body.len()));
     let mut parts: Vec<&[u8]> = if first.is_empty() { Vec::new() } else { vec![first] };

@@ -201,8 +201,7 @@ impl Index {
         }
         let json_len = read_u32(index, 0).ok_or_else(short)? as usize;
         let json = index.get(4..).and_then(|rest| rest.get(..json_len)).ok_or_else(short)?;
-        let meta: Meta =
-            serde_json::from_slice(json).map_err(|e| broken(format!("its JSON is invalid: {e}")))?;
+        let meta: Meta = serde_json::from_slice(json).map_err(|e| broken(format!("its JSON is invalid: {e}")))?;
         meta.check()?;
         let rest = &index[4 + json_len..];
         let count = read_u32(rest, 0).ok_or_else(short)? as usize;

@@ -1,8 +1,8 @@
 //! The playback file `.s4d`: a dynamic scene, small, readable in parts, checked. docs/format.md is its specification.
 //!
 //! [`write()`] takes a [`Draft`] (floats, sorted into time spans by the baker), orders, quantises and packs it.
-//! [`Index::parse`] reads the start of a file, `decode_page` and `decode_palette` any section alone, and
-//! [`read()`] a whole file as a scene of one layer per page.
+//! [`Index::parse`] reads the start of a file, `decode_page` and `decode_palette` any section alone, and [`read()`] a
+//! whole file as a scene of one layer per page.
 
 mod block;
 pub(in crate::format) mod cluster;

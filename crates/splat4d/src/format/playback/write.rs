@@ -263,8 +263,8 @@ pub fn write(draft: &Draft, config: &WriteConfig, out: &mut dyn Write) -> Result
         .enumerate()
         .try_for_each(|(i, n)| check(n, &draft.meta).map_err(|e| e.at(format!("node {i}"))))?;
     let (palette, entries) = palette(draft, config);
-    // First what the first image needs: the important Gaussians of the clip's start in their base colours, what
-    // colours them, the rest of them; then time continues.
+    // First what the first image needs: the important Gaussians of the clip's start in their base colours, what colours
+    // them, the rest of them; then time continues.
     let start = draft.meta.clip[0];
     let mut pieces = pieces(draft, config);
     let holds = |p: &Piece| draft.nodes[p.node].from <= start && start < draft.nodes[p.node].to;

@@ -170,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn straight_paths_come_back_exactly() {
+    fn straight_paths_round_trip_exactly() {
         for life in [LifeKind::GaussHalf, LifeKind::GaussOne] {
             let mut scene = moving(200, life, 1, false);
             let sh = crate::format::samples::gaussians(200, 9)[SH].clone();

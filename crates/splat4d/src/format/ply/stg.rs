@@ -1,9 +1,9 @@
 //! The `.ply` of Spacetime Gaussians (STG, "lite"): moving Gaussians, all f32.
 //!
 //! x y z, trbf_center, trbf_scale (log of s), nx ny nz, motion_0..8 (units per clip, clip², clip³), f_dc_0..2 (**plain
-//! RGB**, not SH coefficients), opacity (logit), scale_0..2 (log), rot_0..3 (wxyz), omega_0..3. The fade is
-//! exp(−((t − centre)/s)²), no ½; t runs from 0 to 1, and 1 is one frame behind the last. The full model's f_t_* feed
-//! a network that is not in the file. Our files specify clip and frame rate in a comment.
+//! RGB**, not SH coefficients), opacity (logit), scale_0..2 (log), rot_0..3 (wxyz), omega_0..3. The fade is exp(−((t −
+//! centre)/s)²), no ½; t runs from 0 to 1, and 1 is one frame behind the last. The full model's f_t_* feed a network
+//! that is not in the file. Our files specify clip and frame rate in a comment.
 //! Source: oppo-us-research/SpacetimeGaussians (MIT), splaTV's importer.
 
 use super::header::{Element, Header, broken};
@@ -171,7 +171,7 @@ mod tests {
     use crate::scene::{LifeKind, Time};
 
     #[test]
-    fn a_moving_scene_comes_back_in_f32() {
+    fn a_dynamic_scene_round_trips_in_f32() {
         for life in [LifeKind::Infinite, LifeKind::GaussHalf, LifeKind::GaussOne] {
             let scene = moving(300, life, 3, true);
             let mut file = Vec::new();

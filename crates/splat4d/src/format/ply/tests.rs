@@ -237,7 +237,7 @@ fn rows_that_the_header_does_not_count_are_reported() {
 }
 
 #[test]
-fn infinities_that_mean_something_are_no_damage() {
+fn meaningful_infinities_are_accepted() {
     // No writer of ours writes infinities: they take the place of numbers that occur once.
     let marks =
         [(1, OPACITY, 1234.5, f32::INFINITY), (2, LOG_SCALE, 2345.5, f32::NEG_INFINITY), (3, 0, 3456.5, f32::INFINITY)];

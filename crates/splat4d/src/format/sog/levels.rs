@@ -105,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn the_finest_level_is_joined_from_its_pieces() {
+    fn the_finest_level_is_joined_from_its_parts() {
         let found = finest(index().to_string().as_bytes()).unwrap();
         assert_eq!(found.levels, 2);
         let names: Vec<&str> = found.pieces.iter().map(|(n, _)| n.as_str()).collect();

@@ -152,7 +152,7 @@ fn version_4_by_hand() {
 }
 
 #[test]
-fn every_version_and_degree_comes_back_within_its_steps() {
+fn every_version_and_degree_round_trips_within_its_steps() {
     for version in VERSIONS {
         for coefficients in [1, 4, 9, 16] {
             let p = gaussians(700, coefficients);

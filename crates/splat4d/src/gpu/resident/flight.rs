@@ -1,11 +1,9 @@
 //! Steps under way: begun without a wait, and done some steps later, when the GPU has written their record
 //! (record.wgsl).
 //!
-//! If a view has more pairs than fit, the GPU stops: nothing later is applied, neither of that
-//! step nor of later ones, which may already be in flight. The reader of the record enlarges the buffers, or cuts
-//! images into more bands, and
-//! starts again from that view. A step is a function of its inputs, so that neither the buffer size nor
-//! the time at
+//! If a view has more pairs than fit, the GPU stops: nothing later is applied, neither of that step nor of later ones,
+//! which may already be in flight. The reader of the record enlarges the buffers, or cuts images into more bands, and
+//! starts again from that view. A step is a function of its inputs, so that neither the buffer size nor the time at
 //! which its record is read changes a bit.
 
 use super::{ResidentPass, STEP_WORDS, Tables, VIEW_WORDS};

@@ -1,5 +1,4 @@
-//! The kernels of Gaussians of space and time against the motion model, in f64, at the edges of the number range
-//! too.
+//! The kernels of Gaussians of space and time against the motion model, in f64, at the edges of the number range too.
 
 use super::*;
 use crate::gpu::MOST_PAIRS;
@@ -55,7 +54,7 @@ fn compare(what: &str, got: &[f64], expected: &[f64]) {
 }
 
 #[test]
-fn slices_equal_the_model_forth_and_back() {
+fn slices_equal_the_model_forward_and_backward() {
     let Some(mut r) = renderer() else { return };
     let spec = Native4dSpec { speed: 2.0, min_life: 0.05, max_life: 3.0, ..Native4dSpec::default() };
     let ((single, own, _), (double, _, motion), t) = (params::<f32>(&spec), params::<f64>(&spec), 0.125);
@@ -238,7 +237,7 @@ fn far_and_near() -> [Vec<Camera>; 3] {
 }
 
 #[test]
-fn steps_under_way_room_bands_and_pages_change_no_bit() {
+fn steps_in_flight_buffer_sizes_bands_and_pages_change_no_bit() {
     let Some(mut r) = own_renderer() else { return };
     let [first, then, last] = far_and_near();
     let steps: Vec<(&[Camera], f64)> =
@@ -307,7 +306,7 @@ fn a_non_finite_value_stops_later_steps_and_its_step_is_reported() {
 }
 
 #[test]
-fn a_device_that_is_lost_under_way_is_an_error() {
+fn a_device_lost_during_a_step_is_an_error() {
     let Some(mut r) = own_renderer() else { return };
     let camera = camera([0.0, 0.0, -4.0], 33, 20);
     stepped(&mut r, &one(&camera));

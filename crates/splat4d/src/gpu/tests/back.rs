@@ -416,7 +416,7 @@ fn a_device_that_is_lost_is_an_error_and_not_a_panic() {
 }
 
 #[test]
-fn a_gradient_that_is_no_number_is_an_error_and_the_next_is_not() {
+fn a_non_finite_gradient_is_an_error_and_the_next_is_not() {
     let Some(mut r) = renderer() else { return };
     let (scene, camera) = (Scenery::new(60, 300, 1.0, 0.1), camera([0.0, 0.5, -4.0], 40, 30));
     let (splats, mut pulled) = (scene.splats(), Pulled::new(61, &camera));

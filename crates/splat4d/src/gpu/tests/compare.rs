@@ -1,5 +1,4 @@
-//! Comparing on the GPU: value and gradient against the definition in f64, then the whole against the
-//! CPU.
+//! Comparing on the GPU: value and gradient against the definition in f64, then the whole against the CPU.
 
 use super::*;
 use crate::render::{Comparison, PartGrads, Target};
@@ -119,7 +118,7 @@ fn compared(r: &mut GpuRenderer, shot: &Shot<'_>, target: &Target<'_>) -> (Compa
 }
 
 #[test]
-fn value_and_gradient_equal_the_definition_and_the_way_through_the_cpu() {
+fn value_and_gradient_equal_the_definition_and_the_cpu() {
     let Some(mut r) = renderer() else { return };
     let scene = Scenery::new(80, 400, 1.2, 0.08);
     let cameras = [camera([0.0, 0.5, -4.0], 67, 45), skewed(16, 33), camera([0.2, 0.1, -0.8], 5, 3)];

@@ -54,7 +54,7 @@ fn ids(rows: Rows<'_>) -> Option<Vec<u32>> {
 }
 
 #[test]
-fn equal_questions_are_one_and_rows_are_united() {
+fn equal_queries_are_merged_with_their_rows() {
     let mut e = Evaluation::<f64>::default();
     let t = Time(0.3);
     assert_eq!(e.request(0, Space::Gaussians, Rows::Some(&[1, 4, 9]), t), 0);

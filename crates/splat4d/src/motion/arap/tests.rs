@@ -71,7 +71,7 @@ fn what_is_not_tied_to_a_handle_stays() {
 }
 
 #[test]
-fn odd_questions_have_answers() {
+fn odd_queries_have_results() {
     assert!(drag(&[], &[], 3).unwrap().positions.is_empty());
     let one = Handle { node: 0, target: [1.0, 2.0, 3.0], rotation: None };
     assert_eq!(drag(&[[0.0; 3]], &[one], 3).unwrap().positions, [[1.0, 2.0, 3.0]]);

@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 
 /// c ↦ curve(M c + o), channel by channel in the curve; colours are 0 to 1.
 ///
-/// On spherical harmonics the base colour is mapped by it, and all that varies with direction by its slope there:
-/// exact where there is no curve.
+/// On spherical harmonics the base colour is mapped by it, and all that varies with direction by its slope there: exact
+/// where there is no curve.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ColorMap {

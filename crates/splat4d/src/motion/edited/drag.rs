@@ -14,9 +14,8 @@ const NODE: usize = 10;
 /// A drag as plain data; its numbers are tables.
 ///
 /// `drag_nodes.INDEX` holds place p, shift T and turn R of every node at every key time, along broken lines between
-/// them.
-/// `drag_pulls@INDEX` holds for every Gaussian K node numbers and K weights a_k with Σ a_k ≤ 1; with weights of zero it
-/// stays as given by the inner model. μ' = μ + Σ a_k (R_k (μ − p_k) + p_k + T_k − μ).
+/// them. `drag_pulls@INDEX` holds for every Gaussian K node numbers and K weights a_k with Σ a_k ≤ 1; with weights of
+/// zero it stays as given by the inner model. μ' = μ + Σ a_k (R_k (μ − p_k) + p_k + T_k − μ).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DragSpec {

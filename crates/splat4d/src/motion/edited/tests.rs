@@ -66,7 +66,7 @@ fn rigidly_moving_nodes_move_their_gaussians_alone() {
 }
 
 #[test]
-fn what_cannot_be_is_refused() {
+fn invalid_changes_are_refused() {
     let mut p = Params::<f32>::new(2, 1, &[]);
     let key = |t| PathKey { t, ..PathKey::default() };
     for (change, word) in [

@@ -138,8 +138,8 @@ impl Native4d {
     }
 }
 
-/// Allocates `blocks` blocks of SH coefficients. A table of one block differs from one of several by its width: 1,
-/// 4, 9 and 16 coefficients are no whole number of blocks of one another, but for one block.
+/// Allocates `blocks` blocks of SH coefficients. A table of one block differs from one of several by its width: 1, 4, 9
+/// and 16 coefficients are no whole number of blocks of one another, but for one block.
 fn widen<F: Real>(p: &mut Params<F>, blocks: usize) -> Result<()> {
     let (rows, width) = (p.len(), p[SH].width());
     let whole = |width: usize| matches!(width, 3 | 12 | 27 | 48);

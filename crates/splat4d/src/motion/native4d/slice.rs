@@ -2,8 +2,8 @@
 //! vectorise.
 //!
 //! Everything here is in the coordinates (x, y, z, κt), κ in scene units per second. A rotation of four dimensions is a
-//! pair of unit quaternions, X ↦ l X r̄ with X = κt + xi + yj + zk. With L = R·diag(s), its last row ℓ, c = ‖ℓ‖² and
-//! v = L₃ℓᵀ, the slice has the mean μ + v·τ/c, τ = κ(t − μ_t), and the covariance L₃(1 − ℓᵀℓ/c)L₃ᵀ. The bracket is a
+//! pair of unit quaternions, X ↦ l X r̄ with X = κt + xi + yj + zk. With L = R·diag(s), its last row ℓ, c = ‖ℓ‖² and v
+//! = L₃ℓᵀ, the slice has the mean μ + v·τ/c, τ = κ(t − μ_t), and the covariance L₃(1 − ℓᵀℓ/c)L₃ᵀ. The bracket is a
 //! projector, so that the covariance is KKᵀ, K = L₃(1 − ℓᵀℓ/c): no difference of large numbers, never indefinite.
 //! Source: Yang et al. 2024 ("Real-time 4DGS") §4; the projector is our own.
 

@@ -369,7 +369,7 @@ fn colours_in_time_have_their_period_are_even_and_join_the_table() {
 }
 
 #[test]
-fn splits_keep_the_distribution_and_resizing_keeps_velocity_and_life() {
+fn splits_keep_the_distribution_and_resizing_keeps_velocity_and_lifespan() {
     let rows = 4000;
     let mut params = Params::<f64>::new(rows, 1, &[]);
     let motion = Native4d::new(SPEC, &mut params).unwrap();
@@ -403,7 +403,7 @@ fn splits_keep_the_distribution_and_resizing_keeps_velocity_and_life() {
 }
 
 #[test]
-fn far_from_its_life_everything_is_a_number() {
+fn far_from_its_lifespan_everything_is_finite() {
     let l = layer(20, SPEC);
     let single = Layer::new(
         "b",

@@ -108,7 +108,7 @@ const ABSOLUTE: (Output, Mode) = (Output::Absolute, Mode::Bidirectional);
 const TWIST: (Output, Mode) = (Output::Twist, Mode::Causal);
 
 #[test]
-fn fifty_motions_of_the_scene_move_the_answer_alike() {
+fn results_are_equivariant_to_fifty_motions_of_the_scene() {
     for (e, mirrors) in [(Equivariance::Frames, false), (Equivariance::Vector, false), (Equivariance::Vector, true)] {
         for (output, mode) in [ABSOLUTE, TWIST] {
             let spec = small(e, output, mode);
@@ -123,7 +123,7 @@ fn fifty_motions_of_the_scene_move_the_answer_alike() {
 }
 
 #[test]
-fn what_is_not_equivariant_is_found_out() {
+fn non_equivariant_networks_are_detected() {
     // The same test must fail for a network that knows where nodes are, and for frames where the scene is mirrored.
     for (e, mirrors) in [(Equivariance::None, false), (Equivariance::None, true), (Equivariance::Frames, true)] {
         let spec = small(e, Output::Absolute, Mode::Bidirectional);

@@ -105,7 +105,7 @@ fn windows_with_carried_states_and_any_chunk_equal_the_whole_scan() {
 }
 
 #[test]
-fn a_scan_forward_never_sees_the_future() {
+fn a_forward_scan_does_not_depend_on_the_future() {
     let (ticks, of) = (20, Discrete::new(SHAPE, &weights_of(SHAPE, 7), &[1.0]));
     let u = random(3 * ticks, 8);
     let mut other = u.clone();

@@ -49,7 +49,7 @@ fn bits(layer: &Layer<f32>) -> Vec<u32> {
 }
 
 #[test]
-fn the_coder_shows_what_a_reader_of_the_file_sees_bit_for_bit() {
+fn the_coder_equals_a_reader_bit_for_bit() {
     let least =
         Depths { position: 2, center: 2, scale: 2, opacity: 2, rotation: 2, shift: 2, turn: 2, color: 2, life: 2 };
     for (degree, depths) in [(0, Depths::default()), (1, coarse()), (3, Depths::default()), (2, least)] {
@@ -88,7 +88,7 @@ fn the_coder_shows_what_a_reader_of_the_file_sees_bit_for_bit() {
 }
 
 #[test]
-fn only_wanted_blocks_change() {
+fn only_selected_blocks_change() {
     let pages = trained(2300, 1, 30);
     let (layer, labels) = (&pages.layers[0], &pages.labels[0]);
     let rows = layer.params.len();
@@ -114,7 +114,7 @@ fn only_wanted_blocks_change() {
 }
 
 #[test]
-fn pages_as_they_are_come_back_almost_unchanged() {
+fn unchanged_pages_round_trip_almost_exactly() {
     let pages = pages(3000, 2, 31);
     let again = read_pages(&written(&pages, Depths::default())).unwrap();
     for (a, b) in pages.layers.iter().zip(&again.layers) {
@@ -131,7 +131,7 @@ fn pages_as_they_are_come_back_almost_unchanged() {
 }
 
 #[test]
-fn a_layer_becomes_primitives_and_a_layer_again() {
+fn layers_round_trip_through_primitives() {
     let pages = trained(1200, 1, 32);
     for (layer, labels) in pages.layers.iter().zip(&pages.labels) {
         let p = primitives(layer);
@@ -223,7 +223,7 @@ fn coarse_codes_are_half_a_step_off_at_most() {
 }
 
 #[test]
-fn what_cannot_be_coded_is_named() {
+fn uncodable_layers_are_named() {
     let refused = |change: fn(&mut Pages, &mut Depths)| {
         let (mut pages, mut depths) = (pages(400, 1, 35), Depths::default());
         change(&mut pages, &mut depths);
@@ -253,7 +253,7 @@ fn what_cannot_be_coded_is_named() {
 }
 
 #[test]
-fn a_file_of_several_palettes_is_no_file_to_work_on() {
+fn files_with_several_palettes_are_refused() {
     let (file, _) = bytes_of(&made_up(400, 1, 38), &WriteConfig::default());
     assert_eq!(read_pages(&file).unwrap().scene().len(), 400);
     let mut index = Index::parse(&file, None).unwrap();

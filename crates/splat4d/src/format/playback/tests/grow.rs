@@ -1,5 +1,5 @@
-//! Files that grow: the present part plays at any time, and a finished file is like any other, in whatever order
-//! it was added.
+//! Files that grow: the present part plays at any time, and a finished file is like any other, in whatever order it was
+//! added.
 
 use super::*;
 use std::io::{Cursor, ErrorKind as Io, Read, Seek, SeekFrom, Write};
@@ -108,7 +108,7 @@ impl Write for Small {
 }
 
 #[test]
-fn on_a_full_disk_the_file_stays_what_it_was_and_grows_once_there_is_room() {
+fn on_a_full_disk_the_file_is_unchanged_and_grows_later() {
     let [one, two] = [part(1, 0.0), part(2, 0.5)];
     let room = one.len() + two.len() / 2;
     let mut growing = Growing::begin(Small(Cursor::new(Vec::new()), room), meta(0.0, &[])).unwrap();

@@ -178,7 +178,7 @@ fn inconsistent_sizes_are_refused_by_name() {
 }
 
 #[test]
-fn numbers_that_are_no_numbers_are_refused() {
+fn non_finite_numbers_are_refused() {
     let (sample, _) = bytes_of(&tiny(), &WriteConfig { deflate_level: 0, ..WriteConfig::default() });
     let index = Index::parse(&sample, None).unwrap();
     let first = index.sections[1].offset as usize;

@@ -24,7 +24,7 @@ fn counts(scene: &Scene<f32>) -> [usize; 4] {
 }
 
 #[test]
-fn labels_come_back_through_drafts_and_pages() {
+fn labels_round_trip_through_drafts_and_pages() {
     let draft = labelled(400);
     let (bytes, _) = bytes_of(&draft, &WriteConfig::default());
     let index = Index::parse(&bytes, None).unwrap();

@@ -218,7 +218,7 @@ fn causal(ticks: usize, seconds: f64) -> SsmSpec {
 
 /// Ten seconds at thirty ticks a second.
 #[test]
-fn node_paths_are_learnt_and_carried_on_better_than_by_a_perceptron() {
+fn node_paths_are_learnt_and_extrapolated_better_than_by_a_perceptron() {
     let steps = 150;
     let (ssm, mlp) = (fit_ssm(&causal(300, 10.0), path, 300, steps), fit_mlp(path, 300, 10.0, 64, steps));
     println!("10 s, {steps} steps: ssm {ssm}, mlp {mlp}");
