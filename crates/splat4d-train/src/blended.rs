@@ -1,6 +1,5 @@
 //! Numbers of Gaussians as training images blend them, and the backward pass: what is learnt next to images while
-//! shapes, places
-//! and colours are not changed ([`labels`](crate::labels), [`features`](crate::features)).
+//! shapes, places and colours are not changed ([`labels`](crate::labels), [`features`](crate::features)).
 
 use crate::capture::Capture;
 use splat4d::layers::{Evaluation, Scene};

@@ -148,10 +148,9 @@ fn pass(
     Ok((sum, loss, pixels))
 }
 
-/// Learns the features of the capture's training images into the scene, in place of those it had. Returns the mean
-/// loss of a
-/// known pixel before each round and after the last. `progress` receives how many images of how many are done, and may
-/// end the work.
+/// Learns the features of the capture's training images into the scene, in place of those it had. Returns the mean loss
+/// of a known pixel before each round and after the last. `progress` receives how many images of how many are done, and
+/// may end the work.
 ///
 /// Errors: those of `progress`; no training image has features; one that cannot be read, or of other channels than the
 /// first.
@@ -358,7 +357,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_named() {
+    fn invalid_features_are_named() {
         let folder = tempfile::tempdir().unwrap();
         let mut capture = capture(folder.path());
         let say = |shape: &[usize], values: &[f32], capture: &Capture| {

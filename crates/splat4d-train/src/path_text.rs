@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn paths_come_back_as_they_were() {
+    fn paths_round_trip() {
         let mut paths = vec![PathBuf::from("a b/100 %.png"), PathBuf::from("ü\n"), PathBuf::from("%bytes:x")];
         #[cfg(unix)]
         paths.push(PathBuf::from(<OsString as std::os::unix::ffi::OsStringExt>::from_vec(b"/t/f_\xff%.ply".to_vec())));

@@ -2,11 +2,9 @@
 //! and a run repeats bit for bit from it (on the same SIMD level).
 //!
 //! Tables are declared next to what they set (`settings!`); here they are only put together. Learning rates of
-//! positions
-//! are in units of the scene's extent; everything with time in it is stated per clip length. Iteration settings left
-//! at 0
-//! follow from `run.iterations` (see [`Recipe::resolve`]). Names without a table (`max_cap` for `densify.max_cap`),
-//! which recipes had before they had tables, are read as well.
+//! positions are in units of the scene's extent; everything with time in it is stated per clip length. Iteration
+//! settings left at 0 follow from `run.iterations` (see [`Recipe::resolve`]). Names without a table (`max_cap` for
+//! `densify.max_cap`), which recipes had before they had tables, are read as well.
 
 mod chunks;
 mod flat;
@@ -85,8 +83,8 @@ impl Recipe {
         if many { self.densify.max_cap as f64 / LEAST as f64 } else { 1.0 }
     }
 
-    /// Lets schedules with the default for their length follow another length: what a run saved of them is
-    /// set back, what was chosen otherwise stays.
+    /// Lets schedules with the default for their length follow another length: what a run saved of them is set back,
+    /// what was chosen otherwise stays.
     #[must_use]
     pub fn unresolved(&self) -> Self {
         let follows = Self {

@@ -45,8 +45,8 @@ const WINDOW_SHARE: f64 = 0.8;
 pub(crate) struct Timeline {
     frames: Vec<Vec<u32>>,
     count: usize,
-    /// The permutation used last: seed, address, length and the order itself. Without it every step would shuffle
-    /// all frames of the capture to learn of one.
+    /// The permutation used last: seed, address, length and the order itself. Without it every step would shuffle all
+    /// frames of the capture to learn of one.
     order: Arc<Mutex<(u64, u64, Vec<u32>)>>,
 }
 

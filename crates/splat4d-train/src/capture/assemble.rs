@@ -291,8 +291,8 @@ fn warn_of_shared(shared: usize, warnings: &mut Vec<String>) {
     }
 }
 
-/// One camera takes one image at a time. Where the data set names none, one "camera" may represent several, so that
-/// the pose counts too.
+/// One camera takes one image at a time. Where the data set names none, one "camera" may represent several, so that the
+/// pose counts too.
 fn check_duplicates(take: &mut RawCapture, cameras: &[Rig]) -> Result<()> {
     let mut groups: BTreeMap<(usize, u64), Vec<usize>> = BTreeMap::new();
     let mut shared = 0;
@@ -425,10 +425,9 @@ fn fits(size: (usize, usize), camera: &Camera) -> bool {
     size == (camera.width, camera.height) || picture::is_resized(size, camera)
 }
 
-/// Compares the sizes of the images with their intrinsics, and scales those where images were resized; returns
-/// whether any image has an alpha channel, for each whether its EXIF orientation is applied, and those of which
-/// sizes do
-/// not specify it.
+/// Compares the sizes of the images with their intrinsics, and scales those where images were resized; returns whether
+/// any image has an alpha channel, for each whether its EXIF orientation is applied, and those of which sizes do not
+/// specify it.
 fn fit_pictures(take: &mut RawCapture, options: &CaptureOptions) -> Result<(bool, Vec<bool>, Vec<usize>)> {
     let mut alpha = false;
     let mut resized = Vec::new();

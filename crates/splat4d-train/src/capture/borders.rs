@@ -36,8 +36,7 @@ const MIXED: usize = 2;
 const INSIDE: usize = MIXED + 2;
 /// Share of the content behind a border that is not black. Chosen between the two kinds: content is bright in most
 /// places, and the outline of an object on black is dark in nearly all images. Ten real and synthetic captures are
-/// distinguished
-/// (studies/records/2026-11-26-real-size.md).
+/// distinguished (studies/records/2026-11-26-real-size.md).
 const BRIGHT: f64 = 0.5;
 /// Share of each of two opposite edges that is black: an undistorted or letterboxed image has both.
 const OF_AN_EDGE: f64 = 0.5;

@@ -226,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pose_comes_back_from_every_convention() {
+    fn poses_round_trip_in_every_convention() {
         let truth = Se3::look_at([3.0, -2.0, 1.5], [0.2, 0.1, 0.0], [0.0, 0.0, 1.0]);
         for stated in [Convention::COLMAP, Convention::OPENCV, Convention::NERF] {
             assert!(apart(&stated.misread(&truth, Poses::STATED), &truth) < 1e-12);

@@ -24,8 +24,8 @@ pub(super) fn key(path: &Path) -> String {
     parts.collect::<Vec<_>>().join("/")
 }
 
-/// The similarity from the second world into the first, the identity where they already agree; `pairs` are one
-/// camera's poses in both. Errors: they do not agree, and by how much.
+/// The similarity from the second world into the first, the identity where they already agree; `pairs` are one camera's
+/// poses in both. Errors: they do not agree, and by how much.
 pub(super) fn align(pairs: &[(Se3, Se3)]) -> Result<Sim3> {
     const REMEDY: &str = "Points of the poses' own world can be named by ply_file_path, or by --set init=FILE.";
     if pairs.len() < LEAST {

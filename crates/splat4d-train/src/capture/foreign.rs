@@ -1,6 +1,5 @@
 //! Exports of capture programs and telephones: Metashape, RealityScan, Polycam, Record3D. Each is a file that states
-//! where poses and images are; shared code is here. They were built from public documentation and synthetic
-//! samples.
+//! where poses and images are; shared code is here. They were built from public documentation and synthetic samples.
 
 mod metashape;
 mod polycam;

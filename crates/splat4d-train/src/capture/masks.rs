@@ -1,8 +1,7 @@
 //! Masks that are next to the images of any layout: found by the usual names, and those that fit nothing are counted.
 //!
 //! For the image `cam0/a.jpg` these are, in `masks/` or `mask/`: `cam0/a.jpg.png` (COLMAP), `cam0/a.png`,
-//! `cam0/a_mask.png`,
-//! `cam0/mask_a.png` and `cam0/a.mask.png` (Metashape), with any ending of images.
+//! `cam0/a_mask.png`, `cam0/mask_a.png` and `cam0/a.mask.png` (Metashape), with any ending of images.
 
 use super::account::Severity;
 use super::account::{Aspect, first_names};

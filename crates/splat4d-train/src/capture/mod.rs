@@ -227,8 +227,7 @@ pub struct Capture {
     /// The cameras; a moving camera is one entry that is not `fixed`.
     pub cameras: Vec<Rig>,
     /// Whether the data set, or the names of its images (`cam07`), separate cameras; else an entry is one camera's
-    /// photo of a
-    /// time, or represents many.
+    /// photo of a time, or represents many.
     pub named: bool,
     /// All images, or those that were requested ([`CaptureOptions::frames`]).
     pub frames: Vec<Frame>,

@@ -76,10 +76,9 @@ impl Value for Option<HoldOut> {
     }
 }
 
-/// Default of `capture.near`: a camera that is mounted in a wall is behind the wall's own splats, and haze in
-/// front of places where no training camera is costs nothing. PanopticSports basketball, four minutes, held-out
-/// cameras: 27.1 dB with 0.05 (Kerbl et al. 2023 render nothing nearer than 0.2 units, about that share), 28.1 with
-/// this.
+/// Default of `capture.near`: a camera that is mounted in a wall is behind the wall's own splats, and haze in front of
+/// places where no training camera is costs nothing. PanopticSports basketball, four minutes, held-out cameras: 27.1 dB
+/// with 0.05 (Kerbl et al. 2023 render nothing nearer than 0.2 units, about that share), 28.1 with this.
 const NEAR: f64 = 0.2;
 
 choices! {
@@ -233,8 +232,7 @@ pub struct CaptureOptions {
     /// Share of the images that may be missing.
     pub max_missing: f64,
     /// Only images with these frame numbers are listed, so that memory does not grow with the capture; empty: all. What
-    /// they
-    /// are for (training, held out) is as in the whole capture.
+    /// they are for (training, held out) is as in the whole capture.
     pub frames: Vec<Range<usize>>,
     /// Known properties of the lenses, from another part of the capture; else images are examined.
     pub lenses: Lenses,

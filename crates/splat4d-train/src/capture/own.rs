@@ -138,8 +138,8 @@ fn read_value(root: &Path, top: &Node<'_>, options: &CaptureOptions) -> Result<R
     })
 }
 
-/// Whether the part that is needed can be read alone: of fixed cameras, which are held out as a whole or not at
-/// all. The rest can only be determined from the whole.
+/// Whether the part that is needed can be read alone: of fixed cameras, which are held out as a whole or not at all.
+/// The rest can only be determined from the whole.
 fn in_part(top: &Node<'_>, nodes: &[Node<'_>], told: Option<&HoldOut>, options: &CaptureOptions) -> Result<bool> {
     let by_camera = match told {
         None => nodes.len() > 1,

@@ -218,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cloud_comes_back_from_its_file_bit_by_bit() {
+    fn a_cloud_round_trips_bit_for_bit() {
         let cloud = PointCloud {
             points: vec![[0.1, -2e-9, 3e7], [1.0 / 3.0, 0.0, -0.7]],
             colors: vec![[0.1, 0.2, 1.0], [0.0, 0.7, 1.0 / 3.0]],

@@ -31,8 +31,7 @@ const CLOSE_DEGREES: f64 = 0.5;
 
 /// Between these angles to the nearest training camera new views end to hold, degrees: half the gap between
 /// neighbouring cameras, whose middle is seen from both sides, but nowhere less than what any two images share, and
-/// nowhere more than
-/// what was seen to hold (docs/priors.md).
+/// nowhere more than what was seen to hold (docs/priors.md).
 const REACH_DEGREES: [f64; 2] = [5.0, 15.0];
 /// Of the nearest and of the farthest training camera's distance: nearer than half of it a pixel shows what no image
 /// did.

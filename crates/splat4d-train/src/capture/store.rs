@@ -30,8 +30,8 @@ pub struct Picture {
     pub valid: Option<Planes<f32>>,
     /// [1, height, width] depths of pixels, 0 where unknown, and their kind.
     pub depth: Option<(Planes<f32>, DepthKind)>,
-    /// [3, height, width] optical flow to the next frame of its camera: u right, v down in pixels, and 1 where
-    /// they are known.
+    /// [3, height, width] optical flow to the next frame of its camera: u right, v down in pixels, and 1 where they are
+    /// known.
     pub flow: Option<Planes<f32>>,
 }
 
@@ -79,8 +79,7 @@ impl StoredPicture {
         self.weights_into(self.valid.as_deref(), out)
     }
 
-    /// Writes the depth as [1, height, width] and returns its kind; `None` (and `out` untouched) if there is
-    /// none.
+    /// Writes the depth as [1, height, width] and returns its kind; `None` (and `out` untouched) if there is none.
     pub(crate) fn depth_into(&self, out: &mut Planes<f32>) -> Option<DepthKind> {
         let (values, kind) = self.depth.as_ref()?;
         (out.channels, out.height, out.width) = (1, self.height, self.width);

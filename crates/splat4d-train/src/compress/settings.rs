@@ -244,7 +244,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn settings_come_back_and_mistakes_are_named() {
+    fn settings_round_trip_and_mistakes_are_named() {
         for level in [Level::Plain, Level::Tuned, Level::Pruned] {
             let all = Compression::level(level, 7000);
             all.check().unwrap();

@@ -1,5 +1,5 @@
-//! Alignment of views that were held out: their poses and clocks alone are fitted to an unchanged scene, so
-//! that a scene whose cameras were refined is not judged by where the others' stated poses are.
+//! Alignment of views that were held out: their poses and clocks alone are fitted to an unchanged scene, so that a
+//! scene whose cameras were refined is not judged by where the others' stated poses are.
 
 use crate::Result;
 use crate::capture::{Capture, ImageStore};

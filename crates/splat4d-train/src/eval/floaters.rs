@@ -5,11 +5,11 @@
 //!
 //! > Δ_i = Σ (I − r_i − T)² − Σ (I − T)² = Σ r_i² − 2 Σ r_i (I − T) = removal_i − o_i ∂L/∂o_i,
 //!
-//! because r_i is linear in the opacity o_i: two numbers from the renderer. A training camera *supports* a
-//! Gaussian that it would miss. A floater is seen, supported by a small share of the cameras that see it, not missed by
-//! held-out cameras, and all images together are better without it. That much holds for some Gaussians of every scene,
-//! whose images are never quite right, so that it must also matter to a camera. What removing the Gaussian gains there
-//! is −Δ; the gain from removing the best amount of it, if there were more, is
+//! because r_i is linear in the opacity o_i: two numbers from the renderer. A training camera *supports* a Gaussian
+//! that it would miss. A floater is seen, supported by a small share of the cameras that see it, not missed by held-out
+//! cameras, and all images together are better without it. That much holds for some Gaussians of every scene, whose
+//! images are never quite right, so that it must also matter to a camera. What removing the Gaussian gains there is −Δ;
+//! the gain from removing the best amount of it, if there were more, is
 //!
 //! > max_a Σ (I − T)² − Σ (I − T − a r)² = (Σ r (I − T))² / Σ r² = (Σ r² − Δ)² / (4 Σ r²),
 //!
@@ -50,8 +50,8 @@ pub struct Support {
     pub seen: u32,
     /// Training cameras that would miss it.
     pub missed: u32,
-    /// Its largest effect on any training camera that sees it, in squared error; zero where
-    /// no camera is better without it.
+    /// Its largest effect on any training camera that sees it, in squared error; zero where no camera is better without
+    /// it.
     pub matters: f64,
     /// Σ Δ over held-out images; below zero they are better without it.
     pub held: f64,
@@ -89,8 +89,7 @@ impl Judged {
 }
 
 /// Of every Gaussian what the images show about it: those of `train`, which is a list of numbers of `frames`, and those
-/// that
-/// were held out. `told`: images done, and all.
+/// that were held out. `told`: images done, and all.
 ///
 /// Errors: an image that cannot be read; no held-out images; a scene with a pixel head.
 pub fn support(

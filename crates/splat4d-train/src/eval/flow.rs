@@ -37,8 +37,7 @@ pub struct FlowError {
     pub drawn: f64,
 }
 
-/// Measures a scene on the held-out views with known flow, or else on those of training. `None`:
-/// none has flow.
+/// Measures a scene on the held-out views with known flow, or else on those of training. `None`: none has flow.
 ///
 /// Errors: a file of flow that cannot be read.
 pub fn flow_error(scene: &Scene<f32>, capture: &Capture) -> Result<Option<FlowError>> {

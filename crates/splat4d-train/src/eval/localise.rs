@@ -1,13 +1,11 @@
 //! Localisation: pose and time of an image in a fixed scene.
 //!
-//! The best of some starts, at some times, are found in small images. Each is then moved to where the scene
-//! differs least
-//! from the image, by Gauss and Newton's method with damping (Levenberg and Marquardt) and a robust loss, in larger and
-//! larger images: there are six unknowns of the pose, one of the time where the scene moves, and one of the focal
-//! length where
-//! it is requested, so that derivatives are differences of renders. A gain and an offset of each colour are free, since
-//! another camera has another exposure. What does not fit the scene much better than one plain colour would is refused
-//! ([`Located::is_sure`]).
+//! The best of some starts, at some times, are found in small images. Each is then moved to where the scene differs
+//! least from the image, by Gauss and Newton's method with damping (Levenberg and Marquardt) and a robust loss, in
+//! larger and larger images: there are six unknowns of the pose, one of the time where the scene moves, and one of the
+//! focal length where it is requested, so that derivatives are differences of renders. A gain and an offset of each
+//! colour are free, since another camera has another exposure. What does not fit the scene much better than one plain
+//! colour would is refused ([`Located::is_sure`]).
 
 use crate::Result;
 use crate::train_state::moved;

@@ -3,9 +3,8 @@
 //!
 //! In the world distances are compared with shares of the height of all points together, in images with pixels, as in
 //! TAP-Vid (Doersch et al. 2022) but for the images' own size, over the points that are truly seen. Where a capture
-//! brings
-//! `truth/tracks_visible.npy`, uint8 [cameras, frames, points], that states who is seen, and the rendered visibility is
-//! compared with it; else every point in the image counts.
+//! brings `truth/tracks_visible.npy`, uint8 [cameras, frames, points], that states who is seen, and the rendered
+//! visibility is compared with it; else every point in the image counts.
 
 use crate::capture::Capture;
 use crate::eval::tracks::Truth;

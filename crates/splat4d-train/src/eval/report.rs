@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn results_have_the_keys_that_3dgs_users_know() {
+    fn results_have_the_keys_of_3dgs() {
         let results = report().results();
         let ours = &results["ours_7000"];
         let number = |v: &Value| v.as_f64().expect("a number");

@@ -1,12 +1,10 @@
-//! 3D error of tracks against known ones: rendered captures contain the true paths of points of their
-//! surfaces.
+//! 3D error of tracks against known ones: rendered captures contain the true paths of points of their surfaces.
 //!
 //! `truth/tracks.npy` holds float32 [frames, points, 3], world positions. Every point at the first frame is a query, as
 //! in benchmarks of point tracking: the few Gaussians nearest to it then carry it on by their mean displacement, and
 //! the error is its distance to the truth at all later frames. The error of the nearest Gaussian is reported next to it
-//! itself, its
-//! distance at the first frame included (the median trajectory error of Luiten et al. 2024). Times at which none of a
-//! point's Gaussians is alive are not counted, but the share that is counted is reported.
+//! itself, its distance at the first frame included (the median trajectory error of Luiten et al. 2024). Times at which
+//! none of a point's Gaussians is alive are not counted, but the share that is counted is reported.
 
 use crate::capture::Capture;
 use crate::{Error, Result};

@@ -1,5 +1,4 @@
-//! Points between the points: if a capture has few, every camera sees surfaces that continue from one to the
-//! next.
+//! Points between the points: if a capture has few, every camera sees surfaces that continue from one to the next.
 //!
 //! Structure from motion finds points where there is texture. Gaussians that have to spread from there over plain walls
 //! settle wherever the training cameras cannot see them, as haze in front of views that were not trained on. Here every

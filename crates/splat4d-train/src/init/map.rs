@@ -5,8 +5,8 @@ use crate::capture::DepthKind;
 use crate::capture::frames::{Frames, Picture};
 use splat4d::scene::{Camera, Planes};
 
-/// An image sees through a point if its depth there is larger by more than this share: beyond the noise of
-/// sensors and the slant of surfaces within a pixel.
+/// An image sees through a point if its depth there is larger by more than this share: beyond the noise of sensors and
+/// the slant of surfaces within a pixel.
 const THROUGH: f64 = 0.05;
 /// Images whose longer side exceeds this many pixels are halved until it does not: they have more pixels than there are
 /// seeds, and a hundred maps of that size fit into any memory.

@@ -261,7 +261,7 @@ mod tests {
     }
 
     #[test]
-    fn few_and_coinciding_points_are_no_trouble() {
+    fn few_and_coinciding_points_are_supported() {
         let g = Graph::<f64>::new(&[], 4, Weigh::Median(1.0));
         assert!(g.is_empty() && g.mean_weight() == 0.0);
         let g = Graph::new(&[[1.0, 2.0, 3.0]], 4, Weigh::Median(1.0));

@@ -14,8 +14,8 @@
 //!
 //! Only the sum of the two variances occurs, so four moments do (x, y, xx+yy, xy), not five. Four rows at a time pass
 //! through the stages: products → vertical means → horizontal means and S's derivatives → vertical means → horizontal
-//! means and the gradient. Products and derivatives are in rings of 16 rows, which stay in the second-level cache.
-//! The loops are plain ones over a row, because LLVM vectorises those reliably, and blocks of lanes it does not.
+//! means and the gradient. Products and derivatives are in rings of 16 rows, which stay in the second-level cache. The
+//! loops are plain ones over a row, because LLVM vectorises those reliably, and blocks of lanes it does not.
 //!
 //! A windowed sum is eleven loads, five additions and six multiply-adds, so loads are what it waits for: scratch rows
 //! start at cache lines, rings are arrays whose offsets are constants, and sums are kept by column until a strip ends.

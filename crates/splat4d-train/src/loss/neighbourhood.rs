@@ -95,8 +95,7 @@ impl<F: Real> ProbeLoss<F> for Neighbourhood<F> {
         let graphs = self.graphs.lock().expect("no thread panics while it holds the graphs");
         assert_eq!(graphs.len(), probes.len(), "`eval` gets the probes of the same step");
         let clip = (self.clip[1] - self.clip[0] + self.frame) / self.frame;
-        // From scene units per frame to extents a clip.
-        // In the order of time: before, at, after, after that.
+        // From scene units per frame to extents a clip. In the order of time: before, at, after, after that.
         let scale = motion::Scale { unit: self.unit, clip };
         let layers = graphs.iter().zip(seen).zip(d);
         layers.fold(0.0, |loss, ((graph, seen), d)| motion::terms(&self.weights, scale, graph, seen, d, loss))

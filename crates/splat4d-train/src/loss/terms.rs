@@ -1,5 +1,5 @@
-//! The contracts of losses without images: on splats at several times, and on raw parameters; and of what
-//! may be between parameters and images, a [`Codec`].
+//! The contracts of losses without images: on splats at several times, and on raw parameters; and of what may be
+//! between parameters and images, a [`Codec`].
 
 use crate::Result;
 use splat4d::layers::Scene;
@@ -84,9 +84,9 @@ pub trait ParamLoss<F: Real>: Send + Sync {
     fn restore(&self, _state: &[u32]) {}
 }
 
-/// A codec between the parameters that learn and the images they are judged by: a file that will hold them
-/// coarsely. Images are rendered from the decoded values, and the gradient is passed to the parameters as if there
-/// were no difference (the straight-through estimator: Bengio et al. 2013).
+/// A codec between the parameters that learn and the images they are judged by: a file that will hold them coarsely.
+/// Images are rendered from the decoded values, and the gradient is passed to the parameters as if there were no
+/// difference (the straight-through estimator: Bengio et al. 2013).
 pub trait Codec<F: Real>: Send + Sync {
     /// Its name, in messages.
     fn name(&self) -> &str;

@@ -2,10 +2,9 @@
 //! sees.
 //!
 //! One camera's images carry no information about depth, so that Gaussians that it alone sees drift along its rays, and
-//! some of them stay
-//! between the other cameras, where they veil every view. Their content is learnt again where others see it,
-//! or farther away. A Gaussian in front of the camera that sees it may be correct and is kept, as are those that two
-//! cameras see.
+//! some of them stay between the other cameras, where they veil every view. Their content is learnt again where others
+//! see it, or farther away. A Gaussian in front of the camera that sees it may be correct and is kept, as are those
+//! that two cameras see.
 
 use super::{At, Change, Context, DensifySettings, Every, Maintenance, RunOrder};
 use crate::Result;

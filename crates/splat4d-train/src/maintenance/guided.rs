@@ -1,10 +1,9 @@
-//! Guided sampling: where images are worst and Gaussians are too few, new ones are placed along the
-//! rays
-//! of the worst patches. It finds what no initial point represented, far backgrounds above all.
+//! Guided sampling: where images are worst and Gaussians are too few, new ones are placed along the rays of the worst
+//! patches. It finds what no initial point represented, far backgrounds above all.
 //!
-//! Source: Li et al. 2024 (STG) §4.2 and its released settings: of the examined views the two worst; patches
-//! of 16 pixels of which 85 % are among the worst 40 % of the pixels, a border of 10 % left out; every second pixel;
-//! depths between 0.7 and 7.5 times the largest seen, with 5 % of jitter; opacity 0.1.
+//! Source: Li et al. 2024 (STG) §4.2 and its released settings: of the examined views the two worst; patches of 16
+//! pixels of which 85 % are among the worst 40 % of the pixels, a border of 10 % left out; every second pixel; depths
+//! between 0.7 and 7.5 times the largest seen, with 5 % of jitter; opacity 0.1.
 
 use super::{At, Change, Context, Maintenance, RunOrder, logit};
 use crate::Result;

@@ -229,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn rounds_come_at_their_interval_but_not_at_the_end() {
+    fn rounds_run_at_their_interval_but_not_at_the_end() {
         let settings = MergeSettings { pair: Pair::Prune, distance: 0.5, interval: 10 };
         let mut merge = Merge { settings };
         assert_eq!(due_steps(&merge, 30), [10, 20]);

@@ -6,8 +6,8 @@ use crate::Result;
 use crate::train_state::TrainState;
 use splat4d::layers::Scene;
 
-/// A change of the scene before one step of a stage. It must be idempotent: it is repeated
-/// where a run is resumed at that very step.
+/// A change of the scene before one step of a stage. It must be idempotent: it is repeated where a run is resumed at
+/// that very step.
 pub(crate) struct Once<C> {
     /// The number of the step, from 0.
     pub at: usize,

@@ -207,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn the_capture_decides_and_the_reason_names_what_was_seen() {
+    fn auto_selects_by_the_capture_and_states_its_reason() {
         let is = |made: Made, fixed: bool, motion: &str, word: &str| {
             let choice = made.choose(fixed);
             assert!(choice.motion == motion && choice.why.contains(word), "{choice:?}");

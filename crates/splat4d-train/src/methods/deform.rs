@@ -16,8 +16,8 @@ const LARGE: (usize, usize, usize) = (8, 256, 4);
 const LARGE_X_LEVELS: usize = 10;
 /// Grids learn so much faster than networks: an entry is met by few Gaussians.
 const GRID_SPEEDUP: f64 = 50.0;
-/// Canonical positions start with this share of the recipe's rate, which suits short-lived Gaussians: a cloud
-/// that is seen at every time has to settle. Chosen next to other settings in runs of 400 steps; not measured alone.
+/// Canonical positions start with this share of the recipe's rate, which suits short-lived Gaussians: a cloud that is
+/// seen at every time has to settle. Chosen next to other settings in runs of 400 steps; not measured alone.
 const CANONICAL_SLOWDOWN: f64 = 4.0;
 /// Share of the iterations until the noise on time is zero: 20,000 of 40,000 (Yang et al. 2024).
 const NOISE_STEPS: f64 = 0.5;

@@ -27,9 +27,9 @@ use std::sync::Arc;
 const NAME: &str = "tracked";
 /// The extent, in metres, of the rig that the paper's weights are for (CMU Panoptic Studio).
 const PAPER_EXTENT: f64 = 3.0;
-/// Share of the masks' weight that frame 0 has. The foreground is not known yet, and at full weight opacities
-/// fall to make up for it: 18.3 dB instead of 29.5 on frame 0 of the bundled capture after 800 steps. The logits, which
-/// depend on masks alone, learn as fast with any weight, because Adam is invariant to the scale of a gradient.
+/// Share of the masks' weight that frame 0 has. The foreground is not known yet, and at full weight opacities fall to
+/// make up for it: 18.3 dB instead of 29.5 on frame 0 of the bundled capture after 800 steps. The logits, which depend
+/// on masks alone, learn as fast with any weight, because Adam is invariant to the scale of a gradient.
 const FIRST_MASKS: f64 = 1e-3;
 
 settings! {

@@ -97,8 +97,7 @@ impl<F: Real> Moments<F> {
         }
     }
 
-    /// Follows a row edit of `p` (which may be before or after its own gather): rows that are not `Kept` start
-    /// again.
+    /// Follows a row edit of `p` (which may be before or after its own gather): rows that are not `Kept` start again.
     pub(crate) fn edit(&mut self, p: &Params<F>, edit: &RowEdit) {
         for key in p.keys().filter(|&k| p.info(k).space == edit.space) {
             let table = &mut self.tables[key.0 as usize];

@@ -19,8 +19,7 @@ use std::collections::BTreeSet;
 /// processor time (studies/records/2026-11-26-real-size.md).
 const PIXELS: f64 = 350.0;
 /// The same for a static scene, whose Gaussians cost less to train. Source: a walk with 17 megapixels in four minutes
-/// ends at
-/// 22.5 dB (SSIM 0.728) with one for 350 pixels and at 23.0 dB (0.762) with one for 120
+/// ends at 22.5 dB (SSIM 0.728) with one for 350 pixels and at 23.0 dB (0.762) with one for 120
 /// (studies/records/2026-11-27-real-size.md).
 const PIXELS_STATIC: f64 = 120.0;
 /// Gaussians that one step can settle. Source: the same room in 480 processor seconds: 32 a step end at 27.58 dB (SSIM

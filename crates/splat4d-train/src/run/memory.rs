@@ -20,8 +20,7 @@ const STORED_BYTES: [u64; 2] = [4, 7];
 /// Bytes that nothing below counts: the program, threads, what the allocator holds back. Chosen on the runs of
 /// docs/models.md.
 const PROCESS_BYTES: u64 = 80 << 20;
-/// While a checkpoint is written, values and moments are in memory twice more: as rows, and as the file. Of the
-/// tables.
+/// While a checkpoint is written, values and moments are in memory twice more: as rows, and as the file. Of the tables.
 const CHECKPOINT: [u64; 2] = [3, 2];
 /// Bytes of a number.
 const F32: u64 = 4;

@@ -219,9 +219,8 @@ impl OpenCapture {
         Ok((recipe.with(|r| r.run.motion = MotionName::of(choice.motion)), choice))
     }
 
-    /// The background: that of cut-out images or, for full frames, their mean
-    /// colour, which
-    /// is the best estimate for pixels that no training camera sees. Errors: an image cannot be read.
+    /// The background: that of cut-out images or, for full frames, their mean colour, which is the best estimate for
+    /// pixels that no training camera sees. Errors: an image cannot be read.
     pub(super) fn background(&self) -> Result<[f32; 3]> {
         match self.capture.background {
             Some(told) => Ok(told),

@@ -19,10 +19,9 @@ use std::sync::Arc;
 const FILE: &str = "points.ply";
 /// Of the initial Gaussians: with fewer points of its own, a capture's images are searched for more.
 const FEW: f64 = 0.05;
-/// A capture whose points leave out more than this share of what a camera sees (the median of its cameras) has too
-/// few as well, however many: a sky, a far background. Of eight captures the bundled one, a kitchen, a hall and five
-/// synthetic rooms
-/// have 0 to 0.06, one before a far background has 0.34 (docs/suite.md).
+/// A capture whose points leave out more than this share of what a camera sees (the median of its cameras) has too few
+/// as well, however many: a sky, a far background. Of eight captures the bundled one, a kitchen, a hall and five
+/// synthetic rooms have 0 to 0.06, one before a far background has 0.34 (docs/suite.md).
 const BARE: f64 = 0.2;
 /// Cells along an image's longer side in which that is counted; of a rig at most so many views.
 const CELLS: f64 = 16.0;

@@ -1,6 +1,5 @@
 //! What files contain about a capture next to its images, held against these: before training what can be checked at
-//! once, after it
-//! what the scene made of them.
+//! once, after it what the scene made of them.
 
 use super::open::{OpenCapture, training_frames};
 use crate::capture::frames::{Depth, Frames, Picture};

@@ -56,8 +56,8 @@ pub(crate) struct Refined {
 
 /// Begins the run in the folder `run`, or continues it, exactly, where that holds one.
 ///
-/// A stage's start is not run again once a checkpoint holds a step of the stage: what codecs, losses and layers
-/// store is read from the checkpoint. Errors: the folder holds another run; what stages and files may say.
+/// A stage's start is not run again once a checkpoint holds a step of the stage: what codecs, losses and layers store
+/// is read from the checkpoint. Errors: the folder holds another run; what stages and files may say.
 pub(crate) fn refine(
     job: Refine,
     run: &Path,

@@ -35,8 +35,8 @@ pub struct TrainOptions {
     /// Keep all from the clock's zero to the end of what follows training to so long: iterations are fitted to it, and
     /// fitted again during the run.
     pub minutes: Option<f64>,
-    /// The caller's work after training (evaluation, film, baking) takes about as long as this many steps at the end
-    /// of training; `minutes` includes it.
+    /// The caller's work after training (evaluation, film, baking) takes about as long as this many steps at the end of
+    /// training; `minutes` includes it.
     pub finish: f64,
     /// Time steps before the run and report by [`Event::Predicted`] how long it will take. With `minutes` it is
     /// reported anyhow.
@@ -88,8 +88,8 @@ pub struct Outcome {
 
 /// Share of the largest number of Gaussians from which on a run is at its cap.
 const AT_CAP: f64 = 0.98;
-/// PSNR of training views below which a cloud at its cap is too small, dB: a real room of 292 photos ends at
-/// 26.5 with 30,000 Gaussians and at 27.4 with 150,000; captures that have enough end above 29
+/// PSNR of training views below which a cloud at its cap is too small, dB: a real room of 292 photos ends at 26.5 with
+/// 30,000 Gaussians and at 27.4 with 150,000; captures that have enough end above 29
 /// (studies/records/2026-11-26-real-size.md).
 const UNDER_FITTED: f64 = 28.0;
 

@@ -1,7 +1,7 @@
 //! The fixed chain of one step: `motion.at → render → loss → render.backward → motion.backward`.
 //!
-//! Views and the queries of losses over several times are merged: one `prepare`, one `at` and one `backward`
-//! for every distinct (layer, space, time), one `finish`.
+//! Views and the queries of losses over several times are merged: one `prepare`, one `at` and one `backward` for every
+//! distinct (layer, space, time), one `finish`.
 
 use super::channels::{Channels, Source};
 use crate::Result;

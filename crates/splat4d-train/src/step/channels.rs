@@ -1,5 +1,5 @@
-//! Further channels of the splats of a view, for losses: normals, the displacement to another time, a
-//! column of the Gaussians. Each has its forward and its VJP here.
+//! Further channels of the splats of a view, for losses: normals, the displacement to another time, a column of the
+//! Gaussians. Each has its forward and its VJP here.
 
 use crate::loss::image::{Channel, View};
 use rayon::prelude::*;

@@ -2,9 +2,9 @@
 //! camera's images
 //! are compared with the scene at shifted times, and the shift that suits them best wins.
 //!
-//! Gradients alone do not find shifts of whole frames: their reach is the width of edges. The scene was learnt with
-//! the wrong clocks, but of any one of them it is mostly the others' scene; so the search is repeated while it learns,
-//! as points and their partners are in ICP (Besl and McKay 1992).
+//! Gradients alone do not find shifts of whole frames: their reach is the width of edges. The scene was learnt with the
+//! wrong clocks, but of any one of them it is mostly the others' scene; so the search is repeated while it learns, as
+//! points and their partners are in ICP (Besl and McKay 1992).
 
 use crate::Result;
 use crate::capture::frames::{Frames, Picture};

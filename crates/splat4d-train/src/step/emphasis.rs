@@ -1,6 +1,5 @@
 //! [`Emphasis`]: pixels of dynamic regions weigh more. Dynamic regions are a small part of most images and the hardest,
-//! since
-//! a still Gaussian learns from every frame and a moving one from those of its lifespan.
+//! since a still Gaussian learns from every frame and a moving one from those of its lifespan.
 //!
 //! Source: the importance of DyNeRF (Li et al. 2022) by the distance from the temporal median, which draws rays there
 //! and weighs pixels here: w = 1 + k·⅓ Σ_c ψ(I_c − median_c), ψ(x) = x²/(x² + γ²).
@@ -118,7 +117,7 @@ mod tests {
     use crate::step::tests::Made;
 
     #[test]
-    fn weights_follow_the_distance_from_the_median_and_what_the_lens_never_filled_has_none() {
+    fn weights_follow_the_distance_from_the_median_and_unfilled_pixels_have_none() {
         let frames = Made::new(3, 5, 24);
         let mut emphasis = Emphasis::new(&frames, 2.0).unwrap().expect("cameras stand still and have five moments");
         let load = |i: usize| {

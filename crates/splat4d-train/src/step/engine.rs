@@ -58,8 +58,8 @@ pub struct Measured {
 pub struct Stepped {
     /// Timings and gradients to times and cameras; losses too, where the step is done.
     pub report: StepReport,
-    /// Measurements of the steps that finished since the last call: this one, or, if the device is still busy,
-    /// earlier ones.
+    /// Measurements of the steps that finished since the last call: this one, or, if the device is still busy, earlier
+    /// ones.
     pub measured: Vec<Measured>,
     /// Loading images.
     pub load: Duration,
@@ -140,8 +140,8 @@ pub(super) fn rates_of(scene: &Scene<f32>, plan: &StepPlan<'_>, all: &mut Rates)
     }
 }
 
-/// Share of a stage after which exposures are frozen: before it they learn at a constant rate, since a rate that
-/// falls from the start leaves them short in runs of a few dozen images a camera (docs/suite.md).
+/// Share of a stage after which exposures are frozen: before it they learn at a constant rate, since a rate that falls
+/// from the start leaves them short in runs of a few dozen images a camera (docs/suite.md).
 const EXPOSURE_RESTS: f64 = 0.7;
 /// What is left of their rate at the end: Adam moves a camera's colours by up to the rate a step whatever the gradient,
 /// and at the full rate images end a thousandth off.

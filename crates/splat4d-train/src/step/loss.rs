@@ -7,8 +7,8 @@ use crate::train_state::Exposure;
 use splat4d::render::{Comparison, Target};
 use splat4d::scene::Planes;
 
-/// The loss on images: terms, in the order in which their values and gradients are summed. The exposure of the
-/// view's camera is between the rendered image and all of them.
+/// The loss on images: terms, in the order in which their values and gradients are summed. The exposure of the view's
+/// camera is between the rendered image and all of them.
 pub struct TrainLoss {
     terms: Vec<Box<dyn ImageTerm>>,
     exposed: Planes<f32>,

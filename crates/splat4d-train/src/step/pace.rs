@@ -2,12 +2,11 @@
 //!
 //! All that depends on a run's length (rates, densification, resolution, degrees of SH, stages) is stated in steps of
 //! its *schedule*, of which there are `run.iterations`. A step of the run is one of the schedule, until the run is
-//! planned again:
-//! from then on what is left of the schedule is spread evenly over the steps that are left. Where these are fewer, a
-//! step passes over several steps of the schedule, and everything that was due at any of them is done once, after it;
-//! where they are more, some steps stay where they are. So nothing of the past changes its meaning, a rate continues
-//! from where it was, densifications neither get lost nor are repeated, and the same changes of plan give the same
-//! bits.
+//! planned again: from then on what is left of the schedule is spread evenly over the steps that are left. Where these
+//! are fewer, a step passes over several steps of the schedule, and everything that was due at any of them is done
+//! once, after it; where they are more, some steps stay where they are. So nothing of the past changes its meaning, a
+//! rate continues from where it was, densifications neither get lost nor are repeated, and the same changes of plan
+//! give the same bits.
 
 use super::replans::ScheduleChange;
 

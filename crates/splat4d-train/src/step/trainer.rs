@@ -163,8 +163,7 @@ impl<'a> Trainer<'a> {
         self.pace = (!replans.is_empty()).then(|| Pace::new(self.schedule(), replans));
     }
 
-    /// Changes of plan that were followed in the first `taken` steps: the step of each, and the steps in
-    /// all.
+    /// Changes of plan that were followed in the first `taken` steps: the step of each, and the steps in all.
     pub(crate) fn replans_before(&self, taken: usize) -> Vec<[usize; 2]> {
         self.pace.as_ref().map_or_else(Vec::new, |p| p.replans_before(taken))
     }

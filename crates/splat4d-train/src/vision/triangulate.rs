@@ -78,8 +78,8 @@ pub fn angle_at(x: [f64; 3], a: [f64; 3], b: [f64; 3]) -> f64 {
 /// Gauss-Newton steps after the linear guess: reprojection errors then change no more.
 const STEPS: usize = 3;
 
-/// The point that several cameras see: the point nearest to their rays, then least squares of the
-/// reprojection errors. Nothing where the rays are parallel or meet behind a camera.
+/// The point that several cameras see: the point nearest to their rays, then least squares of the reprojection errors.
+/// Nothing where the rays are parallel or meet behind a camera.
 pub fn triangulate(sights: &[PixelObservation<'_>]) -> Option<[f64; 3]> {
     let mut a = [[0.0; 3]; 3];
     let mut b = [0.0; 3];
@@ -135,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn points_come_back_from_their_pixels_in_any_unit() {
+    fn points_are_triangulated_in_any_unit() {
         for unit in [1e-3, 1.0, 1e3] {
             let cameras = [-1.0, 0.2, 1.0].map(|x| camera(x, unit));
             let x = [0.3, -0.2, 0.5].map(|v| v * unit);

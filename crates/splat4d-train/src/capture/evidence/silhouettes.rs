@@ -35,8 +35,7 @@ pub(super) fn measure(looks: &[SmallImage], poses: &[Se3]) -> Option<f64> {
 pub(super) enum Masks {
     /// There are none, or foregrounds are at one place.
     Fine,
-    /// The hidden parts are where the cameras point: part of the images, share of what is shown, and of the
-    /// edges.
+    /// The hidden parts are where the cameras point: part of the images, share of what is shown, and of the edges.
     Inverted(f64, f64, f64),
     /// Neither: images with masks that were examined, and the share of what is shown.
     Unsure(usize, f64),

@@ -55,7 +55,7 @@ fn images(sample: &Sample, name: impl Fn(usize) -> String) {
 }
 
 #[test]
-fn metashape_cameras_come_back() {
+fn metashape_cameras_round_trip() {
     let sample = Sample::new(&["cameras.xml"]);
     images(&sample, |i| format!("images/IMG_{:04}.png", 7 * i + i));
     // The chunk is elsewhere, turned and twice as large.
@@ -119,7 +119,7 @@ fn metashape_cameras_come_back() {
 }
 
 #[test]
-fn realityscan_cameras_come_back() {
+fn realityscan_cameras_round_trip() {
     let sample = Sample::new(&["cameras.csv"]);
     images(&sample, |i| format!("DSC{i:05}.png"));
     let mut csv = "\u{feff}#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n".to_owned();
@@ -156,7 +156,7 @@ fn realityscan_cameras_come_back() {
 }
 
 #[test]
-fn polycam_keyframes_come_back() {
+fn polycam_keyframes_round_trip() {
     let sample = Sample::new(&[]);
     images(&sample, |i| format!("keyframes/images/17000{i:02}.png"));
     let camera = |i: usize| {
@@ -190,7 +190,7 @@ fn polycam_keyframes_come_back() {
 }
 
 #[test]
-fn record3d_recordings_come_back() {
+fn record3d_recordings_round_trip() {
     let sample = Sample::new(&["metadata.json"]);
     images(&sample, |i| format!("rgb/{i}.png"));
     let pose = |i: usize| {

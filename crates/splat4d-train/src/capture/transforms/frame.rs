@@ -165,8 +165,7 @@ fn focal(top: &Node<'_>, node: &Node<'_>, keys: [&str; 3], side: usize) -> Resul
 /// By how much an angle of view and a focal length in pixels may differ: angles are sometimes of undistorted images.
 const SAME_FOCAL: f64 = 1.1;
 
-/// The remark if the file's angle of view contradicts its focal length in pixels, which is the one that is
-/// read.
+/// The remark if the file's angle of view contradicts its focal length in pixels, which is the one that is read.
 pub(super) fn contradiction(top: &Node<'_>, entries: &[Entry]) -> Result<Option<String>> {
     let (Some(angle), Some(entry)) = (top.opt("camera_angle_x")?, entries.first()) else { return Ok(None) };
     let (angle, camera) = (angle.number()?, &entry.source);

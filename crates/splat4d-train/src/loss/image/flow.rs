@@ -65,9 +65,9 @@ pub(crate) fn flow<F: Real>(drawn: &Planes<F>, truth: &Planes<F>, weight: f64, d
 const HUBER: f64 = 3.0;
 
 /// Mean over pixels of tracked points that show something of h(‖F − F*‖₂) over the image's longer side, F as in
-/// [`flow`] but
-/// to the time of the track's other end: r²/(2δ) to δ = 3 pixels, and r − δ/2 beyond (Huber). The surface at the pixel
-/// is followed by the weights with which it is blended: the point is where these Gaussians are, and moves with them.
+/// [`flow`] but to the time of the track's other end: r²/(2δ) to δ = 3 pixels, and r − δ/2 beyond (Huber). The surface
+/// at the pixel is followed by the weights with which it is blended: the point is where these Gaussians are, and moves
+/// with them.
 ///
 /// Shapes: as [`flow`]. Source: Wang et al. 2024 (Shape of Motion), track reprojection, with Huber's penalty.
 pub(crate) fn tracks<F: Real>(drawn: &Planes<F>, truth: &Planes<F>, weight: f64, d: &mut Planes<F>) -> f64 {

@@ -1,5 +1,5 @@
-//! The alignment of observation and filter state: D(o, F), o the result of the model inside a filter, F the
-//! state that the filter makes of it and of its prediction. A model that moves steadily costs nothing.
+//! The alignment of observation and filter state: D(o, F), o the result of the model inside a filter, F the state that
+//! the filter makes of it and of its prediction. A model that moves steadily costs nothing.
 //!
 //! The gradient is propagated through both: to o itself, and through the fusion (and, with
 //! `filter.stop_gradient=false`, through the prediction) to everything that F is made of, the gains among it. Without a

@@ -1,5 +1,5 @@
-//! Which Gaussians are rendered around which key time: the temporal filter of 4DGS-1K (Yuan et al. 2025, §4.2),
-//! united with the lifespans that no key time meets.
+//! Which Gaussians are rendered around which key time: the temporal filter of 4DGS-1K (Yuan et al. 2025, §4.2), united
+//! with the lifespans that no key time meets.
 
 use super::temporal::Spatial;
 use super::weighing::Weighing;

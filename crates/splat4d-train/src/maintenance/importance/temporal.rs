@@ -4,8 +4,8 @@
 //! The paper's S^TV = Σ_t 1/(½ tanh p''(t) + ½), p the lifespan, summed over the whole clip, ranks the other way round
 //! than its text states: a term is 1 + exp(−2p''), so that it overflows at the peak of a short lifespan, and a time at
 //! which the Gaussian is not there counts 2, the most that |p''| could give. The reading that does what the text states
-//! takes the product with the spatial score time by time: absent times vanish, and each present one weighs 1
-//! (flickers) to 2 (lasts). That is [`Temporal::InstantAbs`], the default; the others are kept for comparison.
+//! takes the product with the spatial score time by time: absent times vanish, and each present one weighs 1 (flickers)
+//! to 2 (lasts). That is [`Temporal::InstantAbs`], the default; the others are kept for comparison.
 
 use crate::settings::nearest;
 use crate::{Error, Result};
@@ -273,7 +273,7 @@ mod tests {
     }
 
     #[test]
-    fn names_come_back_and_wrong_ones_get_a_suggestion() {
+    fn names_round_trip_and_wrong_ones_get_a_suggestion() {
         for t in Temporal::ALL {
             assert_eq!(t.name().parse::<Temporal>().unwrap(), *t);
         }

@@ -136,7 +136,7 @@ fn colours_that_change_with_time_and_view_are_learnt_better_with_a_head() {
 }
 
 #[test]
-fn rows_come_and_go_with_their_features() {
+fn row_edits_carry_features_along() {
     let mut scene = featured::<f32>(LifeKind::GaussHalf, false, false);
     let key = scene.layers[0].params.find("features").unwrap();
     let (first, head) = (scene.layers[0].params[key].read::<6>(7, 0), HeadKeys::of(&scene.layers[0].params).unwrap());

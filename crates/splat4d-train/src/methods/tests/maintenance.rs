@@ -125,7 +125,7 @@ fn sized(scene: Scene<f32>, stages: Vec<Stage>, size: usize) -> Trainer<'static>
 }
 
 #[test]
-fn guided_sampling_finds_a_sky_that_no_gaussian_stands_for() {
+fn guided_sampling_finds_a_sky_without_gaussians() {
     let run = |guided: Option<GuidedSettings>| {
         // All at the ball: the sky of the capture is not the background.
         let mut p = cloud::<f32>(60, LifeKind::GaussHalf, 3);

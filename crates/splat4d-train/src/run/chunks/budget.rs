@@ -69,8 +69,8 @@ impl Pacing {
 impl ChunkEstimate {
     /// Examines a take as `train` would before its first step, of which at least [`look_ahead`](super::look_ahead) is
     /// listed. Within `minutes`, if there are any, from the start of `clock` on, and within the recipe's memory limit.
-    /// The caller's work after training takes as long as the last `finish` steps. `timed`: steps are timed even
-    /// without `minutes`. `None`: the capture is learnt at once.
+    /// The caller's work after training takes as long as the last `finish` steps. `timed`: steps are timed even without
+    /// `minutes`. `None`: the capture is learnt at once.
     ///
     /// Errors: what the recipe requests cannot be had in chunks, or not within these limits; images that cannot be
     /// read.

@@ -120,8 +120,7 @@ impl Chunked {
         Ok([from - 0.5 / capture.fps, to + 0.5 / capture.fps])
     }
 
-    /// A finished chunk as a scene of one layer, visible as in the whole capture; the shared part is
-    /// left out.
+    /// A finished chunk as a scene of one layer, visible as in the whole capture; the shared part is left out.
     ///
     /// Errors: files that cannot be read.
     pub fn alone(&self, chunk: usize) -> Result<Scene<f32>> {
@@ -187,10 +186,9 @@ impl Chunked {
         Ok(())
     }
 
-    /// How well chunks meet, by fixed cameras: those that training never saw, where there are any. `None`: there
-    /// is no such camera, or no time. Before each cut `go_on` is called with the number of finished ones. Errors:
-    /// chunks or images that
-    /// cannot be read.
+    /// How well chunks meet, by fixed cameras: those that training never saw, where there are any. `None`: there is no
+    /// such camera, or no time. Before each cut `go_on` is called with the number of finished ones. Errors: chunks or
+    /// images that cannot be read.
     pub fn seams(&self, go_on: &mut dyn FnMut(usize) -> bool, listen: &mut dyn FnMut(&Event)) -> Result<Option<Seams>> {
         let antialias = if self.recipe.appearance.antialias { Antialias::On } else { Antialias::Off };
         let config = RenderConfig { antialias, ..RenderConfig::default() };

@@ -226,8 +226,8 @@ impl Chunked {
         })
     }
 
-    /// Trains one part, unless it is done. Errors: parts before it are missing, another worker has it, and those
-    /// of training.
+    /// Trains one part, unless it is done. Errors: parts before it are missing, another worker has it, and those of
+    /// training.
     pub fn work(
         &self,
         part: Part,

@@ -138,7 +138,7 @@ fn a_flickering_copy_of_the_background_is_pruned_and_the_image_stays() {
 /// In training: rows go at the interval's steps, and a run that is taken up again from a checkpoint's state continues
 /// alike.
 #[test]
-fn rows_go_while_a_scene_is_trained_and_the_run_repeats() {
+fn rows_are_pruned_during_training_and_the_run_repeats() {
     let start = || Scene { layers: vec![layer(200, LifeKind::GaussHalf, 7)], clip: [0.0, 0.8], fps: 10.0, ..scene(2) };
     let frames = made();
     let pictures =
