@@ -272,7 +272,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_found_is_written_and_what_was_corrected_is_kept() {
+    fn results_are_written_and_corrections_are_kept() {
         let folder = tempfile::tempdir().unwrap();
         let mut file = Corrections::read(folder.path(), &names()).unwrap();
         assert_eq!(file.given_offsets(), [None, None]);

@@ -94,8 +94,7 @@ impl FromStr for Board {
 pub(crate) struct Tag {
     /// Its number in its family.
     pub id: usize,
-    /// Pixels of the dark square's corners: from the first bit's on, clockwise when the tag is
-    /// examined.
+    /// Pixels of the dark square's corners: from the first bit's on, clockwise when the tag is examined.
     pub corners: [[f64; 2]; 4],
 }
 

@@ -110,8 +110,8 @@ const MAX_FILES: usize = 1000;
 
 /// Reads a calibration: a file, or a folder with one, with a file for each camera, or with a COLMAP reconstruction.
 ///
-/// Errors: an unknown format; damage; missing or invalid matrices; a duplicate camera; lenses that captures
-/// cannot have.
+/// Errors: an unknown format; damage; missing or invalid matrices; a duplicate camera; lenses that captures cannot
+/// have.
 pub fn read(path: &Path) -> Result<Calibration> {
     let there = std::fs::metadata(path).map_err(|e| {
         Error::io("the calibration cannot be read", e).at(path.display()).remedy("Check the path behind --calibration.")

@@ -65,8 +65,7 @@ fn sizes(size: [usize; 2], video: [usize; 2]) -> String {
 /// bars: at the left, above, at the right, below. And what that means, a sentence, where it is not plain.
 ///
 /// Errors: the video is of another shape than the images it was calibrated with, and neither bars nor padding explain
-/// why; the
-/// principal point is outside.
+/// why; the principal point is outside.
 pub(crate) fn fitted(
     camera: &Calibrated,
     video: [usize; 2],

@@ -1,6 +1,5 @@
 //! Rolling shutters: a camera that reads its images row by row captures the lower rows later than the upper ones, and
-//! what
-//! moves leaves its epipolar line by as much.
+//! what moves leaves its epipolar line by as much.
 
 use super::look::CameraObservations;
 use crate::sync::epipolar::{EpipolarLag, sampson};
@@ -36,11 +35,10 @@ struct Sighting {
 /// few
 /// tracks show. Shutters that all cameras share alike show less than their differences, which the deviation states.
 ///
-/// Of one event the cameras a and b have the times t and s with `s − t = lag + r_a·ρ_a − r_b·ρ_b` (r: seconds over
-/// the image,
-/// ρ: row from −½ to ½), so that at `s = t + lag` the distance from the line and its speed times what is missing sum to
-/// nothing, to first order. Least squares over all r and a correction of each lag; deviations by clusters of tracks
-/// (White 1980), for what is wrong with a track is wrong at all of its times.
+/// Of one event the cameras a and b have the times t and s with `s − t = lag + r_a·ρ_a − r_b·ρ_b` (r: seconds over the
+/// image, ρ: row from −½ to ½), so that at `s = t + lag` the distance from the line and its speed times what is missing
+/// sum to nothing, to first order. Least squares over all r and a correction of each lag; deviations by clusters of
+/// tracks (White 1980), for what is wrong with a track is wrong at all of its times.
 pub(super) fn shutters(pairs: &[Pair], seen: &[CameraObservations], interval: f64) -> Vec<Option<[f64; 2]>> {
     let clusters: Vec<(usize, Vec<Sighting>)> = (pairs.iter().enumerate())
         .flat_map(|(k, p)| p.found.matches.iter().map(move |m| (k, sightings(p, *m, seen, STEP * interval))))

@@ -74,9 +74,8 @@ impl Given {
 /// Images of a camera in which bars are searched for.
 const LOOKS: usize = 3;
 
-/// Known lenses of every camera's stored images: from the calibration, and from the user, which has priority.
-/// Sentences about
-/// calibrations that had to be corrected for them join the images' warnings.
+/// Known lenses of every camera's stored images: from the calibration, and from the user, which has priority. Sentences
+/// about calibrations that had to be corrected for them join the images' warnings.
 pub(super) fn known(
     given: Option<&Given>,
     corrections: &Corrections,

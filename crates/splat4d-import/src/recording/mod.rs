@@ -112,8 +112,8 @@ impl Request {
 /// Frames of a moving camera that are placed at most: every one is a camera of its own to the solver.
 const MOST_WALKING: usize = 150;
 
-/// Share of the cameras that must be placed, and below which that is reported: what people who reconstruct by
-/// structure from motion is keyed by.
+/// Share of the cameras that must be placed, and below which that is reported: what people who reconstruct by structure
+/// from motion is keyed by.
 const PLACED_LEAST: f64 = 0.7;
 const PLACED_WARN: f64 = 0.9;
 /// Points below which a reconstruction hangs on too little: a chessboard's.

@@ -608,7 +608,7 @@ mod tests {
     }
 
     #[test]
-    fn derivatives_are_slopes() {
+    fn derivatives_equal_finite_differences() {
         let bundle = disturbed(&ring(3, false), 0.01);
         let h = 1e-6;
         for s in bundle.sightings.iter().step_by(7) {
@@ -643,7 +643,7 @@ mod tests {
     }
 
     #[test]
-    fn exact_sightings_give_everything_to_nine_digits() {
+    fn exact_sightings_are_solved_to_nine_digits() {
         for shared in [false, true] {
             let truth = ring(6, shared);
             let mut bundle = disturbed(&truth, 0.01);
@@ -657,7 +657,7 @@ mod tests {
     }
 
     #[test]
-    fn another_world_gives_the_same_answer() {
+    fn the_result_does_not_depend_on_the_world_frame() {
         let truth = ring(5, false);
         let free = Free { tau: false, ..ALL };
         let mut noisy = truth.clone();

@@ -72,8 +72,8 @@ impl Straight {
 /// errors.
 ///
 /// Moving objects are off their epipolar lines as long as time offsets are wrong: first, offsets are estimated from
-/// matches, within wide
-/// bounds; then points of what is on the lines, which it is at any clock, so that they determine none.
+/// matches, within wide bounds; then points of what is on the lines, which it is at any clock, so that they determine
+/// none.
 pub(crate) fn about(sights: &[CameraView], links: &[Link], how: &Mapping, progress: &mut Progress<'_>) -> Mapped {
     /// Of the tolerance: two frames of what is followed at all, in images 1920 across.
     const WIDE: f64 = 8.0;

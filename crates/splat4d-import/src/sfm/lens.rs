@@ -142,7 +142,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rays_invert_projection_and_derivatives_are_slopes() {
+    fn rays_invert_projection_and_derivatives_equal_finite_differences() {
         let lens = Lens { focal: 430.0, k1: -0.12, center: [310.0, 190.0] };
         let p = [0.4, -0.3, 1.3];
         let seen = lens.project_by(p).unwrap();

@@ -39,11 +39,9 @@ pub struct Mapping {
 impl Default for Mapping {
     fn default() -> Self {
         // Schönberger and Frahm 2016 (COLMAP) filter at 4 pixels and 1.5 degrees. The rest is measured: most sightings
-        // are exact to
-        // 0.16 pixels, so that a loss of 0.6 halves the errors of focal lengths against one of 2; principal points kept
-        // within
-        // 0.3 % are best for the bundled capture, whose true ones are in the middle (0.28 degrees, 0.43 with 1 %), and
-        // 1 % for the hall (0.73 degrees, 0.91 with 0.3 %).
+        // are exact to 0.16 pixels, so that a loss of 0.6 halves the errors of focal lengths against one of 2;
+        // principal points kept within 0.3 % are best for the bundled capture, whose true ones are in the middle (0.28
+        // degrees, 0.43 with 1 %), and 1 % for the hall (0.73 degrees, 0.91 with 0.3 %).
         Self { seed: 0, starts: 6, clocks: true, tolerance: 4.0, angle: 1.5, center: 0.005, k1: 0.01, scale: 0.6 }
     }
 }
@@ -85,8 +83,8 @@ const FAMILY_FROM: usize = 4;
 const FAMILY: f64 = 0.003;
 /// Where images contradict that, lenses differ by this share: of phones of several models, some per cent.
 const STRANGERS: f64 = 0.05;
-/// Twice the loss of treating lenses as equal, of the variance of a sighting and for each lens: more
-/// contradicts it. Were sightings' errors independent, 1 would be usual (Wilks 1938).
+/// Twice the loss of treating lenses as equal, of the variance of a sighting and for each lens: more contradicts it.
+/// Were sightings' errors independent, 1 would be usual (Wilks 1938).
 const CONTRADICTS: f64 = 8.0;
 /// Rounds of adjusting, leaving out and finding again at the end.
 const ROUNDS: usize = 4;

@@ -96,8 +96,8 @@ pub struct Solution {
     pub up: [f64; 3],
     /// Pairs of images that were found to show one scene.
     pub pairs: usize,
-    /// For each camera with a known pose, the deviation from it: epipolar distance of matches that
-    /// were found without it, at the median, pixels of the files' images. None: too few matches.
+    /// For each camera with a known pose, the deviation from it: epipolar distance of matches that were found without
+    /// it, at the median, pixels of the files' images. None: too few matches.
     pub contradiction: Vec<Option<f64>>,
     /// Of each of [`Solution::taken`], the points that move by which its clock was found.
     pub moving: Vec<usize>,
@@ -108,8 +108,8 @@ pub struct Solution {
 /// Finds where images were taken from.
 ///
 /// The world's unit is the median distance of the cameras from the points; its axes are those of the camera that was
-/// placed first. Scale and the vertical need other sources. If all poses are known, so are unit and axes:
-/// then only points and clocks are found.
+/// placed first. Scale and the vertical need other sources. If all poses are known, so are unit and axes: then only
+/// points and clocks are found.
 ///
 /// Errors: images that cannot be read; no two that show one scene.
 pub fn solve(pictures: &dyn Pictures, options: &Options, progress: &mut Progress<'_>) -> Result<Solution> {

@@ -1,12 +1,10 @@
 //! Places of features made exact: the windows about one point in all its images are laid over each other.
 //!
 //! A detector finds the middle of a blob, which is another point of the object from every side, some tenths of a pixel
-//! off. For poses, all images must locate the same point: the window of one image, warped as a small plane
-//! at the point
+//! off. For poses, all images must locate the same point: the window of one image, warped as a small plane at the point
 //! would be seen from the other camera, is moved over the other image until they agree best (Lucas and Kanade 1981,
-//! with an
-//! affine warp and gain and offset of brightness; features are adjusted before bundle adjustment as by Lindenberger et
-//! al. 2021).
+//! with an affine warp and gain and offset of brightness; features are adjusted before bundle adjustment as by
+//! Lindenberger et al. 2021).
 
 use super::lens::Lens;
 use splat4d::math::Se3;
@@ -307,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn places_of_one_point_agree_to_hundredths_of_a_pixel_and_other_things_are_left_out() {
+    fn patches_of_one_point_align_to_hundredths_of_a_pixel_and_others_are_left_out() {
         let lens = Lens { k1: -0.01, ..Lens::plain(150.0, 160, 120) };
         let eyes = [[-0.9, -0.2, -2.0], [0.0, 0.1, -2.2], [0.8, 0.3, -1.9], [0.3, -0.5, -2.1]];
         let poses = eyes.map(|e| Se3::look_at(e, [0.0; 3], [0.0, -1.0, 0.0]));

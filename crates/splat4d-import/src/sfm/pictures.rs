@@ -353,8 +353,7 @@ impl Window {
     }
 }
 
-/// Features of what moves in a frame, each with its velocity; brought to the shared time, which may be next
-/// to the
+/// Features of what moves in a frame, each with its velocity; brought to the shared time, which may be next to the
 /// frame's. And their sources.
 fn moving(
     pictures: &dyn Pictures,

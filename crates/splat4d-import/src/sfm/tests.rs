@@ -287,7 +287,7 @@ fn walk(cameras: usize) -> Walk {
 }
 
 #[test]
-fn what_moves_is_seen_at_times_with_its_velocity() {
+fn moving_features_have_times_and_velocities() {
     let mut silent = |_: &_| {};
     let look = FeatureOptions { moments: 3, ..FeatureOptions::default() };
     let sights = fixed(&walk(1), &look, &mut Progress(&mut silent)).unwrap();

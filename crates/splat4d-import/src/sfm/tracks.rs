@@ -183,8 +183,7 @@ pub(crate) struct Known {
 /// Second-best matches are searched for along the epipolar line alone, where there are few: they must be farther away.
 const GUIDED_RATIO: f32 = 0.75;
 /// What is alone on its line must be as good as if something quite unlike was next to it: squared distance of
-/// descriptors, an
-/// eighth of the largest there is.
+/// descriptors, an eighth of the largest there is.
 const FAR: f32 = 65_536.0;
 /// Cameras whose axes are farther apart see other sides of objects, degrees.
 const WIDEST: f64 = 80.0;

@@ -126,7 +126,7 @@ fn pairs(count: usize) -> Vec<[usize; 2]> {
 }
 
 #[test]
-fn parts_of_a_frame_follow_from_the_geometry() {
+fn sub_frame_offsets_follow_from_the_geometry() {
     for part in [0.37, -2.63] {
         let rig = Rig::new(&[0.0, -part * FRAME], 60, Dance::Free);
         let [a, b] = [0, 1].map(|c| rig.tracks(c, 20, 0.3));

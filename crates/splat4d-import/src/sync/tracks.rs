@@ -359,7 +359,7 @@ mod tests {
     }
 
     #[test]
-    fn corners_are_followed_to_parts_of_a_pixel() {
+    fn corners_are_tracked_to_sub_pixel_accuracy() {
         let still = picture([0.0; 2], 1.0);
         let found = corners(&still, None, 40, 6.0, &[]);
         assert!(found.len() >= 15, "{}", found.len());
@@ -393,7 +393,7 @@ mod tests {
     }
 
     #[test]
-    fn what_vanishes_is_lost() {
+    fn vanished_corners_are_lost() {
         let still = picture([0.0; 2], 1.0);
         let found = corners(&still, None, 20, 8.0, &[]);
         let mut other = still.clone();

@@ -224,7 +224,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn gopros_names_are_known() {
+    fn gopro_chapter_names_are_recognised() {
         let of = |name: &str| Chapter::of(Path::new(name)).map(|c| (c.recording, c.number, c.copy));
         assert_eq!(of("a/GX020012.MP4"), Some(("GX0012".into(), 2, false)));
         assert_eq!(of("gh010345.mp4"), Some(("GH0345".into(), 1, false)));
@@ -243,7 +243,7 @@ mod tests {
 
     /// Folders of images represent chapters.
     #[test]
-    fn chapters_are_one_clock() {
+    fn chapters_share_one_clock() {
         let dir = tempfile::tempdir().unwrap();
         let paths: Vec<PathBuf> = (0..2).map(|k| dir.path().join(format!("part{k}"))).collect();
         for (k, path) in paths.iter().enumerate() {

@@ -131,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rate_that_varies_is_no_loss() {
+    fn a_variable_rate_is_not_a_lost_frame() {
         let uneven: Vec<f64> = (0..60).map(|i| (f64::from(i) + 0.2 * f64::from(i % 3)) / 30.0).collect();
         let clock = Clock::of(&uneven, &[]);
         assert!(clock.variable && clock.dropped.is_empty() && clock.doubled.is_empty());

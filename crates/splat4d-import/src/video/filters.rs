@@ -118,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn times_come_before_and_after_the_choice() {
+    fn frame_times_are_read_before_and_after_selection() {
         let selection = Selection { every: 3, size: Some(540), ..Selection::default() };
         let chain = chain(&info(), &selection, true);
         assert_eq!(chain.size, [960, 540]);

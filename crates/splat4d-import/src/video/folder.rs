@@ -215,8 +215,7 @@ fn natural(a: &str, b: &str) -> Ordering {
     }
 }
 
-/// Number of intervals of each image after the first: by the last numbers in the names where they ascend evenly
-/// but for
+/// Number of intervals of each image after the first: by the last numbers in the names where they ascend evenly but for
 /// some that are missing, else by position.
 fn steps(names: &[String]) -> Vec<f64> {
     let by_position = || (0..names.len()).map(|i| i as f64).collect();
@@ -248,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_in_names_are_the_clock() {
+    fn numbers_in_names_give_frame_times() {
         assert_eq!(steps(&names(&["f0005", "f0006", "f0008", "f0009"])), [0.0, 1.0, 3.0, 4.0]);
         assert_eq!(steps(&names(&["a_010", "a_020", "a_040"])), [0.0, 1.0, 3.0]);
         assert_eq!(steps(&names(&["IMG_3", "IMG_17", "IMG_20"])), [0.0, 1.0, 2.0]);

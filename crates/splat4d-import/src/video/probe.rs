@@ -255,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn a_telephone_held_upright() {
+    fn a_rotated_phone_video_is_probed() {
         let sound = json!({"index": 1, "codec_type": "audio", "codec_name": "aac"});
         let found = probe(&[phone(|_| ()), sound]).unwrap();
         let info = &found.info;
@@ -294,7 +294,7 @@ mod tests {
     }
 
     #[test]
-    fn high_dynamic_range_and_interlace_are_seen() {
+    fn high_dynamic_range_and_interlace_are_detected() {
         let hlg = phone(|f| {
             f["color_transfer"] = json!("arib-std-b67");
             f["color_space"] = json!("bt2020nc");
@@ -310,7 +310,7 @@ mod tests {
     }
 
     #[test]
-    fn alpha_is_seen_in_formats_and_marks() {
+    fn alpha_is_detected_by_format_and_flag() {
         let of = |codec: &str, pixels: &str, mark: bool| {
             let film = phone(|f| {
                 (f["codec_name"], f["pix_fmt"]) = (json!(codec), json!(pixels));
@@ -329,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn pixels_that_are_not_square_and_durations_elsewhere() {
+    fn non_square_pixels_and_other_durations_are_read() {
         let film = phone(|f| {
             (f["width"], f["height"], f["sample_aspect_ratio"]) = (json!(1440), json!(1080), json!("4:3"));
             f.as_object_mut().unwrap().remove("side_data_list");
@@ -344,7 +344,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_used_is_refused_with_a_reason() {
+    fn unusable_videos_are_refused_with_a_reason() {
         let cover = phone(|f| f["disposition"]["attached_pic"] = json!(1));
         let sound = json!({"index": 1, "codec_type": "audio", "codec_name": "aac"});
         for (streams, word) in [

@@ -105,8 +105,8 @@ impl Tools {
         Ok(String::from_utf8_lossy(&out.stdout).into_owned())
     }
 
-    /// Starts ffmpeg on a file; `input` is before the file's name, `output` behind it, and what it makes comes
-    /// through a pipe.
+    /// Starts ffmpeg on a file; `input` is before the file's name, `output` behind it, and what it makes comes through
+    /// a pipe.
     pub(super) fn start(&self, path: &Path, input: &[String], output: &[String]) -> Result<Running> {
         let mut command = Command::new(&self.ffmpeg);
         command.args([
@@ -329,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn a_missing_program_comes_with_how_to_install_it() {
+    fn a_missing_program_is_reported_with_install_instructions() {
         let error = Tools::at(Path::new("no-such-program-here"), Path::new("ffprobe")).unwrap_err().to_string();
         assert!(["apt install", "brew install", "winget install"].iter().all(|w| error.contains(w)), "{error}");
     }

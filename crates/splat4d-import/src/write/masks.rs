@@ -107,8 +107,8 @@ fn numbers(pictures: &Pictures, begin: Begin) -> Result<Vec<usize>> {
     Ok(pictures.shots.iter().map(|s| (s.time / pictures.clock.interval).round() as usize).collect())
 }
 
-/// Stores a mask in a size, black and white, and returns what changes with it; a file that is there is of
-/// another run and is written again.
+/// Stores a mask in a size, black and white, and returns what changes with it; a file that is there is of another run
+/// and is written again.
 fn store(from: &Path, to: &Path, [width, height]: [usize; 2]) -> Result<u64> {
     let mask = Rgb8::read(from)?;
     let off = (mask.width * height).abs_diff(mask.height * width);

@@ -314,10 +314,9 @@ fn read(path: &Path) -> Option<Note> {
     serde_json::from_slice(&splat4d_train::files::read(path).ok()?).ok()
 }
 
-/// Removes the images that were written into a folder of a capture before. `noted`: whether a note records such
-/// images, which
-/// captures without a list of their files are read by. Errors: it holds images of such names without a note; nothing is
-/// removed then.
+/// Removes the images that were written into a folder of a capture before. `noted`: whether a note records such images,
+/// which captures without a list of their files are read by. Errors: it holds images of such names without a note;
+/// nothing is removed then.
 fn clear(capture: &Path, folder: &Path, noted: bool) -> Result<()> {
     let Ok(entries) = std::fs::read_dir(folder) else { return Ok(()) };
     let numbered = |path: &PathBuf| {

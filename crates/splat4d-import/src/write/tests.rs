@@ -61,7 +61,7 @@ fn store(folder: &Path, clips: &[Clip<'_>], stop_after: usize) -> splat4d::Resul
 }
 
 #[test]
-fn what_was_interrupted_ends_in_the_same_bytes() {
+fn an_interrupted_import_ends_in_the_same_bytes() {
     let (_folder, sources) = rig();
     let clips = clips(&sources, &Selection::default());
     let (whole, parts) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
@@ -216,7 +216,7 @@ fn masks_are_stored_next_to_their_images() {
 }
 
 #[test]
-fn the_capture_is_read_as_it_was_meant() {
+fn the_written_capture_is_read_back() {
     let (_folder, sources) = rig();
     let out = tempfile::tempdir().unwrap();
     let stored = store(out.path(), &clips(&sources, &Selection::default()), usize::MAX).unwrap();
