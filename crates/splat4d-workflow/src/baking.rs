@@ -68,8 +68,7 @@ const SAMPLING: f64 = 0.25;
 const WEIGHING: f64 = 0.1;
 /// See [`WEIGHING`].
 const WEIGHING_RENDERS: f64 = 3.0;
-/// Seconds in which a primitive is fitted and packed, on a slow machine; and the share of the remaining time for
-/// it.
+/// Seconds in which a primitive is fitted and packed, on a slow machine; and the share of the remaining time for it.
 const SECONDS_A_PRIMITIVE: f64 = 4e-5;
 const FITTING: f64 = 0.4;
 /// Another cut takes about as long as the last one took, and this many times it is kept for it.

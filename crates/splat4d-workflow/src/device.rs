@@ -4,8 +4,8 @@ use crate::events::Listener;
 use splat4d::device::{self, Device, Opened};
 use splat4d::render::{RenderConfig, Tables, Wanted};
 
-/// Files of which one is there where Linux has a driver for a GPU: querying Vulkan costs time, and its loader
-/// complains on stderr on machines without a screen.
+/// Files of which one is there where Linux has a driver for a GPU: querying Vulkan costs time, and its loader complains
+/// on stderr on machines without a screen.
 const LINUX_GPUS: [&str; 5] = ["/dev/dri", "/dev/nvidiactl", "/dev/kfd", "/dev/dxg", "/dev/mali0"];
 
 /// What is reported where `auto` finds none.

@@ -379,9 +379,8 @@ impl<'a> Painter<'a> {
         }
     }
 
-    /// The range of the last image's numbers that its colours spread over, without the outermost hundredths: of
-    /// depth and
-    /// uncertainty from the least on, of flow and velocity the largest length behind 0, of lifespan the whole clip.
+    /// The range of the last image's numbers that its colours spread over, without the outermost hundredths: of depth
+    /// and uncertainty from the least on, of flow and velocity the largest length behind 0, of lifespan the whole clip.
     /// `None`: nothing is seen, or the channel needs no range.
     pub fn range(&self) -> Option<[f32; 2]> {
         if self.channel == Channel::Life {

@@ -342,8 +342,7 @@ pub fn with_steps(mut edits: Edits, steps: impl IntoIterator<Item = Step>) -> Ed
     edits
 }
 
-/// Provenance of an edited scene: that of its file, with these edits appended and another text if there
-/// are some.
+/// Provenance of an edited scene: that of its file, with these edits appended and another text if there are some.
 pub fn provenance(source: &Source, earlier: Option<Provenance>, edits: &Edits, words: Option<String>) -> Provenance {
     let earlier = earlier.unwrap_or_default();
     let print = |run: &Run| run.info.get("capture_fingerprint")?.as_str().map(str::to_owned);
@@ -365,7 +364,7 @@ mod tests {
     use splat4d::math::Se3;
 
     #[test]
-    fn edits_are_toml_and_come_back() {
+    fn edits_round_trip_as_toml() {
         let text = r#"
             version = 1
             scene = "knight"

@@ -48,8 +48,8 @@ const MANY_LAYERS: usize = 8;
 /// Longest bar of a histogram, characters.
 const BAR: usize = 32;
 
-/// Remarks of readers about values that cannot be right; all other remarks are notes. Base colours
-/// that are all bright may be those of a bright scene.
+/// Remarks of readers about values that cannot be right; all other remarks are notes. Base colours that are all bright
+/// may be those of a bright scene.
 const DOUBTS: [&str; 8] = [
     "--linear scales",
     "--linear opacities",

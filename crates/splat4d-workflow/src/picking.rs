@@ -24,8 +24,8 @@ const ENDLESS: f64 = 1e6;
 /// Most corners that a page may draw.
 const CORNERS: usize = 256;
 /// Share of a drawn shape's narrower side by which a selection without *Through* reaches behind the first visible
-/// surface: half of it holds an object about as deep as it is wide, drawn around with some room, and nothing that
-/// is behind.
+/// surface: half of it holds an object about as deep as it is wide, drawn around with some room, and nothing that is
+/// behind.
 const BEHIND_SURFACE: f64 = 0.5;
 /// Most cells along a side of the stored depth map: its text stays below 5 kB.
 const MOST_CELLS: usize = 24;

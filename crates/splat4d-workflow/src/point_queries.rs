@@ -206,9 +206,8 @@ impl QueryResult {
     }
 
     /// As JSON:
-    /// `{"version": 1,
-    /// "times": [s], "points": [{"start": [x, y, z], "camera": name, "path": [[x, y, z] or null], "pixels": [[u, v] or
-    /// null], "visible": [bool]}]}`; the last two only of points with a camera.
+    /// `{"version": 1, "times": [s], "points": [{"start": [x, y, z], "camera": name, "path": [[x, y, z] or null], "pixels": [[u, v] or null], "visible": [bool]}]}`;
+    /// the last two only of points with a camera.
     pub fn to_json(&self) -> String {
         let times = self.followed.times.len();
         let points: Vec<serde_json::Value> = (0..self.asked.len())

@@ -104,7 +104,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_come_back() {
+    fn raw_values_round_trip() {
         let npy = Npy::read(&RawFormat::Npy.bytes(Channel::Flow, &flow()).unwrap()).unwrap();
         assert_eq!((npy.shape.as_slice(), &npy.to_f32()[..4]), (&[2, 3, 2][..], &[1.0, 0.1, 2.0, 0.2][..]));
         let flo = RawFormat::Flo.bytes(Channel::Flow, &flow()).unwrap();

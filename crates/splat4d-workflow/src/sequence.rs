@@ -329,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_come_in_the_order_of_their_numbers() {
+    fn frames_are_ordered_by_number() {
         let folder = tempfile::tempdir().unwrap();
         for name in ["f10.ply", "f9.ply", "f100.compressed.ply", "notes.txt", "cover.ply", ".9.ply"] {
             std::fs::write(folder.path().join(name), b"").unwrap();

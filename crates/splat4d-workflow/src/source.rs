@@ -307,7 +307,7 @@ mod tests {
     }
 
     #[test]
-    fn times_of_another_programs_ply_are_not_lost_without_a_word() {
+    fn unread_times_of_other_programs_plys_are_reported() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("4d.ply");
         let names = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3 t scale_t";

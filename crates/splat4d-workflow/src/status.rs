@@ -179,7 +179,11 @@ impl PartStatus {
     }
 
     fn failure(&self) -> String {
-        format!("{} stopped at step {}, and no worker is training it", self.name(), grouped(self.iteration.unwrap_or(0)))
+        format!(
+            "{} stopped at step {}, and no worker is training it",
+            self.name(),
+            grouped(self.iteration.unwrap_or(0))
+        )
     }
 
     fn text(&self) -> String {

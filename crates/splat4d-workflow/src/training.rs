@@ -138,8 +138,7 @@ pub fn train(
 }
 
 /// Continues a run from its newest checkpoint, and does what follows training. Of the options only `device`, `measure`,
-/// `finish`,
-/// `clock`, `own_loss` and `chunk` count.
+/// `finish`, `clock`, `own_loss` and `chunk` count.
 ///
 /// Errors: no such run; it belongs to another process; those of training.
 pub fn resume(run: &Path, options: &TrainingOptions, stop: &AtomicBool, listener: &dyn Listener) -> Result<Trained> {

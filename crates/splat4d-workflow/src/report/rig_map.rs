@@ -184,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn cameras_stand_on_the_map_as_seen_from_above() {
+    fn the_map_shows_cameras_from_above() {
         let plan = Plan::new([0.0, 1.0, 0.0]);
         let [a, b] = [plan.of([2.0, 5.0, 0.0]), plan.of([0.0, -3.0, 1.0])];
         assert!(

@@ -106,7 +106,7 @@ fn a_plain_file_is_what_a_compressed_one_is_compared_with() {
 }
 
 #[test]
-fn what_is_missing_or_strange_costs_no_page() {
+fn missing_or_odd_values_do_not_fail_the_page() {
     let folder = tempfile::tempdir().unwrap();
     run(folder.path(), 90);
     assert_eq!(page(folder.path()), "", "a run that was not compressed");
