@@ -1,10 +1,10 @@
 //! Correction by new images: predict, render, compare, update.
 //!
 //! A forecast of the next frame is rendered from the cameras and compared with their images; some steps of gradient
-//! descent on
-//! the nodes' poses alone make an observation of it. Forecast and observation are fused node by node with a scalar gain
-//! (the Kalman form with separate variances): K = P/(P + R), x ← x + K (x_o − x), P ← (1 − K) P, and before the next
-//! frame P ← P + Q, where Q is what an ensemble's variance grows by in a frame, and R the variance of an observation.
+//! descent on the nodes' poses alone make an observation of it. Forecast and observation are fused node by node with a
+//! scalar gain (the Kalman form with separate variances): K = P/(P + R), x ← x + K (x_o − x), P ← (1 − K) P, and before
+//! the next frame P ← P + Q, where Q is what an ensemble's variance grows by in a frame, and R the variance of an
+//! observation.
 
 use crate::future::{Clock, predicted};
 use crate::nodes::Observed;

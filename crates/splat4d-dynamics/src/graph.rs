@@ -1,8 +1,8 @@
 //! M3: accelerations of nodes by messages along edges, equivariant under rotations and translations of the whole scene
 //! (after Satorras et al. 2021, "E(n) equivariant graph neural networks").
 //!
-//! With r = x_j − x_k, ℓ = |r|, w = v_j − v_k along an edge, unit gravity g and vectors u of actions, invariants
-//! s = (ℓ/L, (ℓ − rest)/S, |w|²/S², r·w/(ℓS), r·g/L) of edges and (|v|²/S², v·g/S, height/L, |u|², u·v/S, scalars) of
+//! With r = x_j − x_k, ℓ = |r|, w = v_j − v_k along an edge, unit gravity g and vectors u of actions, invariants s =
+//! (ℓ/L, (ℓ − rest)/S, |w|²/S², r·w/(ℓS), r·g/L) of edges and (|v|²/S², v·g/S, height/L, |u|², u·v/S, scalars) of
 //! nodes:
 //!
 //! > h⁰ = φ_in(e, node's invariants), m_kj = φ_e(h_k, h_j, s), h_k ← h_k + φ_h(h_k, Σ_j m_kj / √8),

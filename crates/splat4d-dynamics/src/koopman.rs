@@ -8,8 +8,8 @@
 //! projection (Golub and Pereyra 1973, with Kaufman's Jacobian 1975) on the principal components of y, pair by pair,
 //! each from the frequency that explains most of what is left. Regression from tick to tick, with delays or without, is
 //! biased towards decay by noise (Dawson et al. 2016), which nodes that were learnt from images have; a fit of whole
-//! paths is not. How many pairs there are is chosen by forecasts
-//! from several ticks of the past. The residual of the last tick decays as earlier residuals did.
+//! paths is not. How many pairs there are is chosen by forecasts from several ticks of the past. The residual of the
+//! last tick decays as earlier residuals did.
 
 use crate::paths::{Moment, Paths, Pose, nearest};
 use nalgebra::{DMatrix, DVector};

@@ -1,8 +1,8 @@
 //! Nodes with identity on whatever moves in a scene, whichever motion model moves it.
 //!
 //! A node is tied to the Gaussians around it. From the last observed time it is followed tick by tick: its pose is the
-//! rigid motion that fits its members best. Where members fade (models with short-lived Gaussians), others
-//! around the node take over at the tick before, so that the node continues although no Gaussian does.
+//! rigid motion that fits its members best. Where members fade (models with short-lived Gaussians), others around the
+//! node take over at the tick before, so that the node continues although no Gaussian does.
 
 use crate::learnt::LEAST_TICKS;
 use crate::paths::{Moment, Paths, Pose};
@@ -223,8 +223,7 @@ fn extent(look: &Snapshot) -> ([f64; 3], f64) {
 }
 
 /// Which Gaussians are fast while they are opaque, and which move: of those that are opaque finally the ones most of
-/// whose
-/// neighbours are fast. All Gaussians of a body move; drifting or flickering ones do so alone.
+/// whose neighbours are fast. All Gaussians of a body move; drifting or flickering ones do so alone.
 fn moving(scene: &Scene<f32>, ticks: &[f64], last: &Snapshot, size: f64) -> (Vec<bool>, Vec<bool>) {
     let n = last.x.len();
     let mut bounds = vec![[[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]]; n];

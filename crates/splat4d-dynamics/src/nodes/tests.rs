@@ -126,7 +126,7 @@ fn a_predicted_scene_equals_the_scene_and_then_continues() {
 }
 
 #[test]
-fn what_cannot_be_observed_is_explained() {
+fn impossible_observations_are_refused_with_a_reason() {
     let scene = scene(false);
     let message = |ticks: &[f64], nodes| observe(&scene, ticks, nodes).unwrap_err().to_string();
     assert!(message(&ticks()[..3], 12).contains("too few"));
