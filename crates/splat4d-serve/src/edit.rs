@@ -1,8 +1,8 @@
 //! The only request with a body that a page may send: requests on a list of edits, if the program was started to edit.
 //!
 //! A page of any origin in the user's browser can send a form to loopback. This requires more than a form can send: a
-//! token that only the address which the program printed holds, JSON (which needs a preflight request, and gets
-//! none), and our own origin. The program decides what to do with it; it may return another scene.
+//! token that only the address which the program printed holds, JSON (which needs a preflight request, and gets none),
+//! and our own origin. The program decides what to do with it; it may return another scene.
 
 use crate::body::Body;
 use crate::reply::{text, whole};

@@ -32,8 +32,7 @@ impl Guard {
         Self { told: told.trim_matches(['[', ']']).to_ascii_lowercase(), open }
     }
 
-    /// Whether a request is allowed. `posts`: whether this path accepts a body, which has rules of its own
-    /// in addition.
+    /// Whether a request is allowed. `posts`: whether this path accepts a body, which has rules of its own in addition.
     pub(crate) fn check(&self, request: &Parts, posts: bool) -> Result<(), Refusal> {
         let known = request.method == Method::GET || request.method == Method::HEAD;
         let posts = posts && request.method == Method::POST;

@@ -150,7 +150,7 @@ fn an_empty_scene_and_none() {
 }
 
 #[test]
-fn the_player_comes_compressed_where_that_is_understood() {
+fn the_player_is_compressed_for_clients_that_accept_it() {
     let server = of_bytes(b"x");
     for asset in crate::assets() {
         let target = format!("/player/{}", asset.name);
@@ -182,7 +182,7 @@ fn the_player_folder_is_read_at_every_request_and_no_other_file() {
 }
 
 #[test]
-fn every_answer_keeps_other_origins_out() {
+fn every_response_excludes_other_origins() {
     let server = of_bytes(b"x");
     for reply in [get(&server, "/"), get(&server, "/scene.s4d"), get(&server, "/none"), {
         ask(&server, "GET", "/", &[("host", "evil.example")])

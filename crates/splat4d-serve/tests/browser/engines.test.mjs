@@ -257,7 +257,7 @@ for (const [name, [packages, script, modules]] of Object.entries(ENGINES)) {
   const missing = [...packages, 'esbuild'].filter((p) => !there(p));
   const skip = !browser ? 'needs a browser' : missing.length ? `needs ${missing.join(', ')}` : false;
   if (skip && process.env.REQUIRE_ENGINES === '1') throw new Error(`${name} ${skip}`);
-  test(`${name} shows what the player shows, sought and played, and gives its memory back`, { skip }, async (t) => {
+  test(`${name} matches the player when seeking and playing, and releases its memory`, { skip }, async (t) => {
     const body = `<canvas width="${WIDTH}" height="${HEIGHT}" style="display:block"></canvas><script type="module">${script}</script>`;
     const { page: p, errors } = await page(body, await modules(), (done) => t.after(done));
     await p.waitForFunction(() => window.shown, null, { timeout: PATIENCE }).catch((e) => assert.fail(`${e.message} ${errors}`));

@@ -29,7 +29,7 @@ async function opened(bytes, t) {
   return { page, errors, url: `${server.url}a.html` };
 }
 
-test('on a slow line the poster stays until the scene looks like it', options, async (t) => {
+test('on a slow connection the poster stays until the scene matches it', options, async (t) => {
   const { page, errors, url } = await opened(KNIGHT, t);
   const line = await page.context().newCDPSession(page);
   await line.send('Network.enable');
@@ -92,7 +92,7 @@ test('on a slow line the poster stays until the scene looks like it', options, a
   assert.deepEqual(errors, []);
 });
 
-test('a file that was cut short plays what is there, and says so', options, async (t) => {
+test('a truncated file plays what it holds, and reports it', options, async (t) => {
   const { page, url } = await opened(KNIGHT.subarray(0, 300_000), t);
   await page.addInitScript(() => {
     addEventListener('DOMContentLoaded', () =>

@@ -46,7 +46,7 @@ async function page(body, t) {
   return opened;
 }
 
-test('the package holds what it names, and is small', (t) => {
+test('the package contains its exports, and is small', (t) => {
   const manifest = JSON.parse(readFileSync(path.join(installed, 'package.json')));
   const named = Object.values(manifest.exports).flatMap((e) => (typeof e === 'string' ? [] : Object.values(e)));
   // What a loader imports is in the package too.
@@ -105,7 +105,7 @@ test('an installed element plays', needs(false), async (t) => {
   assert.deepEqual(errors, []);
 });
 
-test('the object in three.js shows what the element shows, among meshes', needs(true), async (t) => {
+test('the three.js object matches the element, among meshes', needs(true), async (t) => {
   const { page: p, errors } = await page(OBJECT, t);
   await p.waitForFunction(() => window.shown, null, { timeout: 60000 });
   const show = (...args) => p.evaluate((a) => window.show(...a), args);

@@ -151,7 +151,7 @@ function pace(frames, length, speed) {
 }
 
 for (const backend of ['webgl2', 'webgpu']) {
-  test(`${backend}: every frame of a playback is one that exists`, options, async (t) => {
+  test(`${backend}: every frame of a playback exists in the file`, options, async (t) => {
     const { page: p, errors } = await page(element(`backend="${backend}" resolution="1"`), t);
     await ready(p);
     await p.evaluate(HELP);

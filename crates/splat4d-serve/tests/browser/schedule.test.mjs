@@ -106,7 +106,7 @@ test('slow sorting goes on while frames are rendered', () => {
   assert.ok(m.rendered.length >= 36, `${m.rendered.length} of 100 frames`);
 });
 
-test('what is requested beyond the end is the beginning', () => {
+test('requests beyond the end wrap to the beginning', () => {
   const m = new Machine({ ms: 5, frame: 100 });
   m.frames(40);
   const times = m.rendered.slice(10).map(([, time]) => time);
@@ -175,7 +175,7 @@ test('nothing is requested for a time whose pages are missing', () => {
   assert.ok(m.asked.every((t) => t < 0.5) && m.schedule.shown.time < 0.5 && m.schedule.shown.time > 0.45);
 });
 
-test('a page that comes or a camera that moves asks again, at rest nothing does', () => {
+test('a new page or a moved camera requests an order, at rest nothing does', () => {
   const m = new Machine();
   m.playing = false;
   m.frames(5);
