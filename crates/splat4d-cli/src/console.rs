@@ -1,6 +1,5 @@
-//! Output during work: a progress bar on a terminal, plain lines elsewhere, JSON lines for
-//! machines. Results go to stdout; progress, warnings and errors go to stderr (with `--json`, all of them are lines on
-//! stdout).
+//! Output during work: a progress bar on a terminal, plain lines elsewhere, JSON lines for machines. Results go to
+//! stdout; progress, warnings and errors go to stderr (with `--json`, all of them are lines on stdout).
 
 use crate::interrupt;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
@@ -133,8 +132,8 @@ impl Console {
         self.above_bar(|| print(text));
     }
 
-    /// The same for a health report: its lines of problems (`! …`) and its last line, the verdict, have
-    /// colours on a terminal.
+    /// The same for a health report: its lines of problems (`! …`) and its last line, the verdict, have colours on a
+    /// terminal.
     pub(crate) fn report(&self, text: &str, healthy: bool) {
         let text = text::shown(text);
         let colours = std::io::stdout().is_terminal()
@@ -418,7 +417,8 @@ fn print(line: &str) {
     print_shown(&text::shown(line));
 }
 
-/// Prints sanitised text on stdout. A closed reader (`| head`) ends the program without an error; a full disk is an error.
+/// Prints sanitised text on stdout. A closed reader (`| head`) ends the program without an error; a full disk is an
+/// error.
 fn print_shown(line: &str) {
     let mut out = std::io::stdout().lock();
     if let Err(error) = writeln!(out, "{line}").and_then(|()| out.flush()) {
@@ -478,7 +478,7 @@ mod tests {
     }
 
     #[test]
-    fn trouble_and_verdict_have_colours() {
+    fn problems_and_verdict_are_coloured() {
         let text = "cameras          3\n  ! one is dark\n! no points\ndoes not look healthy";
         let painted = painted(text, false);
         assert_eq!(

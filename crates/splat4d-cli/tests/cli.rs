@@ -133,7 +133,7 @@ fn images_are_found_in_a_scene_and_cameras_compared_with_their_truth() {
 }
 
 #[test]
-fn a_capture_becomes_a_run_and_everything_follows() {
+fn a_capture_is_trained_evaluated_and_exported() {
     let work = tempfile::tempdir().unwrap();
     let capture = Capture::new(work.path()).write();
     let run = work.path().join("run");
@@ -365,7 +365,7 @@ fn one_gaussian(folder: &Path) -> PathBuf {
 }
 
 #[test]
-fn a_scene_becomes_a_page_alone_or_next_to_its_file() {
+fn a_page_embeds_or_links_its_scene() {
     let work = tempfile::tempdir().unwrap();
     let (file, page) = (one_gaussian(work.path()), work.path().join("page.html"));
     splat4d(&["export", str(&file), "--html", "-o", str(&page)]).run().ok();
@@ -432,7 +432,7 @@ fn a_scene_is_served_until_an_interrupt() {
 }
 
 #[test]
-fn a_run_is_watched_and_trains_without_a_server_too() {
+fn training_runs_with_and_without_a_live_server() {
     let work = tempfile::tempdir().unwrap();
     let capture = Capture::new(work.path()).write();
     let run = |name: &str| work.path().join(name);

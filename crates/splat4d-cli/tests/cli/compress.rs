@@ -5,7 +5,7 @@ use crate::{json_of, str, train};
 use serde_json::Value;
 
 #[test]
-fn a_run_becomes_a_smaller_run_and_is_measured_before_and_after() {
+fn a_run_is_compressed_and_measured_before_and_after() {
     let work = tempfile::tempdir().unwrap();
     let run = work.path().join("run");
     train(&Capture::new(work.path()).write(), &run).ok();

@@ -384,7 +384,7 @@ fn images_of_one_time_need_no_time_offsets() {
 }
 
 #[test]
-fn what_cannot_be_imported_is_explained() {
+fn unsupported_inputs_are_refused_with_a_reason() {
     let dir = tempfile::tempdir().unwrap();
     let at = |name: &str| dir.path().join(name);
     let take = at("take");

@@ -67,7 +67,7 @@ fn a_run_is_forecast_and_compared_with_later_frames() {
 }
 
 #[test]
-fn what_cannot_be_predicted_is_refused_with_a_remedy() {
+fn unpredictable_runs_are_refused_with_a_remedy() {
     let work = tempfile::tempdir().unwrap();
     let (capture, run) = seen(work.path(), SHARE);
     let actions = |text: &str| {
