@@ -1,5 +1,5 @@
-//! Motion models written in Python (`splat4d.Motion`): the library requests the Gaussians at a time, and passes it
-//! the gradient to them. Its tables are the library's: density control copies and removes their rows, Adam moves them,
+//! Motion models written in Python (`splat4d.Motion`): the library requests the Gaussians at a time, and passes it the
+//! gradient to them. Its tables are the library's: density control copies and removes their rows, Adam moves them,
 //! checkpoints and scenes hold them.
 
 use crate::arrays::{numbers, rows, shaped};

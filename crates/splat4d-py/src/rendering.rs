@@ -81,8 +81,8 @@ pub(crate) fn with_parameters(scene: &Scene<f32>, new: &Bound<'_, PyDict>) -> Py
     Ok(out)
 }
 
-/// A render that stores its inputs, so that a gradient to its image becomes gradients to the scene's
-/// parameters, the camera and the time.
+/// A render that stores its inputs, so that a gradient to its image becomes gradients to the scene's parameters, the
+/// camera and the time.
 #[pyclass(frozen, module = "splat4d")]
 pub(crate) struct Rendering {
     scene: Arc<Scene<f32>>,
@@ -96,8 +96,7 @@ pub(crate) struct Rendering {
     #[pyo3(get)]
     alpha: Py<PyAny>,
     /// [h, w] float32: Σ z α T, depth along the camera's z in scene units times what each Gaussian contributes; divide
-    /// it by
-    /// `alpha` for expected depth.
+    /// it by `alpha` for expected depth.
     #[pyo3(get)]
     depth: Py<PyAny>,
     state: Mutex<(Renderer, Evaluation)>,
@@ -158,9 +157,8 @@ fn gradient(value: &Bound<'_, PyAny>, what: &str, channels: usize, camera: &Came
 impl Rendering {
     /// Gradients of a scalar L, given dL/d`color` [h, w, 3] and, where L depends on them, dL/d`alpha` and dL/d`depth`
     /// [h, w]: a dict of arrays with the names and shapes of `Scene.parameters()`, and next to them `time` (dL/dt, a
-    /// float; 0 before
-    /// and after a Gaussian's path), `camera` ([6]: a translation and a rotation of the camera's axes, applied from the
-    /// left to `world_to_camera`) and `background` ([3]).
+    /// float; 0 before and after a Gaussian's path), `camera` ([6]: a translation and a rotation of the camera's axes,
+    /// applied from the left to `world_to_camera`) and `background` ([3]).
     #[pyo3(signature = (color=None, alpha=None, depth=None))]
     fn backward<'py>(
         &self,

@@ -22,8 +22,7 @@ const NO_DIRECTION: f64 = 1e-20;
 /// Highest order of the polynomials that positions may follow.
 const MAX_ORDER: usize = 3;
 
-/// Numbers of one Gaussian each, unconverted: `rows` times `width`, and the axis of times before them, if there is
-/// one.
+/// Numbers of one Gaussian each, unconverted: `rows` times `width`, and the axis of times before them, if there is one.
 pub(crate) struct Given {
     what: &'static str,
     times: Option<usize>,

@@ -27,10 +27,10 @@ use std::sync::atomic::AtomicBool;
 /// decides. `progress` is called with every event, a dict as in docs/events.md; without one, a bar is shown on
 /// terminals and in notebooks, and with `progress=False` nothing is. `loss(image, truth, view)` gets arrays [h, w, 3]
 /// and returns (value, gradient), which are added to the recipe's losses; in the first 40 % of the steps the arrays
-/// have half of the size, with
-/// `half_size_until=0` always the full one. `evaluate`: afterwards bake the playback file, measure held-out views, film
-/// an orbit and write the report, as the command does; `minutes` includes it. `force` replaces a run that is in `out`
-/// already. Ctrl-C, or an exception in a function of yours, stops with a checkpoint; `resume` continues from there.
+/// have half of the size, with `half_size_until=0` always the full one. `evaluate`: afterwards bake the playback file,
+/// measure held-out views, film an orbit and write the report, as the command does; `minutes` includes it. `force`
+/// replaces a run that is in `out` already. Ctrl-C, or an exception in a function of yours, stops with a checkpoint;
+/// `resume` continues from there.
 #[pyfunction]
 #[pyo3(signature = (
     capture, out=None, *, motion=None, progress=None, loss=None, minutes=None, quality=None, device="cpu", evaluate=false,
