@@ -229,8 +229,7 @@ fn steps(path: &[[f64; 3]]) -> Vec<[f64; 3]> {
     path.windows(2).map(|w| std::array::from_fn(|k| w[1][k] - w[0][k])).collect()
 }
 
-/// Mean of every three neighbours in time, of two at the ends; the sum over all steps is unchanged except for the
-/// ends.
+/// Mean of every three neighbours in time, of two at the ends; the sum over all steps is unchanged except for the ends.
 fn average(flow: &[[f64; 3]]) -> Vec<[f64; 3]> {
     let mean = |n: usize| {
         let near = &flow[n.saturating_sub(1)..(n + 2).min(flow.len())];

@@ -129,8 +129,8 @@ impl SampleShader<'_> {
     }
 }
 
-/// How much of the sky a point sees: darker in the hall's corners, under objects on the floor, and on the
-/// lower side of objects.
+/// How much of the sky a point sees: darker in the hall's corners, under objects on the floor, and on the lower side of
+/// objects.
 fn openness(frame: &Frame, point: V3, normal: V3, object: u8) -> f64 {
     let wall = (SIDE - point.x.abs()).min(point.z - BACK).min(FRONT - point.z);
     let edge = if point.y < 0.01 { wall } else { point.y };

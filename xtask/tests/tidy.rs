@@ -256,7 +256,7 @@ fn paths_in_documents_exist() {
 }
 
 #[test]
-fn tests_that_hold_promises_exist() {
+fn tests_of_promises_exist() {
     let all: String = sources().iter().map(|path| read(path)).collect();
     let (mut troubles, mut names) = (Vec::new(), 0);
     let promises = read("SECURITY.md");

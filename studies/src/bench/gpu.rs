@@ -1,6 +1,5 @@
 //! Times of a GPU: every stage of an image and of its backward pass by the GPU's own clock, and whole training steps in
-//! which it
-//! renders.
+//! which it renders.
 
 use super::roofline::bytes;
 use super::rows::Row;

@@ -418,7 +418,7 @@ mod tests {
     }
 
     #[test]
-    fn a_split_scene_has_as_many_gaussians_as_asked_and_covers_what_it_covered() {
+    fn a_split_scene_has_the_requested_count_and_the_same_coverage() {
         let base = small();
         let many = split(&base.scene, 40 * 500, 3);
         assert_eq!((many.len(), many.layers[0].params[SH].width()), (20_000, 48));

@@ -148,8 +148,8 @@ fn description(name: &str, scene: &Scene) -> Value {
 /// A coloured point, in the world's units.
 type Point = (V3, [u8; 3]);
 
-/// A sparse cloud as structure from motion would find it: random pixels of the training images of the first time (of
-/// a moving camera: of all times), kept where a second training image sees the point from a different direction.
+/// A sparse cloud as structure from motion would find it: random pixels of the training images of the first time (of a
+/// moving camera: of all times), kept where a second training image sees the point from a different direction.
 fn cloud(scene: &Scene) -> Vec<Point> {
     let training = scene.viewers.iter().filter(|v| !v.held);
     let views: Vec<(&Pinhole, usize)> =
@@ -257,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn the_same_bytes_come_out_everywhere() {
+    fn the_same_bytes_on_every_machine() {
         let all: Vec<String> = NAMES.iter().map(|(name, _)| format!("{name} {}", print_of(name))).collect();
         // A change of what is rendered must also change `VERSION`, so that old drawings are not taken for new ones.
         assert_eq!((VERSION, all.join("\n")), (2, PRINTS.trim().to_owned()));

@@ -1,6 +1,4 @@
-//! The synthetic captures: contents, cameras and difficulty. Nothing here was chosen by how
-//! well it
-//! is learnt.
+//! The synthetic captures: contents, cameras and difficulty. Nothing here was chosen by how well it is learnt.
 
 use super::world::{Pinhole, Shape, Texture, Thing, V3, World, sin_cos};
 use splat4d::math::Se3;

@@ -341,8 +341,7 @@ fn elsewhere(whole: Option<f64>, moving: Option<f64>, share: Option<f64>) -> Opt
 /// cameras see.
 struct Judges {
     whole: Judge,
-    /// The same at half the size. While images of half the size are trained on, they are the training views: at
-    /// full
+    /// The same at half the size. While images of half the size are trained on, they are the training views: at full
     /// size a scene that has never seen one gets worse and better at random.
     coarse: Judge,
 }
