@@ -92,7 +92,7 @@ pub fn feature_columns<F: Real>(scene: &Scene<F>, instant: &Evaluation<F>) -> Op
 
 /// A number per Gaussian, by layer and row, as [splats, 2]: it and 1; zeros where it is not finite.
 ///
-/// Panics: `instant` is not of a scene with so many layers and rows.
+/// Panics: `instant` is not of a scene with this many layers and rows.
 pub fn number_columns<F: Real>(instant: &Evaluation<F>, numbers: &[Vec<f32>]) -> Table<F> {
     let rows = instant.tapes().map(|t| t.out().rows()).sum();
     let mut out = Table::new(&[("number", 1), ("valid", 1)], rows);

@@ -67,7 +67,7 @@ fn or_cpu(config: RenderConfig, gpu: Result<(Box<dyn Backend>, String)>) -> Open
 }
 
 /// The requested device, together with the CPU, which renders what the GPU does not support, image by image, and a GPU
-/// that fails is left for good. Each is reported once ([`Backend::notice`]), and neither is an error.
+/// that fails is not used again. Each is reported once ([`Backend::notice`]), and neither is an error.
 pub fn open_to_train(device: Device, config: RenderConfig) -> Opened {
     let opened = open(device, config, &Wanted { backward: true, ..Wanted::default() }, Tables::Changing);
     let why = opened.why.replacen("drawing", "training", 1);

@@ -21,11 +21,11 @@ use std::borrow::Cow;
 
 /// Rows of a straight layer between two calls of the progress listener.
 const STRAIGHT_RUN: usize = 1 << 16;
-/// Samples of a scene are kept up to so many numbers (512 MiB), and sampled again for every cut beyond that.
+/// Samples of a scene are kept up to this many numbers (512 MiB), and sampled again for every cut beyond that.
 const KEPT: usize = 128 << 20;
 /// Rows of a task that measures.
 const ROWS: usize = 128;
-/// The time between samples is not halved beyond so many of them: 30,000 Gaussians at 266 times.
+/// The time between samples is not halved beyond this many of them: 30,000 Gaussians at 266 times.
 const REFINED: usize = 8_000_000;
 /// Gaussians of a layer whose motion between time samples is examined.
 const PROBED: usize = 400;
@@ -35,7 +35,7 @@ const BETWEEN: f64 = 2.5e-5;
 /// Where motion that is not straight is split.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Cut {
-    /// Where a segment misses by more than so many pixels.
+    /// Where a segment misses by more than this many pixels.
     Tolerance(f64),
     /// Where it lowers the mean squared error of images by more than this price of a segment ([`Curve`]).
     Price(f64),
@@ -69,7 +69,7 @@ impl Curve {
         [self.straight as f64 + between(&self.rate.pieces), between(&self.rate.error)]
     }
 
-    /// The lowest price with at most so many primitives; the highest there is, where there are more at any.
+    /// The lowest price with at most this many primitives; the highest there is, where there are more at any.
     pub fn price_of(&self, primitives: f64) -> f64 {
         self.first(|[pieces, _]| pieces <= primitives).unwrap_or(price(PRICES - 1))
     }
@@ -308,7 +308,7 @@ impl<'a> Bakery<'a> {
         !self.is_kept(layer) && Line::of(layer).is_none()
     }
 
-    /// The tree with so many samples a second, as far as their number is allowed.
+    /// The tree with this many samples a second, as far as their number is allowed.
     fn tree_of(&self, looks: f64) -> Result<Tree> {
         let rows: usize = self.scene.layers.iter().filter(|l| self.is_split(l)).map(|l| l.params.len()).sum();
         let most = self.options.samples.checked_div(rows).unwrap_or(usize::MAX);

@@ -18,7 +18,7 @@ pub(super) const LEVEL_PIXELS: f64 = 8.0;
 const FAINT: f64 = 1e-4;
 /// Share of the trace by which a covariance may differ before it counts as turned or stretched: f32 rounding.
 const SAME_SHAPE: f64 = 1e-5;
-/// The envelope's centre may be so many reaches away from a node before rounded velocities matter; a segment further
+/// The envelope's centre may be this many reaches away from a node before rounded velocities matter; a segment further
 /// out gets a centre of its own.
 const FAR: f64 = 8.0;
 /// SH coefficients of all channels.

@@ -68,7 +68,7 @@ pub struct Options {
     /// Most renders each, of fixed cameras and of one that moves, that measure how strongly images react to errors:
     /// bounds the time as well.
     pub renders: usize,
-    /// The clip is played so many times over.
+    /// The clip is played this many times over.
     pub repeat: usize,
     /// The cameras whose pixels count, at all times. No camera and no path: a 1080p image that the scene fills.
     pub cameras: Vec<Camera>,
@@ -145,9 +145,9 @@ pub struct Errors {
     pub counts: Vec<usize>,
 }
 
-/// Bakes a scene with [`Options::tolerance`]. `progress` hears how many Gaussians of how many are done.
+/// Bakes a scene with [`Options::tolerance`]. `progress` is called with the finished and the total number of Gaussians.
 ///
-/// Errors: a scene with a pixel head; options out of range; a clip that is no clip; a model that would become too many
+/// Errors: a scene with a pixel head; options out of range; an invalid clip; a model that would become too many
 /// primitives.
 pub fn bake(scene: &Scene<f32>, options: &Options, progress: &mut dyn FnMut(usize, usize)) -> Result<Baked> {
     Bakery::new(scene, options)?.bake(Cut::Tolerance(options.tolerance), progress)

@@ -22,7 +22,7 @@ const FACTOR: f64 = 2.5;
 /// Share of a Gaussian's energy by which a relative change of its covariance by 1 (Frobenius) changes images: (tr² +
 /// 2‖·‖²)/16 of a bell, between the values of a change along the axes and of a shear.
 const SHAPE: f64 = 0.125;
-/// Axes whose relative difference of squares is below this cannot be distinguished: a shear between them is no turn.
+/// Axes whose relative difference of squares is below this cannot be distinguished: a shear between them is not a turn.
 const ROUND: f64 = 0.05;
 /// A thin axis counts at least as this share of the longest.
 const THIN: f64 = 0.05;

@@ -12,7 +12,7 @@ use std::collections::BTreeMap;
 /// Most primitives of a scene: about 3 GB of memory while baking, 300 MB of file.
 const MAX_PRIMITIVES: usize = 10_000_000;
 
-/// Primitives and statistics of the layers so far.
+/// Primitives and statistics of the processed layers.
 #[derive(Default)]
 pub(super) struct Tally {
     /// By span of the tree, and which of the windows cuts it.

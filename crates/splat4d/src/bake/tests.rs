@@ -87,7 +87,7 @@ fn likeness(scene: &Scene<f32>, baked: &Baked) -> Likeness {
     likeness_after(scene, baked, 0.0)
 }
 
-/// So many frames after frames.
+/// This many frames after frames.
 fn likeness_after(scene: &Scene<f32>, baked: &Baked, part: f64) -> Likeness {
     let frames = ((scene.clip[1] - scene.clip[0]) * FPS).round() as usize + 1;
     let times: Vec<f64> = (0..frames).step_by(frames.div_ceil(9)).map(|k| (k as f64 + part) / FPS).collect();

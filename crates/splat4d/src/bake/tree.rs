@@ -30,7 +30,7 @@ pub(super) struct Tree {
 
 impl Tree {
     /// At least `rate` frames per second, but at most `most` of them (and at least two, where the clip has a length).
-    /// Errors: the clip or the segment's length is no sensible number.
+    /// Errors: the clip or the segment's length is out of range.
     pub(super) fn new(clip: [f64; 2], fps: f64, rate: f64, segment: f64, most: usize) -> Result<Self> {
         let fps = if fps > 0.0 && fps.is_finite() { fps } else { DEFAULT_FPS };
         let after = 1.0 / fps;

@@ -30,7 +30,7 @@ impl Size {
         Self { rows: layer.params.len() as u64, bytes: (tables + masks) as u64 }
     }
 
-    /// Of so many of a layer's Gaussians.
+    /// Of this many of a layer's Gaussians.
     pub(super) fn part(layer: &Layer<f32>, rows: usize) -> Self {
         let all = Self::of(layer);
         let share = rows as f64 / all.rows.max(1) as f64;
@@ -81,7 +81,7 @@ pub(super) fn check_growth(before: usize, steps: &[Step], scene: &Scene<f32>, co
     Ok(())
 }
 
-/// Refuses a clip of so many seconds before anything iterates over it.
+/// Refuses a clip of this many seconds before anything iterates over it.
 pub(super) fn check_clip(clip: [f64; 2], fps: f64) -> Result<()> {
     let fps = if fps > 0.0 && fps.is_finite() { fps } else { DEFAULT_FPS };
     let seconds = clip[1] - clip[0];

@@ -155,7 +155,7 @@ fn base_color(color: &Color<'_>, j: usize) -> [f32; 3] {
     }
 }
 
-/// All bits of so many samples.
+/// All bits of this many samples.
 fn all(count: u8) -> u8 {
     ((1u16 << count) - 1) as u8
 }

@@ -152,7 +152,7 @@ pub enum Step {
         #[serde(default)]
         keys: Vec<FadeKey>,
     },
-    /// Elsewhere, turned, larger: for good, or by keys over time.
+    /// Elsewhere, turned, larger: at all times, or by keys over time.
     Move {
         /// What.
         select: String,

@@ -25,7 +25,7 @@ pub enum Expr {
     Box([f64; 3], [f64; 3]),
     /// Centre and radius, scene units.
     Sphere([f64; 3], f64),
-    /// In the image of a camera, and farther than and nearer than so many scene units.
+    /// In the image of a camera, and farther than and nearer than this many scene units.
     Frustum(String, [f64; 2]),
     /// Base colour within a distance of one, 0 to 1.
     Color([f64; 3], f64),

@@ -26,7 +26,7 @@ pub(super) struct Moves {
     pub(super) velocities: Vec<f32>,
 }
 
-/// The seconds of a clip of so many frames.
+/// The seconds of a clip of this many frames.
 pub(super) fn duration(frames: Option<usize>, warnings: &mut Warnings) -> f64 {
     match frames.filter(|n| *n > 1) {
         Some(n) => {

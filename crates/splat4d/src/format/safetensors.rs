@@ -5,8 +5,7 @@
 //!
 //! Why not the `safetensors` crate (0.8.0, Apache-2.0, bounds-checked and sound when read): it keeps metadata in a
 //! `HashMap`, so that the same scene gives files of different bytes (15 kinds in 20 writes of four keys), while our
-//! runs must repeat byte for byte; it takes a name that occurs twice without a word; and its errors do not name the
-//! array.
+//! runs must repeat byte for byte; it accepts a duplicate name silently; and its errors do not name the array.
 
 use crate::{Error, ErrorKind, Result};
 use flate2::Crc;

@@ -29,7 +29,7 @@ pub(crate) const ROW: usize = 32;
 /// A linear scale of zero or below is read as this: no logarithm, and nothing to see either.
 const SMALLEST_SCALE: f32 = 1e-30;
 
-/// Reads Gaussians. Errors: the length is no multiple of 32, or there is nothing.
+/// Reads Gaussians. Errors: the length is not a multiple of 32, or there is nothing.
 pub fn read(bytes: &[u8]) -> Result<(Params, Warnings)> {
     if bytes.is_empty() || !bytes.len().is_multiple_of(ROW) {
         return Err(Error::input(format!("a .splat file has 32 bytes a Gaussian, this one has {} bytes", bytes.len()))

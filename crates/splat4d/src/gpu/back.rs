@@ -192,7 +192,7 @@ impl GpuRenderer {
         Ok(layout)
     }
 
-    /// Buffers of the gradients to `n` splats and to so many pixels, and of so many bytes of records.
+    /// Buffers of the gradients to `n` splats and to this many pixels, and of this many bytes of records.
     pub(super) fn make_room_for_gradients(&mut self, n: usize, pixels: u64, records: u64) -> Result<()> {
         let (gpu, b) = (&self.gpu, &mut self.buffers);
         let groups: usize = self.upload.draws.iter().map(|draw| draw.groups()).sum();

@@ -1,4 +1,4 @@
-//! An image that never leaves the GPU: rendered, compared with its truth and taken back in one submission.
+//! An image that never leaves the GPU: rendered, compared with its truth and backpropagated in one submission.
 
 use super::back::{Came, End};
 use super::buffers::UNIFORM_STRIDE;
@@ -73,7 +73,7 @@ pub(super) fn means(held: &Held, [l1, ssim, mse]: [f64; 3], d_response: Option<[
 }
 
 impl GpuRenderer {
-    /// Whether an image of so many splats can be compared at all: its planes are one buffer.
+    /// Whether an image of this many splats can be compared at all: its planes are one buffer.
     pub(super) fn can_compare(&self, splats: usize, [w, h]: [usize; 2]) -> bool {
         let room = largest_binding(&self.gpu) - 4 * UNIFORM_STRIDE;
         let whole = Band { first: 0, rows: h.div_ceil(TILE) };
@@ -197,7 +197,7 @@ impl GpuRenderer {
     }
 }
 
-/// Number of the first sum behind records of so many pairs.
+/// Number of the first sum behind records of this many pairs.
 pub(super) fn sums_at(room: usize) -> u32 {
     (RECORD_BYTES / 4) as u32 * room as u32
 }

@@ -44,7 +44,7 @@ impl Gpu {
         Self::open_within(adapters, u64::MAX)
     }
 
-    /// The same, with no buffer larger than so many bytes, whatever the driver has.
+    /// The same, with no buffer larger than this many bytes, whatever the driver has.
     pub(super) fn open_within(adapters: Adapters, most: u64) -> Result<Self> {
         let mut found = all_adapters();
         found.retain(|a| adapters == Adapters::Any || a.get_info().device_type != wgpu::DeviceType::Cpu);

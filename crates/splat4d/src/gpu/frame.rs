@@ -258,8 +258,8 @@ impl Frame<'_> {
         })
     }
 
-    /// Lists and blends one band; `bytes`: so many pixels of it in 8 bits too. Returns in which of the two buffers the
-    /// sorted pairs are.
+    /// Lists and blends one band; `bytes`: this many pixels of it in 8 bits too. Returns in which of the two buffers
+    /// the sorted pairs are.
     pub(super) fn band(
         &self,
         recorder: &mut Recorder<'_>,

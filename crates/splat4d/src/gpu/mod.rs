@@ -108,7 +108,7 @@ pub struct GpuRenderer {
     response: Grown,
     resident: Option<Box<KeptTables>>,
     flights: Flights,
-    /// Steps that may be under way, rows of tiles of a band in them, and rows of a page of their tables, where tests
+    /// Steps that may be in flight, rows of tiles of a band in them, and rows of a page of their tables, where tests
     /// request it.
     ahead: usize,
     band_rows: usize,
@@ -512,7 +512,7 @@ fn counts_at(planes: u64) -> u64 {
     planes.next_multiple_of(UNIFORM_STRIDE)
 }
 
-/// Bytes of the sort's counts for so many pairs.
+/// Bytes of the sort's counts for this many pairs.
 fn sort_bytes(gpu: &Gpu, pairs: u64) -> u64 {
     4 * DIGITS as u64 * (pairs.div_ceil(gpu.tuning.block() as u64) + 1)
 }

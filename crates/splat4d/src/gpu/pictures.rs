@@ -105,7 +105,7 @@ impl Pictures {
         Ok(Held { buffer: buffer.get().clone(), flags, weight, size, stays: false })
     }
 
-    /// Takes back an image that is no longer compared with.
+    /// Releases an image that is no longer compared with.
     pub(super) fn give_back(&mut self, held: Held) {
         if !held.stays {
             self.spare.push(Grown::of("an image's truth", held.buffer));

@@ -180,7 +180,7 @@ impl Tables {
         self.upload.bytes() + own + self.pages.iter().map(ResidentBuffers::bytes).sum::<u64>()
     }
 
-    /// What a step of so many views leaves in the status.
+    /// What a step of this many views leaves in the status.
     fn status(&self, views: usize) -> Status {
         let bad = STEP_WORDS + VIEW_WORDS * views;
         let alive = bad + self.layers * KEPT;
@@ -255,7 +255,7 @@ fn side_by_side(tables: &[(&[f32], usize)]) -> Vec<f32> {
     out
 }
 
-/// The rows of a page, of whole blocks, of a table with so many columns.
+/// The rows of a page, of whole blocks, of a table with this many columns.
 fn cut<'a>(data: &'a [f32], width: usize, page: &Range<usize>) -> &'a [f32] {
     &data[page.start * width..page.end * width]
 }

@@ -9,7 +9,7 @@ use wgpu::BufferUsages as Usage;
 
 /// Splats that pass a thread's pixel (roofline.wgsl).
 const SPLATS: usize = 1024;
-/// A measurement is made longer until it takes so many seconds: then a submission costs next to nothing.
+/// A measurement is made longer until it takes this many seconds: then a submission costs next to nothing.
 const LONG: f64 = 0.03;
 /// Runs of which the best counts.
 const RUNS: usize = 4;

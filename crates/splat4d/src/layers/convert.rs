@@ -68,7 +68,7 @@ pub fn to_spacetime<F: Real>(layer: &Layer<F>) -> Result<Layer<F>> {
 /// A `spacetime` layer as a `native4d` one with the given spec (its harmonics start at zero): the same image at every
 /// time, where the lifespans are within the spec's bounds.
 ///
-/// Errors: the layer moves otherwise, along curves, turns, or its lifespan is no Gaussian; a spec out of its ranges.
+/// Errors: the layer moves otherwise, along curves, turns, or its lifespan is not Gaussian; a spec out of its ranges.
 pub fn to_native4d<F: Real>(layer: &Layer<F>, spec: Native4dSpec) -> Result<Layer<F>> {
     let own_spec = match layer.motion.spec() {
         Spec::Spacetime(SpacetimeSpec { features: Some(_), .. }) => {

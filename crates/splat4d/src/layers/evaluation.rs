@@ -1,8 +1,8 @@
 //! [`Evaluation`]: the scene at these times, forth and back.
 //!
 //! A motion model needs all queries of a step at once (`prepare`), then computes them one by one (`at`); in the
-//! backward pass it takes a gradient a query (`backward`) and hears when that was the last one (`finish`). That order
-//! is written here, once, for training, playback, freezing, flow and baking.
+//! backward pass it takes a gradient a query (`backward`) and is notified after the last one (`finish`). That order is
+//! written here, once, for training, playback, freezing, flow and baking.
 
 #[cfg(test)]
 mod tests;
@@ -232,7 +232,7 @@ impl<F: Real> Query<F> {
 }
 
 /// Passes the results of many queries for the Gaussians of one layer to a callback, one at a time, however many there
-/// are. The motion model hears of all of them first, so that one that scans through time does so once.
+/// are. The motion model is notified of all of them first, so that one that scans through time does so once.
 pub(crate) fn sweep<F: Real>(layer: &Layer<F>, asked: &[(Rows<'_>, Time)], mut show: impl FnMut(usize, &LayerTape<F>)) {
     let (p, of) = (&layer.params, Space::Gaussians);
     let (mut cache, mut tape) = (Cache::default(), LayerTape::default());

@@ -18,7 +18,7 @@ use rayon::prelude::*;
 
 /// Neighbours of a node (SC-GS).
 pub(crate) const NEIGHBOURS: usize = 10;
-/// Of them the nearest so many always count, the others only within [`REACH`] (SC-GS).
+/// Of them the nearest this many always count, the others only within [`REACH`] (SC-GS).
 const SURE_NEIGHBOURS: usize = 3;
 /// Length of an edge beyond the third, of the median distance to the third neighbour: farther nodes are those of
 /// another limb (ours; SC-GS has 0.3 scene units).

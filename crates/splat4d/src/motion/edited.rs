@@ -212,7 +212,7 @@ impl<F: Real> Edited<F> {
         &self.change
     }
 
-    /// Writes the numbers of a drag into its tables. Panics: the change is no drag, or has another shape.
+    /// Writes the numbers of a drag into its tables. Panics: the change is not a drag, or has another shape.
     pub(crate) fn fill_drag(&self, from: &NodeOffsets, p: &mut Params<F>) {
         let (Change::Drag(spec), Some(keys)) = (&self.change, &self.drag) else { panic!("this edit drags nothing") };
         keys.fill(spec, from, p);

@@ -21,7 +21,7 @@ use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-/// Numbers of a pose: position 3, raw quaternion 4. The first so many columns of the geometry are frame 0's.
+/// Numbers of a pose: position 3, raw quaternion 4. The first this many columns of the geometry are frame 0's.
 pub const POSE: usize = 7;
 /// Columns of a page.
 const PAGE: [(&str, usize); 2] = [("means", 3), ("quats", 4)];

@@ -51,7 +51,7 @@ impl HashShape {
         self.levels * self.features
     }
 
-    /// Cells a side and entries of every level of a grid with so many axes. Errors: sizes that are not possible.
+    /// Cells a side and entries of every level of a grid with this many axes. Errors: sizes that are not possible.
     fn sizes(&self, dims: usize) -> Result<Vec<(usize, usize)>> {
         let given = [self.levels, self.features, self.finest, self.log2_size];
         let sound = given.iter().zip(LIMITS).all(|(&n, most)| (1..=most).contains(&n))

@@ -31,7 +31,7 @@ pub const SPATIAL: [usize; 3] = [0, 1, 3];
 /// The planes over x and t, y and t, z and t.
 pub const TEMPORAL: [usize; 3] = [2, 4, 5];
 
-/// Channels are worked on so many at a time.
+/// Channels are worked on this many at a time.
 pub(crate) const LANES: usize = 16;
 /// Most channels: four times what anyone uses.
 const MAX_CHANNELS: usize = 128;

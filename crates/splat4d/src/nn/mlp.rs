@@ -249,7 +249,7 @@ impl Mlp {
         let chunks = n.div_ceil(rows);
         let runs = chunks.min(RUNS);
         let inputs = self.shape.inputs;
-        // Every run is so many whole chunks, whichever thread works on it.
+        // Every run is this many whole chunks, whichever thread works on it.
         let ends: Vec<usize> = (0..=runs).map(|r| (r * chunks / runs.max(1) * rows).min(n)).collect();
         let (mut rest, overwrite) = match d_x {
             InputGrad::Skip => (&mut [][..], false),

@@ -116,7 +116,7 @@ pub trait Backend<F: Real = f32>: Send {
         None
     }
 
-    /// Radius of every splat of the last render that was taken back: 3σ of the larger axis, pixels; 0: not rendered.
+    /// Radius of every splat of the last render with a backward pass: 3σ of the larger axis, pixels; 0: not rendered.
     /// Empty where the backend has no backward pass.
     fn radii(&self) -> &[F];
 

@@ -113,7 +113,7 @@ impl<F: Real> Renderer<F> {
     /// exact for each alone.
     ///
     /// Neither head nor further channels are examined: it is the base colours' image that changes. `out` is
-    /// overwritten, one per splat. Renders by itself; no backward may follow.
+    /// overwritten, one per splat. Renders on its own; no backward may follow.
     pub(crate) fn removals(&mut self, shot: &Shot<'_, F>, out: &mut Vec<F>) {
         self.list_and_blend(shot);
         self.score_all::<Removal>(Some(shot.background), out);
@@ -122,7 +122,7 @@ impl<F: Real> Renderer<F> {
     /// The sensitivity of the image to each splat: exact sums over its pixels, for splats that stay in front of and
     /// behind the same others. Neither head nor further channels are examined: the image is that of the base colours.
     ///
-    /// `out` is overwritten, one per splat; zeros where no pixel shows it. Renders by itself; no backward may follow.
+    /// `out` is overwritten, one per splat; zeros where no pixel shows it. Renders on its own; no backward may follow.
     pub fn sensitivities(&mut self, shot: &Shot<'_, F>, out: &mut Vec<Sensitivity>) {
         let view = self.list_and_blend(shot);
         let splats = shot.splats;

@@ -320,7 +320,7 @@ pub(crate) fn project_backward<F: Real>(
     let iz = e.inv_z;
     let mut d_p = [F::ZERO, F::ZERO, d.depth];
     // Longer focal lengths move the centre away from the principal point and stretch M; where J is clamped, its bound
-    // is so many pixels, and its column of z stays.
+    // is this many pixels, and its column of z stays.
     let mut d_focal = F::ZERO;
     for a in 0..2 {
         let f = view.focal[a];

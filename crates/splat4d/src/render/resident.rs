@@ -218,7 +218,7 @@ pub struct ResidentNumbers {
 /// Steps are asynchronous: several may be in flight, and their results are returned in order. The results do not depend
 /// on the time of reading.
 pub trait Resident {
-    /// Takes over all layers, in place of whatever was kept; steps under way are forgotten. `corrections`: Adam's 1/(1
+    /// Takes over all layers, in place of whatever was kept; steps in flight are forgotten. `corrections`: Adam's 1/(1
     /// − β₁ⁿ) and 1/(1 − β₂ⁿ) by step count n, the last for all that follow.
     ///
     /// Errors: they are too large for the device, or it failed.
@@ -243,7 +243,7 @@ pub trait Resident {
         Vec::new()
     }
 
-    /// The numbers of a layer, with no step under way. Errors: the device failed. Panics: as of `step`.
+    /// The numbers of a layer, with no step in flight. Errors: the device failed. Panics: as of `step`.
     fn fetch(&mut self, layer: usize) -> Result<ResidentNumbers>;
 
     /// The cameras' colour matrices and their moments, in the same way; empty where none are kept. Errors: as of

@@ -262,7 +262,7 @@ impl<F> TableMut<'_, F> {
         self.rows.div_ceil(BLOCK)
     }
 
-    /// The first `blocks` blocks, and the rest. Panics: there are not so many.
+    /// The first `blocks` blocks, and the rest. Panics: there are not this many.
     pub(crate) fn split_at(self, blocks: usize) -> (Self, Self) {
         let rows = (blocks * BLOCK).min(self.rows);
         let (head, tail) = self.data.split_at_mut(blocks * BLOCK * self.width);

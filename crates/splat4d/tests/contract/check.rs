@@ -56,7 +56,7 @@ pub(crate) fn subject(spec: &Spec, rows: usize, life: LifeKind, spread: f64, see
     Subject { p, motion }
 }
 
-/// One scalar of everything a model answers, and its gradient: random weights on splats, colours and SH weights.
+/// One scalar of all results of a model, and its gradient: random weights on splats, colours and SH weights.
 struct Weights(Rng);
 
 impl Weights {
@@ -100,7 +100,7 @@ impl Subject {
         out
     }
 
-    /// Σ weights · answers over all queries of a step.
+    /// Σ weights · results over all queries of a step.
     fn value(&self, spaces: &[Space], rows: &[u32], times: &[f64], w: &Weights) -> f64 {
         let q = self.questions(spaces, rows, times);
         let mut cache = Cache::default();
@@ -195,7 +195,7 @@ impl Subject {
         }
     }
 
-    /// A query about some rows answers as the query about all.
+    /// A query for some rows returns the same as one for all.
     pub(crate) fn compact(&self) {
         let rows: Vec<u32> = (0..self.p.len() as u32).filter(|r| r % 4 == 1 || r % 7 == 0).collect();
         for t in TIMES {
@@ -257,7 +257,8 @@ impl Subject {
     }
 }
 
-/// The model is as it states: what moves and lives by itself, the SH table, scratch, and the polynomial of its path.
+/// The model agrees with its capabilities: own motion and lifespan, the SH table, scratch, and the polynomial of its
+/// path.
 pub(crate) fn capabilities(spec: &Spec, rows: usize, life: LifeKind) {
     let s = subject(spec, rows, life, 0.1, 4);
     let told = s.motion.capabilities();
@@ -379,7 +380,7 @@ pub(crate) fn any_threads(spec: &Spec, rows: usize) {
 }
 
 /// A filter around the model: switched off it changes nothing; switched on, a step along a random direction of all
-/// learnable numbers changes the answers as the gradient states.
+/// learnable numbers changes the results as the gradient states.
 pub(crate) fn filtered(spec: &Spec, rows: usize, life: LifeKind, spaces: &[Space], frozen: &[&str]) {
     let plain = subject(spec, rows, life, 0.1, 1);
     let around = |fusion: Fusion| {

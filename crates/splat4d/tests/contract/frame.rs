@@ -1,5 +1,5 @@
 //! A layer's frame, for every motion model: frame then evaluate is evaluate then frame, in numbers and in images; its
-//! gradient; files, frozen moments and baked scenes take it along.
+//! gradient; files, frozen times and baked scenes include it.
 
 use crate::check::subject;
 use splat4d::bake::{Options, Shown, bake, compare};
@@ -13,7 +13,7 @@ use splat4d::scene::{Camera, Grads, LifeKind, Rows, SH, Space, SplatGrads, Table
 
 /// Largest difference between a framed result and the result framed by hand, and of their images, in f64.
 const SAME: f64 = 1e-6;
-/// Largest difference between a frozen moment's image and the scene's: f32, and shapes out of a decomposition.
+/// Largest difference between a frozen time's image and the scene's: f32, and shapes out of a decomposition.
 const FROZEN: f32 = 2e-3;
 /// Likeness of a baked scene and the model from which on images are the same, dB.
 const ALIKE: f64 = 45.0;

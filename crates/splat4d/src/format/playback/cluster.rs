@@ -1,5 +1,5 @@
 //! Weighted k-means for palettes, in two levels so that thousands of entries take seconds: coarse clusters first, then
-//! each is divided by itself, and finally every point searches the coarse clusters nearest to it for its entry.
+//! each is divided alone, and finally every point searches the coarse clusters nearest to it for its entry.
 //!
 //! Identical points are merged into one with the sum of their weights first: the segments of a Gaussian share its
 //! colours. Points are assigned in parallel, and every cluster is summed in the order of its points: any number of

@@ -564,7 +564,7 @@ pub(super) fn palette_bytes(degree: usize, entries: usize) -> usize {
     12 + 3 * (sh::coeffs(degree) - 1) * entries
 }
 
-/// Key times of the masks of so many Gaussians, whose decoded bytes are so many; none where no number fits.
+/// Key times of the masks of this many Gaussians, whose decoded bytes are this many; none where no number fits.
 pub(super) fn mask_keys(gaussians: usize, bytes: usize) -> Option<usize> {
     let (rest, key) = (bytes.checked_sub(MASK_HEAD)?, 8 + gaussians.div_ceil(8));
     (rest.is_multiple_of(key) && (1..=MAX_KEYS).contains(&(rest / key))).then_some(rest / key)

@@ -127,7 +127,7 @@ pub struct PathKey {
     pub up: [f64; 3],
     /// Vertical field of view, degrees.
     pub fov_y: f64,
-    /// Second of the scene; none: time continues by itself.
+    /// Second of the scene; none: time runs.
     #[serde(default)]
     pub time: Option<f64>,
 }

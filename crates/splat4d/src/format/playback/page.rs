@@ -126,7 +126,7 @@ pub(super) fn unpack<'a>(entry: &Entry, stored: &'a [u8]) -> Result<std::borrow:
     match entry.codec {
         Codec::Raw if stored.len() == wanted => Ok(stored.into()),
         Codec::Deflate => {
-            // The entry's check has seen that so few bytes can become so many.
+            // The entry's check has seen that so few bytes can become this many.
             let mut out = vec![0; wanted];
             let mut inflate = flate2::Decompress::new(false);
             let status = inflate.decompress(stored, &mut out, flate2::FlushDecompress::Finish);

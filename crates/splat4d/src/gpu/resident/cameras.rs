@@ -17,7 +17,7 @@ pub(super) struct Cameras {
     buffer: Grown,
 }
 
-/// Place of a number in a table of so many columns.
+/// Place of a number in a table of this many columns.
 fn place(row: usize, column: usize, width: usize) -> usize {
     (row / BLOCK * width + column) * BLOCK + row % BLOCK
 }

@@ -12,7 +12,7 @@ use crate::scene::{Camera, Splats, Time};
 use std::collections::VecDeque;
 use std::time::Instant;
 
-/// Frames that are under way at most, as on a screen with three images.
+/// Frames that are in flight at most, as on a screen with three images.
 const FRAMES: usize = 3;
 /// The step that the frames belong to, for the capacity for pairs.
 const VIEW: u32 = 1;

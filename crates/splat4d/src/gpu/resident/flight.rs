@@ -1,4 +1,4 @@
-//! Steps under way: begun without a wait, and done some steps later, when the GPU has written their record
+//! Steps in flight: begun without a wait, and done some steps later, when the GPU has written their record
 //! (record.wgsl).
 //!
 //! If a view has more pairs than fit, the GPU stops: nothing later is applied, neither of that step nor of later ones,
@@ -18,7 +18,7 @@ use crate::scene::{Camera, Splats, Time};
 use crate::{Error, ErrorKind, Result};
 use std::collections::VecDeque;
 
-/// Steps that are under way at most: enough that a hiccup of the CPU of some steps' length is not seen, few enough that
+/// Steps that are in flight at most: enough that a hiccup of the CPU of some steps' length is not seen, few enough that
 /// what they hold (an image each, where images are not kept) is little.
 pub(in crate::gpu) const AHEAD: usize = 8;
 /// What stops steps because a number is none (record.wgsl).
@@ -48,7 +48,7 @@ pub(super) struct Begun {
     pub cameras: f64,
 }
 
-/// A step under way.
+/// A step in flight.
 #[derive(Debug)]
 struct Flight {
     step: Begun,
@@ -101,14 +101,14 @@ impl GpuRenderer {
         Ok(Some(std::mem::take(&mut self.flights.done)))
     }
 
-    /// A buffer of the status of steps of so many views.
+    /// A buffer of the status of steps of this many views.
     pub(super) fn make_room_for_status(&mut self, views: usize) -> Result<()> {
         let tables = self.resident.as_ref().expect("tables are kept before steps are taken");
         let bytes = 4 * tables.status(views).words as u64;
         if tables.status.bytes() >= bytes {
             return Ok(());
         }
-        // Those under way write into the old one.
+        // Those in flight write into the old one.
         while !self.flights.under_way.is_empty() {
             self.land()?;
         }
@@ -200,8 +200,8 @@ impl GpuRenderer {
         unreachable!("a step has a last view")
     }
 
-    /// Submits a view of a step, and, after its last, what it leaves: so many bytes of its status, and behind them its
-    /// times. Returns the last work, and the stages that are timed.
+    /// Submits a view of a step, and, after its last, what it leaves: this many bytes of its status, and behind them
+    /// its times. Returns the last work, and the stages that are timed.
     fn submit_view(
         &mut self,
         pass: &ResidentPass<'_>,

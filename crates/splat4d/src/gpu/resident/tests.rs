@@ -323,7 +323,7 @@ fn a_device_lost_with_steps_in_flight_is_an_error_for_every_call() {
     let finish = |r: &mut GpuRenderer| r.finish().map(|_| ());
     let fetch = |r: &mut GpuRenderer| r.fetch(0).map(|_| ());
     let step = |r: &mut GpuRenderer, number| begun(r, number, std::slice::from_ref(&camera), 0.01);
-    // As many as may be under way, and one.
+    // As many as may be in flight, and one.
     let more = |r: &mut GpuRenderer| (2..=r.ahead).try_for_each(|number| step(r, number).map(|_| ()));
     let ways: [Asked<'_>; 3] = [&finish, &fetch, &more];
     for (what, ask) in ["finish", "fetch", "more steps"].into_iter().zip(ways) {

@@ -415,7 +415,7 @@ fn models() -> Vec<Spec> {
     all
 }
 
-/// Answers, colours, gradients and velocities of a step with two queries.
+/// Results, colours, gradients and velocities of a step with two queries.
 fn whole(p: &Params<f64>, model: &dyn Motion<f64>, rows: Rows<'_>) -> Vec<f64> {
     let q = [0.21, 0.77].map(|t| At { p, of: Space::Gaussians, rows, t: Time(t) });
     let (mut cache, mut d_cache, mut d) = (Cache::default(), Cache::default(), Grads::new(p));

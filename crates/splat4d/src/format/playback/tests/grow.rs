@@ -81,7 +81,7 @@ fn the_finished_file_does_not_depend_on_the_order_of_chunks() {
     assert!(finish(&mut Cursor::new(cut), meta(1.0, &[]), None, &mut Vec::new()).is_err());
 }
 
-/// A disk with so many bytes.
+/// A disk with this many bytes.
 struct Small(Cursor<Vec<u8>>, usize);
 
 impl Read for Small {
