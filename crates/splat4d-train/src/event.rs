@@ -70,7 +70,7 @@ pub enum Event {
         /// The minutes that were requested.
         minutes: f64,
     },
-    /// A step was taken; sent every so many iterations.
+    /// A step was taken; sent every n iterations.
     Progress {
         /// Steps taken.
         iteration: usize,

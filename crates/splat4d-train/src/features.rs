@@ -37,7 +37,7 @@ pub struct FeatureScores {
     pub cosine: f64,
 }
 
-/// Frames of a list that have features, at most so many, evenly chosen.
+/// Frames of a list that have features, at most this many, evenly chosen.
 fn featured(capture: &Capture, frames: &[usize]) -> Vec<usize> {
     let all: Vec<usize> = frames.iter().copied().filter(|&i| capture.frames[i].features.is_some()).collect();
     let step = all.len().div_ceil(MOST_PICTURES).max(1);

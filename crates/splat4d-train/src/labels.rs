@@ -49,7 +49,7 @@ impl LabelScores {
     }
 }
 
-/// Frames of a list that have labels, at most so many, evenly chosen.
+/// Frames of a list that have labels, at most this many, evenly chosen.
 fn labelled(capture: &Capture, frames: &[usize], most: usize) -> Vec<usize> {
     let all: Vec<usize> = frames.iter().copied().filter(|&i| capture.frames[i].labels.is_some()).collect();
     let step = all.len().div_ceil(most.max(1)).max(1);

@@ -28,7 +28,7 @@ pub fn in_command(path: &Path) -> String {
     if !text.is_empty() && text.chars().all(plain) { text } else { format!("'{}'", text.replace('\'', r"'\''")) }
 }
 
-/// For `#[serde(with = "…::path_text")]`: text that comes back as the same path.
+/// For `#[serde(with = "…::path_text")]`: text that parses to the same path.
 pub fn serialize<S: Serializer>(path: &Path, to: S) -> Result<S::Ok, S::Error> {
     to.serialize_str(&to_text(path))
 }

@@ -13,12 +13,12 @@ pub enum Sampler {
     Uniform,
     /// As `Uniform`, but all views of a step at one time (Spacetime Gaussians).
     SameTime,
-    /// Four of five from a window of so many distinct times that slides over the clip as the stage proceeds, the rest
+    /// Four of five from a window of this many distinct times that slides over the clip as the stage proceeds, the rest
     /// from the whole capture (long captures).
     Window(usize),
     /// Only frames at the k-th distinct time (per-frame tracking).
     Frame(usize),
-    /// The step's views at so many consecutive distinct times, one each.
+    /// The step's views at this many consecutive distinct times, one each.
     Tuple(usize),
 }
 

@@ -23,7 +23,7 @@ pub struct Setting {
     pub doc: String,
     /// The permitted values and their unit.
     pub rule: Rule,
-    /// The words that it may be; none: it is no word.
+    /// The words that it may be; none: it is not a word.
     pub choices: Vec<&'static str>,
 }
 

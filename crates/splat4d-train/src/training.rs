@@ -26,14 +26,14 @@ pub struct Training<'a> {
 impl<'a> Training<'a> {
     /// Opens a capture (a folder or its marker file) as the recipe states: scale, split, frames.
     ///
-    /// Errors: the folder is no capture; files that are missing or broken; a recipe out of range.
+    /// Errors: the folder is not a capture; files that are missing or broken; a recipe out of range.
     pub fn open(capture: impl AsRef<Path>, recipe: Recipe) -> Result<Self> {
         recipe.check()?;
         let capture = Arc::new(open_capture(capture.as_ref(), &recipe)?);
         Ok(Self { capture, recipe, options: TrainOptions::default(), listen: Box::new(|_| {}), stop: None })
     }
 
-    /// Keeps training to so many minutes from its opening, on a machine that turns slower or faster as well.
+    /// Keeps training to this many minutes from its opening, on a machine that turns slower or faster as well.
     #[must_use]
     pub fn minutes(mut self, minutes: f64) -> Self {
         self.options.minutes = Some(minutes);

@@ -434,7 +434,7 @@ fn fit_pictures(take: &mut RawCapture, options: &CaptureOptions) -> Result<(bool
     let mut upright = Vec::with_capacity(take.frames.len());
     // Turned images whose sizes specify which pixels are described, and those whose sizes do not.
     let (mut by_size, mut unsure) = ([0; 2], Vec::new());
-    // COLMAP reads pixels as they are stored, and so do the scripts that write these layouts.
+    // COLMAP reads pixels as stored, and so do the scripts that write these layouts.
     let of_colmap = matches!(take.kind, CaptureKind::Colmap | CaptureKind::N3dv | CaptureKind::Llff);
     let mut as_stored = 0;
     for frame in &mut take.frames {

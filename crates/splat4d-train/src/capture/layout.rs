@@ -163,7 +163,7 @@ fn remark(take: &mut RawCapture, path: &Path, marker: &str, others: &[&str]) {
         ));
     }
 }
-/// Why a folder is no capture, and what to do about it.
+/// Why a folder is not a capture, and what to do about it.
 fn unknown_layout(root: &Path, named: &Path) -> Error {
     for (marker, what) in FOREIGN {
         if root.join(marker).exists() {

@@ -136,7 +136,7 @@ fn ahead(at: [f64; 2], theta: f64) -> Option<[f64; 2]> {
     (theta < std::f64::consts::FRAC_PI_2).then(|| along(at, theta.tan()))
 }
 
-/// RAD_TAN_THIN_PRISM_FISHEYE numbers its tangential terms the other way round than Brown does.
+/// RAD_TAN_THIN_PRISM_FISHEYE numbers its tangential terms in the opposite order to Brown.
 fn swapped([p0, p1]: [f64; 2]) -> [f64; 2] {
     [p1, p0]
 }

@@ -112,7 +112,7 @@ fn extracted_rate(root: &Path, camera: &str) -> Option<f64> {
     super::options::check_rate("frame rate", rate).ok().map(|()| rate)
 }
 
-/// The row of poses that each camera has, of so many: in the order of names; or, where cameras are missing, by the
+/// The row of poses that each camera has, of this many: in the order of names; or, where cameras are missing, by the
 /// number in the name, which counts from 0. `None`: they do not fit.
 pub fn rows_of(names: &[String], rows: usize) -> Option<Vec<usize>> {
     if names.len() == rows {

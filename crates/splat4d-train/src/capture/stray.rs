@@ -24,7 +24,7 @@ const HEAD: u64 = 1 << 16;
 /// Folders that are searched for a capture.
 const MOST_FOLDERS: usize = 100;
 
-/// What to do with a folder that is no capture, which the user called `named`, by what it holds. `None`: it holds
+/// What to do with a folder that is not a capture, which the user called `named`, by what it holds. `None`: it holds
 /// nothing that is known.
 pub(super) fn advice(root: &Path, named: &Path, is_capture: &dyn Fn(&Path) -> bool) -> Option<String> {
     let names = rig::file_names(root);

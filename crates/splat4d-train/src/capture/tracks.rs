@@ -27,7 +27,7 @@ pub struct Tracks {
 }
 
 impl Tracks {
-    /// Reads the tracks of a camera of this size, of so many frames. Errors name the file, the point and the frame.
+    /// Reads the tracks of a camera of this size, of this many frames. Errors name the file, the point and the frame.
     pub(super) fn read(path: &Path, size: [usize; 2], frames: usize) -> Result<Self> {
         let bytes = json::read_bytes(path)?;
         let npz = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("npz"));

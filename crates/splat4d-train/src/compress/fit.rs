@@ -1,4 +1,4 @@
-//! Settings with which a file stays within so many bytes.
+//! Settings with which a file stays within this many bytes.
 
 use super::{Compression, Level, MOST_PRUNED, draft};
 use crate::maintenance::importance::{Scores, prune};

@@ -117,7 +117,7 @@ mod tests {
         Capture::open(folder, &CaptureOptions::default()).unwrap()
     }
 
-    /// The wall, which moves by so many pixels a frame.
+    /// The wall, which moves by this many pixels a frame.
     fn wall(pixels: f64) -> Scene<f32> {
         let mut p = Params::new(400, 1, &[]);
         let motion = build(&Spec::Spacetime(SpacetimeSpec { order: 1, ..SpacetimeSpec::default() }), &mut p).unwrap();

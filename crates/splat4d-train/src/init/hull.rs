@@ -31,9 +31,9 @@ const MOVING_CAMERAS: usize = 5;
 /// A camera in which more of the image differs (an exposure that was changed, a camera that was pushed) shows no
 /// silhouette.
 const MOVING_PICTURE: f64 = 0.5;
-/// A point must be seen by at least so many images.
+/// A point must be seen by at least this many images.
 const MIN_VIEWS: usize = 2;
-/// One moving camera: images of so many times around replace other cameras.
+/// One moving camera: images of this many times around replace other cameras.
 const MONOCULAR_PICTURES: usize = 60;
 
 /// About `count` points over all `times`. For a still scene (`moving` false) masks of the first time represent all.

@@ -173,7 +173,7 @@ impl Value for Source {
 const UNKNOWN_COLOR: [f32; 3] = [0.5; 3];
 /// A lifespan this many clips wide is practically infinite: at the clip's ends σ is still above 0.96.
 const LONG_LIFE_CLIPS: f64 = 2.0;
-/// One keyframe of initial points about every so many frames.
+/// One keyframe of initial points about every n frames.
 const FRAMES_PER_KEYFRAME: usize = 5;
 /// Initial scales are clamped to this share of the extent, or of the distance from the cameras where that is more: a
 /// lone point would otherwise hide the scene, and a far background of points that are a pixel wide would have to grow

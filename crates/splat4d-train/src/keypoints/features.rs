@@ -60,7 +60,7 @@ const MOST: usize = 3000;
 pub struct Limits {
     /// Least contrast of an extremum, of an image in [0, 1].
     pub contrast: f64,
-    /// At most so many, those of highest contrast.
+    /// At most this many, those of highest contrast.
     pub most: usize,
 }
 

@@ -47,7 +47,7 @@ const MOMENTS: usize = 4;
 const DERIVATIVES: usize = 3;
 /// Widest run of columns worked on at a time, so that the rings fit the second-level cache.
 const MAX_COLUMNS: usize = 512;
-/// Numbers in a scratch row, whole cache lines: columns, the products' halo on both sides, and room for [`READ`] from
+/// Numbers in a scratch row, whole cache lines: columns, the products' halo on both sides, and space for [`READ`] from
 /// the derivatives' first column on.
 const STRIDE: usize = MAX_COLUMNS + 3 * PRODUCT_HALO;
 /// Most numbers that a horizontal pass reads of a row: a window's rest more than it makes.

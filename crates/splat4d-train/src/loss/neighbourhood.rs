@@ -28,12 +28,12 @@ pub(crate) struct Neighbourhood<F> {
     frame: f64,
     clip: [f64; 2],
     near: Near,
-    /// Of the step that is under way: a graph over the rows of each probe.
+    /// Of the step that is in flight: a graph over the rows of each probe.
     graphs: Mutex<Vec<Graph<F>>>,
 }
 
 impl<F: Real> Neighbourhood<F> {
-    /// For a scene of this extent (scene units), over a clip (seconds) of so many frames per second.
+    /// For a scene of this extent (scene units), over a clip (seconds) of this many frames per second.
     pub(crate) fn new(weights: LossSettings, extent: f64, clip: [f64; 2], fps: f64) -> Self {
         Self { weights, unit: 1.0 / extent, frame: 1.0 / fps, clip, near: Near::default(), graphs: Mutex::default() }
     }

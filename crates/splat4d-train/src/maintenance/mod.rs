@@ -126,7 +126,7 @@ impl Every {
     /// At no step.
     pub(crate) const NEVER: Self = Self { first: 0, last: 0, interval: 0 };
 
-    /// Whether it is time after so many steps.
+    /// Whether it is time after this many steps.
     pub(crate) fn is_due(&self, step: usize) -> bool {
         self.interval > 0 && step >= self.first && step <= self.last && step.is_multiple_of(self.interval)
     }
@@ -223,7 +223,7 @@ pub trait Maintenance: Send + Sync {
         RunOrder::Last
     }
 
-    /// Whether it is to run after so many steps of the stage; see [`once`](Self::once) for the time before the first
+    /// Whether it is to run after this many steps of the stage; see [`once`](Self::once) for the time before the first
     /// one.
     fn due(&self, at: &At) -> bool;
 

@@ -14,9 +14,8 @@ use splat4d::motion::Spec;
 use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
 use splat4d::motion::skin::{MAX_NEIGHBOURS, MAX_NODES, SkinSpec};
 
-/// One key of a trajectory about every so many frames. Four is usual for B-splines on SE(3); with one moving camera
-/// fewer keys separate motion from shape sooner: 12 keys reach 31.9 dB on D-NeRF's mutant after 1,000 steps, 41 keys
-/// 29.0 dB.
+/// One key of a trajectory about every n frames. Four is usual for B-splines on SE(3); with one moving camera fewer
+/// keys separate motion from shape sooner: 12 keys reach 31.9 dB on D-NeRF's mutant after 1,000 steps, 41 keys 29.0 dB.
 const FRAMES_PER_KEY: usize = 12;
 /// A cubic curve has three keys more than segments.
 const CUBIC_EXTRA: usize = 3;

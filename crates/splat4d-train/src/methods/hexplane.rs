@@ -83,7 +83,7 @@ const OUTSIDE: f64 = 0.002;
 const MARGIN: f64 = 0.1;
 /// Smallest side of the box, of its longest: a flat cloud may still move out of its plane.
 const FLATTEST: f64 = 0.1;
-/// One of so many steps has a coarse stage's place if the recipe leaves it open.
+/// One of this many steps has a coarse stage's place if the recipe leaves it open.
 const COARSE_PART: usize = 10;
 
 impl Method for HexplaneMethod {
@@ -176,7 +176,7 @@ impl HexplaneMethod {
         ends
     }
 
-    /// Everything in one stage, with so many levels; the others are parts of it.
+    /// Everything in one stage, with this many levels; the others are parts of it.
     fn whole(&self, plan: &TrainContext, levels: usize) -> Stage {
         let c = &plan.common;
         let mut stage = still::stage("hexplane", plan);

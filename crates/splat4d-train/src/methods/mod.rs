@@ -163,7 +163,7 @@ pub struct Group {
     pub rate: Rate,
     /// Frozen for this many steps of the stage (networks and fine grids that start later).
     pub from: usize,
-    /// The rate rises linearly over so many of its first steps; 0: all at once.
+    /// The rate rises linearly over this many of its first steps; 0: all at once.
     pub warm_up: usize,
 }
 
@@ -197,7 +197,7 @@ pub struct TimeNoise {
 }
 
 impl TimeNoise {
-    /// β after so many steps of the stage.
+    /// β after this many steps of the stage.
     pub(crate) fn width(&self, step: usize) -> f64 {
         if step >= self.steps { 0.0 } else { self.start * (1.0 - step as f64 / self.steps as f64) }
     }
@@ -320,7 +320,7 @@ impl Stage {
         self
     }
 
-    /// The highest SH degree that is rendered after so many steps, of `most`.
+    /// The highest SH degree that is rendered after this many steps, of `most`.
     pub(crate) fn sh_degree(&self, step: usize, most: usize) -> usize {
         (self.sh_from + step).checked_div(self.sh_interval).map_or(most, |unlocked| unlocked.min(most))
     }

@@ -11,7 +11,8 @@ use splat4d::motion::Spec;
 use splat4d::motion::native4d::{MAX_HARMONICS, Native4dSpec, TABLE, set_velocity};
 use splat4d::scene::{LifeKind, Params};
 
-/// Scales in time count up to so many clips: a Gaussian is then as good as immortal (0.5 % fainter at the clip's ends).
+/// Scales in time count up to this many clips: a Gaussian is then as good as immortal (0.5 % fainter at the clip's
+/// ends).
 const LONGEST_CLIPS: f64 = 10.0;
 /// Colours beyond the base learn this much slower (Kerbl et al. 2023; Yang et al. 2024 for the blocks in time).
 const SH_REST_SLOWDOWN: f64 = 20.0;

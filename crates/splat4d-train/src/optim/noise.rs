@@ -21,7 +21,7 @@ const NOISE_SLOPE: f64 = 100.0;
 pub struct Noise {
     /// Its strength, times the rate of positions.
     pub strength: f64,
-    /// Stages that begin after so many steps, where densification has ended, have none.
+    /// Stages that begin after this many steps, where densification has ended, have none.
     pub until: usize,
 }
 

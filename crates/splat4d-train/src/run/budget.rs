@@ -101,7 +101,7 @@ pub(super) struct Planner {
 }
 
 impl Planner {
-    /// Begins at so many seconds of the command, behind these plans.
+    /// Begins at this many seconds of the command, behind these plans.
     pub(super) fn new(budget: Budget, now: f64, replans: &[ScheduleChange]) -> Self {
         let last = replans.last().map_or(0, |row| row.at);
         // A part that begins late in a command is examined as often as one that begins at once.

@@ -33,7 +33,7 @@ const LOOKED_AT: usize = 8;
 const CLOSE: usize = 1000;
 
 impl OpenCapture {
-    /// The number of Gaussians for a run of so many steps, and the reason.
+    /// The number of Gaussians for a run of this many steps, and the reason.
     ///
     /// Errors: an image cannot be read.
     pub(super) fn needed(&self, recipe: &Recipe, steps: f64) -> Result<(usize, String)> {

@@ -17,7 +17,7 @@ use std::sync::Arc;
 /// The folder next to the run, and the file that identifies the flow's input.
 const FOLDER: &str = "flow";
 const MARK: &str = "of.txt";
-/// The next training image may be so many frames later: one between them may be held out.
+/// The next training image may be this many frames later: one between them may be held out.
 const MOST_FRAMES: usize = 2;
 
 /// The capture with flow between its training images, where it brings none and the recipe needs our own.

@@ -19,7 +19,7 @@ const TIMED: usize = 37;
 const WARM_UP: f64 = 1.0 / 3.0;
 /// Steps that are timed however long they take.
 const LEAST: usize = 6;
-/// Steps between two densifications of the probe, and at most so many steps until it is at the cap.
+/// Steps between two densifications of the probe, and at most this many steps until it is at the cap.
 const HURRIED: usize = 20;
 /// See [`HURRIED`].
 const GROWTH_STEPS: usize = 400;
@@ -49,7 +49,7 @@ struct Steps {
 }
 
 impl Steps {
-    /// Seconds a step of `stage` takes, `place` steps into its schedule, with so many Gaussians.
+    /// Seconds a step of `stage` takes, `place` steps into its schedule, with this many Gaussians.
     fn at(&self, stage: &Stage, place: usize, count: f64) -> f64 {
         let ([start, end], [few, many]) = (self.gaussians.map(|n| n as f64), self.seconds);
         let size = usize::from(place >= stage.half_size_steps);
@@ -109,7 +109,7 @@ impl Timing {
         Ok(Self { stages, scene: first })
     }
 
-    /// Seconds of one step in a place of the schedule, with so many Gaussians.
+    /// Seconds of one step in a place of the schedule, with this many Gaussians.
     pub(super) fn step(&self, stages: &[Stage], stage: usize, place: usize, count: usize) -> f64 {
         stages.get(stage).map_or(0.0, |s| self.stages[stage.min(1)].at(s, place, count as f64))
     }
@@ -142,7 +142,7 @@ impl Timing {
         self.step(stages, stages.len() - 1, usize::MAX, cap.max(self.stages[0].gaussians[0]))
     }
 
-    /// The recipe with as many iterations as take `seconds`, where what follows takes as long as so many steps at the
+    /// The recipe with as many iterations as take `seconds`, where what follows takes as long as this many steps at the
     /// end.
     pub(super) fn fit(&self, opened: &OpenCapture, recipe: &Recipe, seconds: f64, finish: f64) -> Result<Recipe> {
         let recipe = recipe.unresolved();

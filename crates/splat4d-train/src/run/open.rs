@@ -175,7 +175,7 @@ fn mean_color(frames: &dyn Frames) -> Result<[f32; 3]> {
 }
 
 /// Corrections of cameras that a recipe enables. Clocks carry no information where nothing moves, and nothing can be
-/// asked between the frames of a model that is learnt frame by frame.
+/// queried between the frames of a model that is learnt frame by frame.
 pub(crate) fn learnable(recipe: &Recipe) -> RefineSettings {
     let timed = !["still", "tracked"].contains(&recipe.run.motion.as_str());
     RefineSettings { times: recipe.refine.times && timed, ..recipe.refine.clone() }

@@ -23,7 +23,7 @@ const FEW: f64 = 0.05;
 /// as well, however many: a sky, a far background. Of eight captures the bundled one, a kitchen, a hall and five
 /// synthetic rooms have 0 to 0.06, one before a far background has 0.34 (docs/suite.md).
 const BARE: f64 = 0.2;
-/// Cells along an image's longer side in which that is counted; of a rig at most so many views.
+/// Cells along an image's longer side in which that is counted; of a rig at most this many views.
 const CELLS: f64 = 16.0;
 const VIEWS: usize = 64;
 /// Of the initial Gaussians, the points that are searched for: the others are placed between them along surfaces.

@@ -25,7 +25,7 @@ const CLEARLY: f64 = 0.7;
 /// leaves of the median of hundreds.
 const OTHER_SCALE: f64 = 0.02;
 /// Share of the points that what is in front of them hides from an image at most but for this: the scale is that of the
-/// closest so many ratios.
+/// closest this many ratios.
 const VISIBLE: f64 = 0.3;
 /// Depths whose closest ratios to the points are spread by more than this either way (logarithm) are not theirs, at
 /// whatever scale: noise of a quarter of the depth does as much, and single-image networks have less.
@@ -150,7 +150,7 @@ fn flow_reads(capture: &Capture, store: &ImageStore, frame: usize) -> Result<Opt
 enum Depths {
     /// They agree, or cannot be compared.
     Fit,
-    /// The points are so many times as far away, everywhere.
+    /// The points are this many times as far away, everywhere.
     Scaled(f64),
     /// Even the closest scatter about the points by this (logarithm): no unit corrects that.
     Foreign(f64),

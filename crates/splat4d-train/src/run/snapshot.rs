@@ -16,7 +16,7 @@ use splat4d::scene::{Camera, time::DEFAULT_FPS};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Training continues for so many times as long as the last snapshot took: at most 2.5 % of the time.
+/// Training continues for this many times as long as the last snapshot took: at most 2.5 % of the time.
 const REST: u32 = 40;
 /// Entries of the palette, rounds that fit it, effort of deflate: a snapshot is examined for seconds.
 const PALETTE: usize = 256;

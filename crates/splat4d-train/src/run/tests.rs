@@ -38,7 +38,7 @@ const CAMERAS: usize = 4;
 const MOMENTS: usize = 3;
 const STEPS: usize = 40;
 
-/// Four cameras, so many frames, on disk.
+/// Four cameras, this many frames, on disk.
 fn capture_on_disk(moments: usize) -> TempDir {
     let folder = tempfile::tempdir().unwrap();
     let made = Made::new(CAMERAS, MOMENTS, SIZE);
@@ -87,7 +87,7 @@ pub(crate) fn recipe(changes: &[&str]) -> Recipe {
     r
 }
 
-/// A folder with the capture and room for runs.
+/// A folder with the capture and space for runs.
 pub(crate) struct Place {
     capture: TempDir,
     runs: TempDir,

@@ -10,7 +10,7 @@
 
 use super::replans::ScheduleChange;
 
-/// How many steps of the schedule are behind a run after so many steps of its own: a pure function of the changes of
+/// How many steps of the schedule are behind a run after this many steps of its own: a pure function of the changes of
 /// plan.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Pace {
@@ -20,7 +20,7 @@ pub(crate) struct Pace {
 }
 
 impl Pace {
-    /// The pace of a run whose schedule has so many steps.
+    /// The pace of a run whose schedule has this many steps.
     pub(crate) fn new(schedule: usize, replans: &[ScheduleChange]) -> Self {
         let mut pace = Self { schedule, rows: Vec::new() };
         for row in replans {

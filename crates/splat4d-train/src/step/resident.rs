@@ -150,7 +150,7 @@ impl<'a> DeviceEngine<'a> {
         Ok(())
     }
 
-    /// The fault of a device that failed with the only numbers, and is left for good.
+    /// The fault of a device that failed with the only numbers, and is not used again.
     fn gone(&mut self, why: &str) -> Fault {
         self.given_up = true;
         self.cpu.leave_device();

@@ -307,7 +307,7 @@ impl Corrections {
         SearchDue { round, reach: reach * self.scale.frame, step: step * self.scale.frame }
     }
 
-    /// Shifts the clocks of cameras by so many seconds. Their earlier gradients no longer apply.
+    /// Shifts the clocks of cameras by this many seconds. Their earlier gradients no longer apply.
     pub(crate) fn shift(&mut self, shifts: &[(usize, f64)]) {
         let limit = (self.settings.time_limit * self.scale.frame) as f32;
         let Some(times) = &mut self.times else { return };

@@ -42,8 +42,8 @@ const STRIDE: usize = 4;
 const PATCH_STEPS: usize = 16;
 /// Differences below this, of images in [0, 1], weigh alike where patches overlap (one grey level there).
 const GREY_LEVEL: f32 = 1.0 / 255.0;
-/// Forward and backward flow agree if |F + B|² is below this share of |F|² + |B|² and so many squared pixels (Sundaram et
-/// al. 2010).
+/// Forward and backward flow agree if |F + B|² is below this share of |F|² + |B|² and this many squared pixels
+/// (Sundaram et al. 2010).
 const AGREE_SHARE: f32 = 0.01;
 const AGREE_PIXELS: f32 = 0.5;
 

@@ -21,7 +21,7 @@ const MEDIAN_FROM: usize = 3;
 /// A pixel that differs by more than this from the static background (mean of the channels, in [0, 1]) belongs to
 /// something that moves: above the noise of ordinary cameras.
 const MOVED: f32 = 0.06;
-/// Differences are blurred by so many pixels: single ones are noise.
+/// Differences are blurred by this many pixels: single ones are noise.
 const MOVED_BLUR: f64 = 1.0;
 
 /// An image to search for points in.
@@ -95,7 +95,7 @@ impl Rigs {
         Self::Fixed(fixed)
     }
 
-    /// Whether a fixed camera has so many times that their median is the static background.
+    /// Whether a fixed camera has this many times that their median is the static background.
     pub(crate) fn have_medians(&self) -> bool {
         matches!(self, Self::Fixed(rigs) if rigs.iter().any(|rig| rig.len() >= MEDIAN_FROM))
     }

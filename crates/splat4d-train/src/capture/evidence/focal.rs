@@ -10,7 +10,7 @@ use super::pairs::{self, Match};
 use super::points;
 use splat4d::math::Se3;
 
-/// Factors that are tried are powers of this, up to so many both ways: a quarter to four times.
+/// Factors that are tried are powers of this, up to this many both ways: a quarter to four times.
 const STEP: f64 = 1.189_207_115_002_721;
 const STEPS: i32 = 8;
 /// Steps to half and to twice the length.

@@ -14,7 +14,7 @@ use splat4d::math::Se3;
 use splat4d::math::se3::{dot, norm, sub};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Captures of at most so many places are compared image by image; of larger ones the conspicuous poses.
+/// Captures of at most this many places are compared image by image; of larger ones the conspicuous poses.
 const ALL: usize = 24;
 /// Conspicuous poses that are examined at most, and share of all positions: more are a property of the capture.
 const SUSPECTS: usize = 4;
@@ -33,7 +33,8 @@ const VOUCHED: f64 = 0.3;
 const STRANGE: (f64, f64) = (0.1, 0.35);
 /// Images that are compared with points for that, evenly chosen, and their pixels: a tenth of a second.
 const SEEN: (usize, usize) = (64, 8_000_000);
-/// A jump is this many times as far as usual steps and as the step over it, to and from; and a turn is so many degrees.
+/// A jump is this many times as far as usual steps and as the step over it, to and from; and a turn is this many
+/// degrees.
 const JUMP: f64 = 8.0;
 const TURN: f64 = 30.0;
 /// Entries of an axis-parallel rotation are this near to 0 or 1.
@@ -372,7 +373,7 @@ mod tests {
         assert_eq!(jumps(&far), [5]);
         let turned: Vec<Se3> = moved(5, Se3::look_at([0.5, 4.0, 1.0], [0.5, 8.0, 0.0], [0.0, 0.0, 1.0]));
         assert_eq!(jumps(&turned), [5]);
-        // A cut to another place is no jump out and back.
+        // A cut to another place is not a jump out and back.
         let cut: Vec<Se3> =
             path.iter().enumerate().map(|(i, p)| if i < 6 { *p } else { at(9.0 + 0.1 * i as f64) }).collect();
         assert!(jumps(&cut).is_empty());

@@ -43,7 +43,7 @@ impl Match {
 pub(super) struct Measure {
     pub(super) matches: usize,
     pub(super) fitting: usize,
-    /// Matches that it fits and the poses as read do not, and the other way round.
+    /// Matches that it fits and the poses as read do not, and vice versa.
     gained: usize,
     lost: usize,
 }

@@ -175,7 +175,7 @@ fn named(capture: &Capture, conventions: &[Convention]) -> (usize, usize) {
     (right, all)
 }
 
-/// A film of the scene by one camera that moves; `speed`: the ball turns by so many radians from frame to frame.
+/// A film of the scene by one camera that moves; `speed`: the ball turns by this many radians from frame to frame.
 fn film(speed: f64) -> (Sample, Capture) {
     const FRAMES: usize = 13;
     let sample = Sample::new(&["transforms.json"]);

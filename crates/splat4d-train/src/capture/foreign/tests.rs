@@ -1,4 +1,4 @@
-//! Synthetic samples of every export; their poses come back as they were made.
+//! Synthetic samples of every export; their poses round-trip.
 
 use crate::capture::tests::samples::{self, FOCAL, HEIGHT, Sample, WIDTH};
 use crate::capture::{Capture, CaptureKind, CaptureOptions, Timing};

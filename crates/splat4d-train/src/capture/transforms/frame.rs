@@ -20,7 +20,7 @@ pub(super) struct Entry {
     pub image: PathBuf,
     /// Pose, intrinsics and lens.
     pub source: Camera,
-    /// Whether the focal length is an angle of view and no number of pixels: Blender's way.
+    /// Whether the focal length is an angle of view instead of pixels: Blender's way.
     pub by_angle: bool,
     /// As written.
     pub time: Option<f64>,

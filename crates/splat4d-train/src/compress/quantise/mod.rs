@@ -51,7 +51,7 @@ struct Memory {
 }
 
 impl Quantised {
-    /// A codec of codes of so many bits; `rate`: how fast the palette learns. Errors: depths out of range.
+    /// A codec of codes of this many bits; `rate`: how fast the palette learns. Errors: depths out of range.
     pub(crate) fn new(depths: Depths, rate: Rate) -> Result<Arc<Self>> {
         depths.check()?;
         Ok(Arc::new(Self { coder: Coder { depths }, rate, memory: Mutex::new(None) }))

@@ -1,5 +1,5 @@
-//! Learning behind a codec: the same image as the file's, gradients past the rounding, a palette that is a sum, a
-//! memory that comes back.
+//! Learning behind a codec: the same image as the file's, gradients past the rounding, a palette that is a sum, a state
+//! that round-trips.
 
 use super::*;
 use crate::capture::frames::{Frames, Picture};

@@ -46,7 +46,7 @@ fn all() -> LossSettings {
     }
 }
 
-/// Answers of no model in particular.
+/// Arbitrary results of a model.
 fn answers(probes: &[Probe]) -> Vec<Vec<Table<f64>>> {
     let rng = Rng::new(5, "answers", 0);
     let table = |p: &Probe, t: usize| {

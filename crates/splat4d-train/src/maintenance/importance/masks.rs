@@ -27,7 +27,7 @@ impl Default for MaskConfig {
     }
 }
 
-/// Key times so many frames apart, for training frames at `times` (rising) of a clip of `fps` frames a second: always
+/// Key times this many frames apart, for training frames at `times` (rising) of a clip of `fps` frames a second: always
 /// times of training frames, the first and the last among them.
 pub(super) fn keys(interval: usize, times: &[f64], fps: f64) -> Vec<f64> {
     let [Some(&first), Some(&last)] = [times.first(), times.last()] else { return Vec::new() };
@@ -49,7 +49,7 @@ pub(super) fn keys(interval: usize, times: &[f64], fps: f64) -> Vec<f64> {
 /// Gives every layer of `scene` masks: at a key time, the Gaussians that any training view of that time shows (weight
 /// above 0, behind what hides them). One whose lifespan is between two key times and meets none is admitted at both;
 /// one that is alive only before or after all training frames at none. Existing masks of the layers are ignored.
-/// `progress` hears of views done and in all.
+/// `progress` is called with the finished and the total number of views.
 ///
 /// Errors: there is no frame.
 pub(crate) fn key_masks(

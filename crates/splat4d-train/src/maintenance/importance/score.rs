@@ -40,7 +40,7 @@ pub(crate) struct ScoreConfig {
     pub cost: f64,
     /// Frames of a unit of time, in which derivatives of the lifespan are measured (`UNIT_FRAMES`).
     pub unit: f64,
-    /// Every so many of the views at a time are examined, another choice at each time, and at least one.
+    /// Every n of the views at a time are examined, another choice at each time, and at least one.
     pub every: usize,
     /// As the scene was trained.
     pub antialias: Antialias,
@@ -73,8 +73,8 @@ pub struct Scores {
     pub views: usize,
 }
 
-/// Scores all Gaussians of `scene` by the views of `frames`; no image is loaded. `progress` hears of views done and
-/// in all. The same bits for any number of threads.
+/// Scores all Gaussians of `scene` by the views of `frames`; no image is loaded. `progress` is called with the number
+/// of views done and in all. The same bits for any number of threads.
 ///
 /// Errors: there is no frame.
 pub(crate) fn score(
@@ -177,7 +177,7 @@ pub(crate) fn score(
     Ok(Scores { layers, spatial, views: total })
 }
 
-/// Every so many of the views at the k-th time, beginning elsewhere at each; at least one.
+/// Every n of the views at the k-th time, beginning elsewhere at each; at least one.
 fn views_at(group: &[u32], k: usize, every: usize) -> Vec<usize> {
     let some: Vec<usize> =
         group.iter().enumerate().filter(|(i, _)| (i + k).is_multiple_of(every)).map(|(_, &f)| f as usize).collect();

@@ -17,7 +17,7 @@ const ELASTIC_NEIGHBOURS: usize = 2;
 const ELASTIC_TIMES: usize = 8;
 /// Width of the window of times of ARAP and elastic distances, of the clip (SC-GS).
 const WINDOW: f64 = 0.05;
-/// Acceleration is taken over so many frames to both sides (SC-GS).
+/// Acceleration is taken over this many frames to both sides (SC-GS).
 const ACCELERATION_FRAMES: f64 = 3.0;
 
 /// Positions of all rows of a result.

@@ -1,4 +1,4 @@
-//! Gradients through the whole chain of what is drawn next to colours: depth, normals, flow and a column's sigmoid.
+//! Gradients through the whole chain of the channels next to colours: depth, normals, flow and a column's sigmoid.
 
 use super::*;
 use crate::capture::frames::FlowTruth;

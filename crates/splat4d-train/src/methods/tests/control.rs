@@ -161,7 +161,7 @@ fn a_scene_on_nodes_learns_with_every_trajectory() {
     }
 }
 
-/// Shaken nodes come to rest in training, whatever the images say.
+/// Shaken nodes settle in training, independent of the images.
 #[test]
 fn losses_on_nodes_reduce_jitter() {
     let clip = [0.0, 0.2];

@@ -1,5 +1,5 @@
-//! Edits of rows in the middle of a stage: every loss hears of them, and guided sampling finds what no Gaussian stands
-//! for.
+//! Edits of rows in the middle of a stage: every loss is notified of them, and guided sampling finds what no Gaussian
+//! stands for.
 
 use super::*;
 use crate::maintenance::importance::Spatial;
@@ -12,7 +12,7 @@ use splat4d::motion::control::{ControlSpec, Curve, TrajectorySpec};
 use splat4d::motion::skin::SkinSpec;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// Counts what it hears.
+/// Counts its notifications.
 #[derive(Clone, Default)]
 struct Ear {
     heard: Arc<AtomicUsize>,

@@ -12,7 +12,7 @@ use splat4d::scene::{RowEdit, SplatGrads};
 const PULLS: usize = 2;
 /// Seconds between two pages.
 const PAGE_SECONDS: f64 = 0.1;
-/// Opacity with which nodes answer as splats.
+/// Opacity with which nodes are rendered as splats.
 const NODE_OPACITY: f64 = 0.5;
 
 /// μ = Σ w_b (c_b + A_b (μ₀ − c_b) + τ_b), Σ = A Σ₀ Aᵀ, A = Σ w_b (I + [ω_b]×): a linear blend, not a rotation. Poses
@@ -270,7 +270,7 @@ fn linear<F: Real>(pose: &[F; 6]) -> Matrix<F> {
     [[F::ONE, -z, y], [z, F::ONE, -x], [-y, x, F::ONE]]
 }
 
-/// Pulls nodes towards where the object is known to be: a loss on nodes, who answer as splats.
+/// Pulls nodes towards where the object is known to be: a loss on nodes, which are evaluated as splats.
 struct Anchors {
     at: Vec<([f64; 3], Time)>,
 }

@@ -39,7 +39,7 @@ use std::time::Duration;
 
 /// Frames of a chunk where the recipe leaves it open (STG: 50).
 const FRAMES: usize = 60;
-/// A capture of so many frames is learnt at once where the recipe leaves it open: the cap's Gaussians are enough for
+/// A capture of this many frames is learnt at once where the recipe leaves it open: the cap's Gaussians are enough for
 /// it.
 const WHOLE: usize = 300;
 /// Seconds between two checks whether other workers are done.
@@ -282,9 +282,8 @@ impl Chunked {
         Ok(format!("{part} {}", identity::file_print(&bytes)))
     }
 
-    /// Does whatever there is to do until all is done, next to any number of other workers. `finished` hears of
-    /// every part
-    /// that this worker has finished.
+    /// Works on all parts until they are done, next to any number of other workers. `finished` is called with every
+    /// part that this worker has finished.
     ///
     /// Errors: those of training, and of `finished`.
     pub fn work_all(

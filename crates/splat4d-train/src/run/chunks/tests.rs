@@ -183,7 +183,7 @@ fn the_tie_is_the_mean_difference_to_the_neighbour_where_both_are() {
     assert!((0..108).all(|i| (f64::from(d[i]) - 0.5 / 108.0 * off(i).signum()).abs() < 1e-9));
 }
 
-/// A clock on which every reading takes so many seconds: a step that is timed takes one, a step of a run some more.
+/// A clock on which every reading takes this many seconds: a step that is timed takes one, a step of a run some more.
 fn ticking(seconds: f64) -> Stopwatch {
     let ticks = std::sync::atomic::AtomicUsize::new(0);
     Stopwatch::of(move || ticks.fetch_add(1, Ordering::Relaxed) as f64 * seconds)

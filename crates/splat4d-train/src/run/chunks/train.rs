@@ -26,7 +26,7 @@ use std::ops::Range;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-/// A point within so many Gaussians' spacings of the shared layer shows what that shows.
+/// A point within this many Gaussians' spacings of the shared layer shows what that shows.
 const COVERED: f64 = 2.0;
 /// Share of the number of Gaussians that those of neighbours may take at the start.
 const TAKEN_OVER: f64 = 0.5;
@@ -170,7 +170,7 @@ fn first_scene(
     Ok(scene)
 }
 
-/// At most so many of the Gaussians of a chunk that are alive at a time, without the shared layer, at that time.
+/// At most this many of the Gaussians of a chunk that are alive at a time, without the shared layer, at that time.
 fn alive(scene: &Scene<f32>, time: f64, most: usize, seed: u64) -> Params<f32> {
     let layer = &scene.layers[0];
     let mut rows = Vec::new();

@@ -1,5 +1,5 @@
 //! A scene is pruned, becomes the pages of a file and is tuned: the same bits for any number of threads, after any stop
-//! and after a crash; no stage begins twice.
+//! and after a crash; no stage is repeated.
 
 use super::*;
 use crate::ErrorKind;
@@ -18,7 +18,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 const FLOATS: usize = 12;
 const CODED: usize = 18;
 
-/// Something happens before step `at`: `f` hears of the gradients.
+/// A disturbance before step `at`: `f` gets the gradients.
 struct Meddle<F> {
     at: usize,
     f: F,

@@ -1,4 +1,4 @@
-//! What comes after the observed part reaches no number of a run.
+//! Data after the observed part affects no number of a run.
 
 use super::{MOMENTS, Place, recipe};
 use crate::capture::{Capture, Split};

@@ -13,7 +13,7 @@ fn long() -> Recipe {
     recipe(&["iterations=320", "densify_until_iter=240", "densification_interval=20", "checkpoint_interval=50"])
 }
 
-/// Trains on a machine whose n-th step takes so many times [`STEP`]; returns the seconds that it took.
+/// Trains on a machine whose n-th step takes this many times [`STEP`]; returns the seconds that it took.
 fn train_slowly(place: &Place, name: &str, slow: fn(usize) -> usize, listen: &mut dyn FnMut(&Event)) -> f64 {
     let ticks = Arc::new(AtomicUsize::new(0));
     let (read, add) = (ticks.clone(), ticks.clone());

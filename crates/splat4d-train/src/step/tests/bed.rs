@@ -20,8 +20,7 @@ pub(super) struct Bed {
     frames: Arc<Dataset>,
 }
 
-/// What shows where no Gaussian is: on the images' mean colour, the default, little of their error is there to begin
-/// with.
+/// The background: on the images' mean colour, the default, little of their error is there to begin with.
 const BLACK: [f32; 3] = [0.0; 3];
 
 /// The result of a short training.

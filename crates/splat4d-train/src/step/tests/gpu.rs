@@ -53,7 +53,7 @@ pub(super) fn finish(trainer: &mut Trainer<'_>, what: &str) -> (Vec<f64>, Vec<St
     (mse, notices)
 }
 
-/// Steps until so many are done.
+/// Steps until this many are done.
 pub(super) fn steps_to(trainer: &mut Trainer<'_>, iteration: usize) {
     while trainer.progress.iteration < iteration {
         trainer.step().unwrap().unwrap_or_else(|fault| panic!("step {iteration}: {}", fault.0));

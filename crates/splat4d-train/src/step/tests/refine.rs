@@ -36,12 +36,12 @@ struct Disturbed {
 }
 
 impl Disturbed {
-    /// Clocks that are late by so many frames.
+    /// Clocks that are late by this many frames.
     fn clocks(late: [f64; CAMERAS]) -> Self {
         Self::new(SIZE, 0.0, late, [0.0; CAMERAS])
     }
 
-    /// Poses that are off by about so many radians and radii.
+    /// Poses that are off by about this many radians and radii.
     fn poses(turn: f64) -> Self {
         Self::new(FINE, turn, [0.0; CAMERAS], [0.0; CAMERAS])
     }

@@ -175,7 +175,7 @@ fn a_number_that_is_not_finite_is_found_and_named() {
     resumed.step().unwrap().unwrap();
 }
 
-/// What a device that fails states, and one that has no room.
+/// Errors of a failing device, and of one without memory.
 const GONE: &str = "the driver is gone";
 const FULL: &str = "too many for one buffer";
 /// As often as it is called.

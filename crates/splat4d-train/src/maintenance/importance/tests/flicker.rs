@@ -10,7 +10,7 @@ use crate::step::trainer::{Settings, Trainer};
 use crate::train_state::TrainState;
 use std::sync::Arc;
 
-/// Gaussians of the truth, and for each of them so many that only flicker.
+/// Gaussians of the truth, and for each of them this many that only flicker.
 const TRUTH: usize = 60;
 const REPEATS: usize = 4;
 /// Steps of training before and after pruning.

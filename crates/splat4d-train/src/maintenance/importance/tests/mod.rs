@@ -15,7 +15,7 @@ use splat4d::render::{Image, RenderConfig, Renderer, Shot};
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, LIFE, LifeKind, Params, Part, Rows, SH, Splats, Time};
 
-/// Cameras, moments and pixels across of the synthetic capture; ten frames per second.
+/// Cameras, times and width in pixels of the synthetic capture; ten frames per second.
 const CAPTURE: (usize, usize, usize) = (3, 9, 40);
 
 /// A layer of Gaussians around the origin, with lifespans of random lengths about random times of the clip.

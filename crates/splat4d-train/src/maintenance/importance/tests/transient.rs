@@ -17,7 +17,7 @@ const CRATE: ([f64; 3], f64) = ([-0.55, 0.4, 1.75], 0.5);
 const FRAMES: usize = 30;
 const EVERY: usize = 3;
 
-/// Of the views at a time one in so many is scored by: one at every time.
+/// Of the views at a time one in n is scored by: one at every time.
 const VIEWS: usize = 16;
 /// A share of the Gaussians, and its permitted loss in either, without fine-tuning, dB.
 const FEW: f64 = 0.35;
