@@ -128,7 +128,7 @@ impl Tree {
         }
     }
 
-    /// A matrix: rows and columns, and its numbers row by row. A plain list is a column. None: it is no matrix.
+    /// A matrix: rows and columns, and its numbers row by row. A plain list is a column. None: it is not a matrix.
     pub(super) fn matrix(&self) -> Option<Matrix> {
         if let (Some(rows), Some(columns), Some(data)) = (self.get("rows"), self.get("cols"), self.get("data")) {
             let data = data.list()?.iter().map(Tree::number).collect::<Option<Vec<f64>>>()?;

@@ -1,4 +1,4 @@
-//! What cameras show about each other: poses, exposure, white balance and sharpness, by features that two of them see.
+//! Findings of pairs of cameras: poses, exposure, white balance and sharpness, by features that two of them see.
 
 use super::finding::{AGREE, FindingList, GAMMA, MATCHES, SHARPNESS, grade, unit};
 use super::look::{CameraObservations, Stand, detail};
@@ -19,7 +19,7 @@ use splat4d_train::vision::raster::grey;
 
 /// Distance of matches from their epipolar lines, pixels of an image 1920 wide.
 pub(super) const EPIPOLAR: [f64; 2] = [1.0, 2.0];
-/// And at least so many of the image's own: of the bundled capture, whose poses are exact, up to 0.8 were measured.
+/// And at least this many of the image's own: of the bundled capture, whose poses are exact, up to 0.8 were measured.
 pub(super) const OWN_PIXELS: [f64; 2] = [1.0, 2.0];
 /// Exposure, and one channel against green, stops.
 pub(super) const EXPOSURE: [f64; 2] = [0.15, 0.5];

@@ -9,8 +9,8 @@ pub(super) const SHARPNESS: [f64; 2] = [0.6, 0.35];
 pub(super) const GAMMA: f64 = 2.2;
 /// Matches that are needed to judge a pair.
 pub(super) const MATCHES: usize = 12;
-/// So many of a camera's pairs must agree on its error at least, of so many that measure it; chance only makes errors
-/// larger.
+/// This many of a camera's pairs must agree on its error at least, of this many that measure it; chance only makes
+/// errors larger.
 pub(super) const AGREE: usize = 2;
 
 pub(super) fn grade(value: f64, [warning, bad]: [f64; 2]) -> Option<Grade> {

@@ -71,7 +71,7 @@ fn bytes(color: &Planes<f32>) -> Rgb8 {
     small(Rgb8 { width: color.width, height: color.height, data }).0
 }
 
-/// Numbers evenly among so many, the first and last with them.
+/// Numbers evenly among this many, the first and last with them.
 fn spread(of: usize, count: usize) -> Vec<usize> {
     match of.min(count) {
         0 => Vec::new(),

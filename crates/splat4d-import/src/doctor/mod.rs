@@ -169,7 +169,7 @@ impl Default for Options {
 const STORE: usize = 64 << 20;
 
 /// Bytes of memory that the machine has, or less where it is a container that may take less; none: it does not report
-/// it (it is no Linux).
+/// it (it is not Linux).
 fn machine_memory() -> Option<u64> {
     let text = std::fs::read_to_string("/proc/meminfo").ok()?;
     let all = text.lines().find_map(|l| l.strip_prefix("MemTotal:"))?.trim().strip_suffix("kB")?;

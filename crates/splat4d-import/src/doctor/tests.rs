@@ -1,4 +1,5 @@
-//! Each fault drawn once, and a clean recording: a room of random spots that six cameras see, and balls that move in it.
+//! Each fault rendered once, and a clean recording: a room of random spots that six cameras see, and balls that move in
+//! it.
 
 use super::clocks::clocks;
 use super::look::{CameraObservations, Stand};
@@ -72,7 +73,8 @@ fn clean() -> &'static Clip {
     CLIP.get_or_init(|| (0..CAMERAS).map(|c| (0..FRAMES).map(|n| draw(&camera(c), n as f64 / FPS)).collect()).collect())
 }
 
-/// What the doctor states of these images, where the ill camera's pose is turned by so many radians about its own x axis.
+/// What the doctor states of these images, where the ill camera's pose is turned by this many radians about its own x
+/// axis.
 fn says(clip: &Clip, turned: f64, cameras: usize) -> Report {
     let folder = tempfile::tempdir().unwrap();
     let capture = write(folder.path(), clip, turned, cameras);
@@ -358,7 +360,7 @@ fn the_share_of_what_moves_that_three_cameras_see_is_measured() {
     assert_eq!(share(&still), None, "nothing moves");
 }
 
-/// Perfect tracks of things that move by one music, on a clock that is late by so many seconds, by a shutter that takes so
+/// Perfect tracks of objects with one motion, on a clock that is late by this many seconds, by a shutter that takes so
 /// long from the first to the last row.
 fn tracks(c: usize, late: f64, shutter: f64) -> Vec<Track> {
     let place = |k: usize, t: f64| {
@@ -384,7 +386,8 @@ fn tracks(c: usize, late: f64, shutter: f64) -> Vec<Track> {
     (0..30).map(|k| Track { samples: (0..60).map(|n| sample(k, n)).collect() }).collect()
 }
 
-/// The findings on time offsets where the faulty camera is late by so many seconds, and reads its rows over so many.
+/// The findings on time offsets where the faulty camera is late by this many seconds, and reads its rows over this
+/// many.
 fn timed(late: f64, shutter: f64) -> Report {
     let folder = tempfile::tempdir().unwrap();
     let moment: Clip = clean().iter().map(|c| c[..2].to_vec()).collect();
@@ -459,7 +462,8 @@ fn training_that_does_not_fit_into_memory_is_reported() {
     assert_eq!(told(needed / 2), [Grade::Bad]);
 }
 
-/// The clean recording with faults that are smaller than what is reported, each of them as large as the names of the checks say.
+/// The clean recording with faults that are smaller than what is reported, each of them as large as the names of the
+/// checks state.
 #[test]
 fn invisible_faults_are_not_reported() {
     let mut pushed = clean().clone();

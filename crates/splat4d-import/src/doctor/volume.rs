@@ -9,7 +9,7 @@ use splat4d_train::vision::triangulate::{self, PixelObservation};
 const SIDE: usize = 40;
 /// Half the cube's side, of the cameras' median distance from their target: it reaches half way to them.
 const HALF: f64 = 0.6;
-/// So many cameras bound a place, and so many give it a shape.
+/// This many cameras bound a place, and this many give it a shape.
 const SEES: [usize; 2] = [2, 3];
 /// Of the cameras that see a place so large a part must see something move there: noise and shade hide some of it.
 const MOVES: f64 = 0.75;

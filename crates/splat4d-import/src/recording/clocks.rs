@@ -20,7 +20,7 @@ const LEAST_SHARED: f64 = 0.1;
 /// Frames a second of cameras that do not state them.
 const USUAL_RATE: f64 = 30.0;
 
-/// All pairs of so many.
+/// All pairs of this many.
 fn pairs(n: usize) -> Vec<[usize; 2]> {
     (0..n).flat_map(|a| (a + 1..n).map(move |b| [a, b])).collect()
 }

@@ -18,11 +18,11 @@ use splat4d_train::event::Progress;
 const ROUNDS: usize = 4;
 /// Clocks rest when the one that changed most changed by less, frames.
 const RESTED: f64 = 0.05;
-/// A clock is believed that so many moving points agree on.
+/// A clock is believed that this many moving points agree on.
 const MOVING_POINTS: usize = 20;
 /// The standard deviation of a clock that they agree on, frames: half of a hall's 31 clocks were 0.04 off.
 const BY_GEOMETRY: f64 = 0.06;
-/// Where sound determines a clock, geometry contradicts it from so many frames on.
+/// Where sound determines a clock, geometry contradicts it from this many frames on.
 const CONTRADICTS: f64 = 1.0;
 /// Of points that are static training starts; where there are fewer, of all.
 const ENOUGH_STILL: usize = 200;

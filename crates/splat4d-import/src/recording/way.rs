@@ -14,7 +14,7 @@ const ABOUT: f64 = 0.3;
 const STEPS: usize = 20;
 /// Standard deviations from which on a lag counts less (Huber).
 const OUTLIER: f64 = 2.0;
-/// A clock of geometry is sure to so many seconds at least.
+/// A clock of geometry is sure to this many seconds at least.
 const SURE: f64 = 1e-3;
 
 /// What was corrected.

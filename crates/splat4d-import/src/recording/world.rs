@@ -117,7 +117,7 @@ fn place(solved: &Solved, stored: &Stored<'_>, name: &str) -> Option<[f64; 3]> {
     stand.poses.iter().flatten().next().map(|p: &Se3| p.inverse().translation)
 }
 
-/// What makes the distance of two cameras so many metres.
+/// What makes the distance of two cameras this many metres.
 fn apart(solved: &Solved, stored: &Stored<'_>, pair: &[String; 2], metres: f64) -> Result<f64> {
     let other = |what: String| Error::input(what).remedy("Give the distance of two other cameras.");
     let (Some(a), Some(b)) = (place(solved, stored, &pair[0]), place(solved, stored, &pair[1])) else {

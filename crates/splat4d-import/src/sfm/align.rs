@@ -38,7 +38,7 @@ const FINE: f64 = 0.05;
 /// Width of a bin, of the points' median distance from their middle: of the bundled capture's 650 points widths from
 /// 0.01 to 0.04 find the axes to 0.4 degrees.
 const BIN: f64 = 0.03;
-/// Points farther from the middle than so many medians are left out.
+/// Points farther from the middle than this many medians are left out.
 const FAR: f64 = 3.0;
 /// Points that are examined, at most, evenly chosen.
 const MOST: usize = 3000;

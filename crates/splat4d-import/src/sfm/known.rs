@@ -115,8 +115,8 @@ const SURE: usize = 12;
 const APART: f64 = 70.0;
 /// Median over lower quartile of the size of a normal error: 0.6745 / 0.3186.
 const QUARTILE_TO_MEDIAN: f64 = 2.117;
-/// So many of a camera's pairs must agree on its error, where so many measure it: a neighbour may be the one that is
-/// wrong.
+/// This many of a camera's pairs must agree on its error, where this many measure it: a neighbour may be the one that
+/// is wrong.
 const AGREE: usize = 2;
 const TELL: usize = 3;
 

@@ -58,15 +58,15 @@ const SEES: usize = 15;
 const FITS: usize = 12;
 /// Of the known points that it sees, the share that must fit.
 const FITS_SHARE: f64 = 0.2;
-/// A camera is placed within so many tolerances: points and lenses are not final.
+/// A camera is placed within this many tolerances: points and lenses are not final.
 const PLACED_WITHIN: f64 = 2.0;
 /// Views from which on focal lengths are adjusted, and from which on all else is: few views do not separate them from
 /// poses.
 const FOCAL_FROM: usize = 3;
 const ALL_FROM: usize = 7;
-/// Small rigs have no more: then from all of them, and at least so many.
+/// Small rigs have no more: then from all of them, and at least this many.
 const FEWEST: usize = 4;
-/// Everything is adjusted again once there are so many times as many views.
+/// Everything is adjusted again once there are this many times as many views.
 const GROWTH: f64 = 1.08;
 /// Standard deviations: of log f where it is guessed and where it is known; of k1; of the principal point, of the
 /// larger side; of clocks, frames (measured on the hall: 6 pixels of 640, 2 frames).
@@ -75,9 +75,9 @@ const TOLD: f64 = 0.1;
 const CLOCK: f64 = 2.0;
 /// Epipolar distance of matches that are searched for once cameras are placed, of the tolerance.
 const GUIDED_WITHIN: f64 = 0.5;
-/// Lenses whose focal lengths are found to differ by no more than this share are taken for equal ones, from so many on;
-/// they then differ by this share (standard deviation). Of two phones of one model focal lengths differ by some tenths
-/// of a per cent.
+/// Lenses whose focal lengths are found to differ by no more than this share are taken for equal ones, from this many
+/// on; they then differ by this share (standard deviation). Of two phones of one model focal lengths differ by some
+/// tenths of a per cent.
 const ALIKE: f64 = 0.06;
 const FAMILY_FROM: usize = 4;
 const FAMILY: f64 = 0.003;
@@ -375,7 +375,7 @@ impl Map<'_> {
         self.sights.iter().all(|s| s.pose.is_some())
     }
 
-    /// Adjusts everything with so many evaluations; the loss and how many sightings it is of.
+    /// Adjusts everything with this many evaluations; the loss and how many sightings it is of.
     fn adjust(&mut self, steps: usize) -> Option<(f64, usize)> {
         let mut bundle = Bundle::default();
         let mut number = vec![usize::MAX; self.sights.len()];

@@ -36,7 +36,7 @@ pub struct Options {
     pub look: FeatureOptions,
     /// How cameras are placed.
     pub mapping: Mapping,
-    /// Whether cameras move: then every frame is placed on its own, at most so many of them.
+    /// Whether cameras move: then every frame is placed on its own, at most this many of them.
     pub walking: Option<usize>,
 }
 
@@ -128,7 +128,7 @@ pub fn solve(pictures: &dyn Pictures, options: &Options, progress: &mut Progress
     solve_sights(&who, &sights, pairing, options, progress)
 }
 
-/// So many frames are all compared with each other.
+/// This many frames are all compared with each other.
 const ALL_UP_TO: usize = 50;
 /// Of more, neighbours and loops.
 const WALK: Pairing = Pairing::Sequence { near: 10, every: 6 };
@@ -174,7 +174,7 @@ fn in_units(who: &[Who], sights: &[CameraView], mapped: mapper::Mapped, pairs: u
     solution(who, sights, mapped, pairs, scale)
 }
 
-/// The solution in a unit of so many of the map's.
+/// The solution in a unit of this many of the map's.
 fn solution(who: &[Who], sights: &[CameraView], mapped: mapper::Mapped, pairs: usize, scale: f64) -> Solution {
     let placed = |(camera, sight): (&Result<mapper::Stand, String>, &CameraView)| {
         camera.as_ref().map_err(Clone::clone).map(|c| Placed {

@@ -145,7 +145,7 @@ pub(super) fn speed(x: [f64; 3], seen: &[ImagePoint<'_>], velocities: &[[f64; 2]
 const REACH: isize = 7;
 const SPREAD: f64 = 4.0;
 const SIDE: usize = 2 * REACH as usize + 1;
-/// Steps at most; it rests at steps shorter than so many pixels.
+/// Steps at most; it rests at steps shorter than this many pixels.
 const STEPS: usize = 20;
 const STILL: f64 = 0.003;
 /// Farthest that a place may move, pixels.

@@ -115,7 +115,7 @@ const MEDIAN_FROM: usize = 3;
 /// A pixel that differs by more than this from the static background (mean of the channels, in [0, 1]) belongs to
 /// something that moves: above the noise of ordinary cameras.
 const MOVED: f32 = 0.06;
-/// Differences are blurred by so many pixels: single ones are noise.
+/// Differences are blurred by this many pixels: single ones are noise.
 const MOVED_BLUR: f64 = 1.0;
 /// A frame farther from a time than this many frames does not show it.
 const TOO_FAR: f64 = 1.0;

@@ -47,11 +47,11 @@ pub struct Track {
 pub(crate) enum Pairing {
     /// All with all.
     All,
-    /// Frames of a walk: with so many that follow, and every one of these many with all others of them.
+    /// Frames of a walk: with this many that follow, and every one of these many with all others of them.
     Sequence {
         /// How many that follow.
         near: usize,
-        /// Every so many-th is compared with all others of that kind: loops.
+        /// Every n-th is compared with all others of that kind: loops.
         every: usize,
     },
 }

@@ -12,7 +12,7 @@ use splat4d::scene::Camera;
 const TOLERANCE: f64 = 3.0;
 /// Pixels that corners and poses are usually off, together, in the search.
 const USUAL: f64 = 1.0;
-/// So many times of a track count as independent of each other: what is wrong with a corner is wrong for some frames.
+/// This many times of a track count as independent of each other: what is wrong with a corner is wrong for some frames.
 const INDEPENDENT: f64 = 5.0;
 /// Likelihood that a track has no match, of that of a perfect one.
 const NO_MATCH: f64 = 0.05;
@@ -62,7 +62,7 @@ pub(crate) struct EpipolarLag {
 pub struct Range {
     /// The middle, seconds.
     pub around: f64,
-    /// So many seconds to either side.
+    /// This many seconds to either side.
     pub within: f64,
 }
 
@@ -133,7 +133,7 @@ pub(crate) fn fundamental(a: &Camera, b: &Camera) -> [[f64; 3]; 3] {
     mat_mul(&transpose(&inverse(b)), &mat_mul(&mat_mul(&cross, &rotation), &inverse(a)))
 }
 
-/// Pairs of cameras, each with so many that are nearest to it, in order; None: a camera that takes no part.
+/// Pairs of cameras, each with this many that are nearest to it, in order; None: a camera that takes no part.
 pub fn neighbours(centers: &[Option<[f64; 3]>], count: usize) -> Vec<[usize; 2]> {
     let mut pairs = Vec::new();
     for (a, own) in centers.iter().enumerate() {

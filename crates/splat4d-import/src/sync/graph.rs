@@ -95,7 +95,7 @@ pub(crate) struct Solution {
     pub refused: Vec<Refused>,
 }
 
-/// Offsets of so many cameras, camera 0's being 0 unless `given` states otherwise; where it gives an offset, it is
+/// Offsets of this many cameras, camera 0's being 0 unless `given` states otherwise; where it gives an offset, it is
 /// kept. Lags that are off by more than `tolerance` seconds (half a frame) and more than four standard deviations
 /// contradict.
 pub(crate) fn solve(cameras: usize, evidence: &[Evidence], given: &[Option<f64>], tolerance: f64) -> Solution {

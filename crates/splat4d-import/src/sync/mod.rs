@@ -30,9 +30,9 @@ pub(crate) enum Refusal {
     Unrelated,
     /// Several lags agree alike: what moves or sounds repeats itself. The two best, seconds.
     Repeating([f64; 2]),
-    /// What agrees leaves the lag open by so many seconds: motion along the epipolar lines.
+    /// What agrees leaves the lag open by this many seconds: motion along the epipolar lines.
     Vague(f64),
-    /// The evidence grows or shrinks in time, by so many seconds a second: a wrong frame rate in a file.
+    /// The evidence grows or shrinks in time, by this many seconds a second: a wrong frame rate in a file.
     Drifting(f64),
 }
 

@@ -11,7 +11,7 @@ const SIDE: usize = 160;
 const MOVES: f64 = 0.15 / 255.0;
 /// Cameras share at least this part of the shorter take.
 const MIN_OVERLAP: f64 = 0.4;
-/// And at least so many intervals.
+/// And at least this many intervals.
 const MIN_INTERVALS: usize = 12;
 /// The least correlation that is believed. Of one motion from different sides 0.4 to 0.9 was measured on rendered rigs.
 const LEAST: f64 = 0.3;

@@ -15,9 +15,9 @@ const BANDS: [f64; 5] = [150.0, 640.0, 1420.0, 2680.0, 4700.0];
 const FLOOR: f64 = 1e-3;
 /// Lags that are examined closely: the coarse search may prefer a neighbour of the right one.
 const CANDIDATES: usize = 4;
-/// Candidates are so many seconds apart.
+/// Candidates are this many seconds apart.
 const CANDIDATE_GAP: f64 = 0.05;
-/// Tracks share at least so many seconds.
+/// Tracks share at least this many seconds.
 const MIN_OVERLAP: f64 = 1.5;
 /// Seconds around a coarse lag that contain the fine one.
 const FINE_RANGE: f64 = 0.2;
@@ -39,7 +39,7 @@ const AGREEING: usize = 3;
 const AGREEING_PART: f64 = 0.6;
 /// Largest median absolute deviation of those that agree, seconds.
 const MAX_MAD: f64 = 3e-3;
-/// Windows over at least so many seconds are needed to measure a drift of the clocks.
+/// Windows over at least this many seconds are needed to measure a drift of the clocks.
 const DRIFT_SPAN: f64 = 60.0;
 /// Largest drift of clocks, seconds a second: crystals of phones are within 100 ppm of each other.
 const MAX_DRIFT: f64 = 500e-6;
@@ -72,7 +72,7 @@ impl SoundLag {
     }
 }
 
-/// A lag corrected for the travel time of sound: b hears the source `lag` later than a, and the source has these
+/// A lag corrected for the travel time of sound: b records the source `lag` later than a, and the source has these
 /// distances from either.
 pub(crate) fn without_way(lag: f64, [from_a, from_b]: [f64; 2]) -> f64 {
     lag - (from_b - from_a) / SPEED

@@ -2,9 +2,9 @@
 
 use super::Rgb8;
 
-/// An interval above so many medians is one that a frame is missing in.
+/// An interval above this many medians is one that a frame is missing in.
 const DROPPED: f64 = 1.5;
-/// An interval below so many medians is one that a frame was put in a second time.
+/// An interval below this many medians is one that a frame was put in a second time.
 const DOUBLED: f64 = 0.25;
 /// Two images whose samples differ by less than this on average (of 255) are one image: codecs repeat a frame without a
 /// bit of change, sensors never do.

@@ -35,7 +35,7 @@ pub(crate) const SOUND_RATE: f64 = 16_000.0;
 /// Which frames of a source, and how large.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Selection {
-    /// Every so many frames, from the first one on; at least 1.
+    /// Every n frames, from the first one on; at least 1.
     pub every: usize,
     /// No frame before this second of the source's clock.
     pub from: Option<f64>,

@@ -9,7 +9,7 @@ use splat4d::{Error, ErrorKind, Result};
 use splat4d_train::run::checkpoint::write_atomically;
 use std::path::{Path, PathBuf};
 
-/// Times are written to so many parts of a second: cameras' clocks are no finer, and people can read them.
+/// Times are written to this many parts of a second: cameras' clocks are no finer, and people can read them.
 const TICKS: f64 = 1e6;
 
 /// Where a camera was.

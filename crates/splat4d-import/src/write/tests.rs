@@ -1,4 +1,4 @@
-//! Captures that are written, interrupted, gone on with and read again.
+//! Captures that are written, interrupted, continued and read again.
 
 use super::*;
 use crate::sync::graph::Offset;
