@@ -46,7 +46,7 @@ const PATH_STEP: f64 = 0.75;
 pub const LIKE: f64 = 40.0;
 /// What a cut aims at beyond that, dB.
 const MARGIN: f64 = 0.3;
-/// A file may have the bytes of the learned scene and so many for each second of the clip: 12 Mbit/s, the rate of a
+/// A file may have the bytes of the learned scene and this many for each second of the clip: 12 Mbit/s, the rate of a
 /// streamed film of 1080 to 2160 lines.
 const BYTES_A_SECOND: f64 = 1.5e6;
 /// Bytes of a primitive, its share of the palette included, until the first file is written (docs/format.md: 32 before

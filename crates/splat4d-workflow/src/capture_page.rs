@@ -94,7 +94,7 @@ fn find(store: &ImageStore, list: &[Listed], wanted: &PhotoQuery) -> Option<Phot
     Some(Photo { jpeg, time: frames[nearest].time.0 })
 }
 
-/// An image whose longer side has at most so many pixels.
+/// An image whose longer side has at most this many pixels.
 fn reduced(picture: RgbImage, side: u32) -> RgbImage {
     let (w, h) = picture.dimensions();
     if w.max(h) <= side {

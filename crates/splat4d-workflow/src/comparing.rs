@@ -43,7 +43,7 @@ pub struct Entry {
 impl Entry {
     /// A run, a folder with `results.json`, or such a file.
     ///
-    /// Errors: nothing of that kind; a file that is no JSON; no score that is known.
+    /// Errors: nothing of that kind; a file that is not JSON; no score that is known.
     pub fn open(path: &Path) -> Result<Self> {
         if Run::is(path) {
             let run = Run::open(path)?;
@@ -202,7 +202,7 @@ pub fn table(entries: &[Entry]) -> (Vec<String>, Vec<Vec<String>>) {
     (columns.iter().map(|(name, _)| name.clone()).collect(), rows.collect())
 }
 
-/// The place of a column's score in [`SCORES`]; `None`: it is no score.
+/// The place of a column's score in [`SCORES`]; `None`: it is not a score.
 pub fn score_of(column: &str) -> Option<usize> {
     SCORES.iter().position(|(name, ..)| *name == column)
 }

@@ -28,7 +28,7 @@ impl Default for Deadline {
 }
 
 impl Deadline {
-    /// At so many minutes of a clock; none: never.
+    /// At this many minutes of a clock; none: never.
     pub fn of(clock: Stopwatch, minutes: Option<f64>) -> Self {
         Self { clock, end: minutes.map_or(f64::INFINITY, |m| 60.0 * m) }
     }

@@ -59,7 +59,7 @@ const CUT_STEPS: f64 = 100.0;
 /// Motion models whose motion is straight, or nearly.
 const STRAIGHT: [&str; 3] = ["still", "spacetime", "native4d"];
 
-/// See [`HELD_STEPS`]: an image with a mask of labels or an image of features, rendered and taken back once.
+/// See [`HELD_STEPS`]: an image with a mask of labels or an image of features, rendered and backpropagated once.
 const LABEL_STEPS: f64 = 1.0;
 
 /// The time of the work after training, in training steps at full size: `--minutes` includes it.

@@ -44,7 +44,7 @@ impl Frames {
 pub struct TrackOptions {
     /// The times.
     pub frames: Frames,
-    /// Every so many Gaussians; 0 counts as 1.
+    /// Every n Gaussians; 0 counts as 1.
     pub every: usize,
     /// Only the Gaussians nearest to this point at the first time, and how many.
     pub near: Option<([f64; 3], usize)>,

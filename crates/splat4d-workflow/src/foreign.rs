@@ -93,8 +93,8 @@ pub fn score(
     Ok(())
 }
 
-/// Scores a scene that is no run's on views of a capture, and writes scores and images into `out`, if there is such a
-/// folder.
+/// Scores a scene that is not a run's on views of a capture, and writes scores and images into `out`, if there is such
+/// a folder.
 ///
 /// Errors: the capture has no such views; images without alpha, which are composited on nothing; those of measuring.
 #[allow(clippy::too_many_arguments)]

@@ -141,7 +141,7 @@ pub struct QueryResult {
 }
 
 impl QueryResult {
-    /// Follows points to some times. `progress` hears how many times of how many are done.
+    /// Follows points to some times. `progress` is called with the finished and the total number of times.
     pub fn of(
         scene: &Scene<f32>,
         asked: Vec<PointQuery>,
@@ -206,6 +206,8 @@ impl QueryResult {
     }
 
     /// As JSON:
+    ///
+    ///
     /// `{"version": 1, "times": [s], "points": [{"start": [x, y, z], "camera": name, "path": [[x, y, z] or null], "pixels": [[u, v] or null], "visible": [bool]}]}`;
     /// the last two only of points with a camera.
     pub fn to_json(&self) -> String {

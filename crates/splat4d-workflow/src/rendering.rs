@@ -291,7 +291,7 @@ pub fn film(path: &Path, args: &RenderOptions, console: &dyn Listener) -> Result
     Ok(output)
 }
 
-/// Takes the folders of frames: of images, where the output is no single file, and of numbers.
+/// Takes the folders of frames: of images, where the output is not a single file, and of numbers.
 fn folders(args: &RenderOptions, output: &Path, count: usize, read: &sequence::Read<'_>) -> Result<Vec<OutputFolder>> {
     let pictures = output.extension().is_none().then(|| Pattern::plain(output, "png"));
     let numbers = args.raw.as_deref().map(|raw| Pattern::plain(raw, args.raw_format.ending()));

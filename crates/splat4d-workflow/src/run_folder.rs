@@ -111,7 +111,7 @@ impl Run {
         path.join("scene.safetensors").is_file()
     }
 
-    /// Reads the folder. Errors: it is no run; a file in it is damaged.
+    /// Reads the folder. Errors: it is not a run; a file in it is damaged.
     pub fn open(path: &Path) -> Result<Self> {
         if !path.exists() {
             return Err(Error::input("no such run")
@@ -480,7 +480,7 @@ impl RunRequest {
         Recipe::from_toml(&self.recipe)
     }
 
-    /// Takes the folder of the run for a new training or the rest of one. What is there of one that took no step is
+    /// Takes the folder of the run for a new training or the rest of one. The content of one that took no step is
     /// removed.
     pub fn begin(&self, run: &Path, force: bool, command: &str) -> Result<(OutputFolder, FolderContent)> {
         let asked = serde_json::to_string(self).expect("it is plain data");

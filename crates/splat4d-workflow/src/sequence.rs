@@ -14,8 +14,8 @@ use std::path::{Path, PathBuf};
 const MAX_FILES: f64 = 100_000.0;
 /// Most digits of a padded number in a pattern.
 const MAX_DIGITS: usize = 9;
-/// Programs save their Gaussians every so many steps (or a multiple of it; some count from 0): Brush every 5,000, 3DGS
-/// after 7,000 and 30,000, OpenSplat and gsplat as documented. No film has so few of its frames.
+/// Programs save their Gaussians every n steps (or a multiple of it; some count from 0): Brush every 5,000, 3DGS after
+/// 7,000 and 30,000, OpenSplat and gsplat as documented. No film has so few of its frames.
 const SNAPSHOTS: u64 = 500;
 /// Gaps of a sequence that are named.
 const NAMED_GAPS: usize = 8;
@@ -195,7 +195,7 @@ pub fn frames(path: &Path) -> Result<Frames> {
     }
     let first = found[0].0;
     let last = found[found.len() - 1].0;
-    // Numbers with so many of them missing are no frames of one sequence.
+    // Numbers with this many of them missing are no frames of one sequence.
     let steps = || found.windows(2).map(|w| w[1].0 - w[0].0);
     // Every tenth frame is a sequence without gaps.
     let step = steps().fold(0, gcd).max(1);

@@ -68,7 +68,7 @@ pub struct Status {
     next: Option<String>,
 }
 
-/// Reads how far a run is. Errors: it is no run, or damaged.
+/// Reads how far a run is. Errors: it is not a run, or damaged.
 pub fn of(path: &Path) -> Result<Status> {
     let run = Run::open(path)?;
     let mut parts = if Chunked::is(path) { of_chunks(&Chunked::open(path)?) } else { vec![whole(path, &run)] };

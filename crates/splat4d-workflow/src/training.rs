@@ -53,7 +53,7 @@ pub struct TrainingOptions {
     pub output: Option<PathBuf>,
     /// Replace the run in the output folder once the new run has begun.
     pub force: bool,
-    /// Finish within so many minutes of the clock, whatever follows training included.
+    /// Finish within this many minutes of the clock, whatever follows training included.
     pub minutes: Option<f64>,
     /// Report the expected time first.
     pub predict: bool,
@@ -195,7 +195,7 @@ impl<'a> Work<'a> {
         self.listener.on_event(&crate::events::Event::Begun { title, run, capture });
     }
 
-    /// Options of the trainer. `finish`: what follows training takes as long as about so many steps.
+    /// Options of the trainer. `finish`: what follows training takes as long as about this many steps.
     fn options(&self, minutes: Option<f64>, finish: f64, predict: bool) -> TrainOptions {
         TrainOptions {
             device: chosen(self.options.device, "training", self.listener),

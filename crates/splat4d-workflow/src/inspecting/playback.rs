@@ -97,7 +97,7 @@ pub struct Conformance {
 
 /// Checks a playback file against the whole specification of its format.
 ///
-/// Errors: it cannot be read, it is no playback file, readers refuse it.
+/// Errors: it cannot be read, it is not a playback file, readers refuse it.
 pub fn conformance(path: &Path) -> Result<Conformance> {
     let bytes = std::fs::read(path).map_err(|e| Error::io("cannot be read", e).at(path.display()))?;
     if !bytes.starts_with(&MAGIC) {

@@ -9,7 +9,7 @@ use std::fmt::Write;
 /// Width of the map and its margin, units of the SVG.
 const WIDTH: f64 = 560.0;
 const MARGIN: f64 = 64.0;
-/// Most points that are drawn.
+/// Most points that are plotted.
 const POINTS: usize = 600;
 /// Length of a viewing direction, of the map's width.
 const ARROW: f64 = 0.09;
