@@ -83,7 +83,7 @@ impl Koopman {
         Self::with(paths, best)
     }
 
-    /// The model of so many pairs.
+    /// The model of this many pairs.
     pub(crate) fn with(paths: &Paths, count: usize) -> Self {
         let components = components(&numbers(paths));
         Self { pairs: (0..count).fold(Vec::new(), |pairs, _| grown(&pairs, &components)) }
@@ -109,7 +109,7 @@ impl Koopman {
     }
 }
 
-/// How many pairs so many ticks determine: one at least.
+/// How many pairs this many ticks determine: one at least.
 fn most_pairs(ticks: usize) -> usize {
     ((ticks / TICKS_A_NUMBER).saturating_sub(1) / 2).clamp(1, PAIRS)
 }

@@ -33,7 +33,7 @@ pub struct State<F> {
 }
 
 impl<F: Real> State<F> {
-    /// Zeros for so many rows.
+    /// Zeros for this many rows.
     pub(crate) fn zeros(rows: usize) -> Self {
         Self { x: vec![F::ZERO; 3 * rows], v: vec![F::ZERO; 3 * rows] }
     }

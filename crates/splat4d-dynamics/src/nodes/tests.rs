@@ -14,8 +14,8 @@ const BODY: usize = 80;
 /// Scene units per second.
 const VELOCITY: [f64; 3] = [0.5, 0.2, 0.0];
 
-/// A still room and a body that drifts through it. Where `lives` holds, no Gaussian of the body lives longer than a
-/// third of a second: others take over along its way.
+/// A still room and a body that drifts through it. If `lives` is set, no Gaussian of the body has a lifespan longer
+/// than a third of a second: others take over along its way.
 fn scene(lives: bool) -> Scene<f32> {
     let generations = if lives { 8 } else { 1 };
     let mut params = Params::new(STILL + BODY * generations, 1, LifeKind::GaussHalf.columns());
