@@ -67,7 +67,7 @@ const CORNERS: u32 = 6u;
 const MASKS: u32 = 8u;
 // Pairs that a workgroup of sort.wgsl takes (SORT_BLOCK there).
 const PAIRS: u32 = 2048u;
-// Its scan takes a workgroup a digit, or one for all up to so many pairs (SORT_FEW blocks there).
+// Its scan takes a workgroup a digit, or one for all up to this many pairs (SORT_FEW blocks there).
 const SCAN_GROUPS: u32 = 256u;
 const FEW_PAIRS: u32 = 65536u;
 

@@ -57,7 +57,7 @@ struct Log {
     /// Number of the newest entry; the first is 1.
     newest: u64,
     steps: VecDeque<Entry>,
-    /// Of every so many steps one is kept, and the newest in addition: a power of two; 0 represents 1.
+    /// Of every n steps one is kept, and the newest in addition: a power of two; 0 represents 1.
     stride: u64,
     /// Steps published.
     count: u64,

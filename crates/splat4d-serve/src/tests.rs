@@ -1,4 +1,4 @@
-//! The whole server on loopback: what clients ask, well and badly, and what they get.
+//! The whole server on loopback: valid and invalid requests, and the responses.
 
 use crate::{Config, Content, EditAnswer, Editing, News, Photo, Photos, Running, Server};
 use serde_json::{Value, json};
