@@ -388,7 +388,7 @@ fn a_page_embeds_or_links_its_scene() {
     assert!(refused.contains("--link"), "{refused}");
 }
 
-/// Body of the answer of a server at `url`.
+/// Body of the response of a server at `url`.
 fn get(url: &str, path: &str) -> Vec<u8> {
     use std::io::{Read, Write};
     // What follows # stays in the browser: the page's token.

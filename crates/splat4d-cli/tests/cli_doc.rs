@@ -58,7 +58,7 @@ fn text(page: &Page, all: &Command) -> String {
     text
 }
 
-/// A command: what it does, how it is called, its options by heading, its examples.
+/// A command: its purpose, usage, options by heading, its examples.
 fn section(mut command: Command) -> String {
     let about = command.get_about().map(ToString::to_string).unwrap_or_default();
     let usage = command.render_usage().to_string();

@@ -80,7 +80,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The capture at a path, if that is one: a marker file, or a folder that is no run.
+/// The capture at a path, if that is one: a marker file, or a folder that is not a run.
 fn capture_at(path: &Path) -> splat4d::Result<Option<Capture>> {
     if is_metadata(path) {
         return open_capture(path, &Recipe::default()).map(Some);

@@ -1,4 +1,4 @@
-//! What goes out next to colours: channels as images and numbers, points that are requested, labels.
+//! Exports next to colours: channels as images and numbers, requested points, labels.
 
 use crate::convert::moving;
 use crate::sample::{Capture, splat4d};

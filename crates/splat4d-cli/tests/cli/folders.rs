@@ -1,4 +1,4 @@
-//! Output folders, as a user meets them; what is behind them is tested where it is (`splat4d_train::output`).
+//! Output folders from a user's view; their implementation is tested in `splat4d_train::output`.
 
 use crate::sample::{Capture, splat4d};
 use crate::{TINY, str};

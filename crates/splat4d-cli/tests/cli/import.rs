@@ -72,7 +72,7 @@ fn images_alone_become_a_capture_with_clocks_and_poses() {
 const SOUND_RATE: u32 = 16_000;
 const SLOW: usize = 10;
 
-/// A WAV file of what a camera hears that begins after so many seconds: bursts of noise, the same for all.
+/// A WAV file of a camera's sound that begins after this many seconds: bursts of noise, the same for all.
 fn heard(begin: f64, seconds: f64, camera: u64) -> Vec<u8> {
     let noise = |stream: u64, k: u64| {
         let mut z = (stream << 32 | k).wrapping_mul(0x9E37_79B9_7F4A_7C15);

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 const FRAMES: usize = 10;
 const SHARE: &str = "0.75";
 
-/// A capture and a run of it that saw a share of it. Twenty steps teach no motion: what is learnt is made to drift.
+/// A capture and a run on a share of it. Twenty steps learn no motion, so the learnt scene is made to drift.
 fn seen(work: &Path, share: &str) -> (PathBuf, PathBuf) {
     let mut sample = Capture::new(work);
     sample.frames = FRAMES;

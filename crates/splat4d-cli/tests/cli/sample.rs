@@ -136,7 +136,7 @@ impl Capture {
     }
 }
 
-/// Files of a folder that a user sees, in the order of their names: without the record of what splat4d wrote there.
+/// Visible files of a folder, in the order of their names: without the record of what splat4d wrote there.
 pub(crate) fn shown(folder: &Path) -> Vec<PathBuf> {
     let all = std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().path());
     let mut files: Vec<PathBuf> = all.filter(|p| !p.file_name().unwrap().to_string_lossy().starts_with('.')).collect();
@@ -215,7 +215,7 @@ impl Answer {
         self.stdout
     }
 
-    /// All that a call that worked said.
+    /// All output of a successful call.
     pub(crate) fn all(self) -> String {
         assert_eq!(self.code, Some(0), "{}: {}", self.call, self.stderr);
         self.stdout + &self.stderr
