@@ -82,7 +82,7 @@ pub(crate) enum Kind {
 /// Anything that NumPy makes an array of, in its own type of numbers, if images may have that one.
 pub(crate) fn pixels<'py>(value: &Bound<'py, PyAny>, what: &str) -> PyResult<(Bound<'py, PyAny>, Kind)> {
     let array = value.py().import("numpy")?.call_method1("asarray", (value,)).map_err(|e| {
-        bad_input(format!("{what} is no array ({})", e.value(value.py())), "Give an image [height, width, 3]")
+        bad_input(format!("{what} is not an array ({})", e.value(value.py())), "Give an image [height, width, 3]")
     })?;
     let dtype = array.getattr("dtype")?;
     let kind: (String, usize) = (dtype.getattr("kind")?.extract()?, dtype.getattr("itemsize")?.extract()?);

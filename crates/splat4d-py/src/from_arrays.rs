@@ -236,7 +236,7 @@ fn samples(image: &Bound<'_, PyAny>, what: &str, camera: &scene::Camera) -> PyRe
         }
     };
     if !image.hasattr("__array__")? {
-        return Err(bad_input(format!("{what} is no array"), "Give NumPy arrays"));
+        return Err(bad_input(format!("{what} is not an array"), "Give NumPy arrays"));
     }
     let (image, kind) = pixels(image, what)?;
     match kind {

@@ -296,7 +296,7 @@ impl PyMotion {
             }
             let unknown = || {
                 bad_input(
-                    format!("the motion's backward returned `{name}`, which is no array of it"),
+                    format!("the motion's backward returned `{name}`, which is not one of its arrays"),
                     "Return the names that forward is given",
                 )
             };

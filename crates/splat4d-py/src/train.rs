@@ -122,10 +122,10 @@ pub(crate) fn resume(
     listener.drive(py, options, |options, stop, listen| training::resume(&path, options, stop, listen))
 }
 
-/// Who hears of a run, and may end it.
+/// Listeners of a run, which may end it.
 struct Listener {
     progress: Option<Py<PyAny>>,
-    /// Whether the caller's own function hears of warnings; they are Python's otherwise.
+    /// Whether the caller's function gets warnings; otherwise they are Python warnings.
     told: bool,
     loss: Option<Py<PyAny>>,
     raised: Arc<Raised>,

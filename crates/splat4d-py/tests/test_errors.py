@@ -98,7 +98,7 @@ class Errors(InFolder):
         refuses("images of 2", [[picture], [picture]], times=[0.0])
         refuses(r"images\[0\]\[0\] has the shape \[40, 30, 3\]", [[picture.transpose(1, 0, 2)]], times=[0.0])
         refuses(r"dtype int64", [[picture.astype(np.int64)]], times=[0.0])
-        refuses(r"images\[0\]\[0\] is no array", [["picture"]], times=[0.0])
+        refuses(r"images\[0\]\[0\] is not an array", [["picture"]], times=[0.0])
         refuses(r"is 1.5 at row 0, column 0", [[picture + 1.5]], times=[0.0])
         bad = picture.copy()
         bad[3, 4] = np.nan
