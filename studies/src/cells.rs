@@ -203,7 +203,7 @@ impl Grid {
         [0, self.steps].map(|steps| Cell { prune: AT, interval, steps, ..Cell::source() })
     }
 
-    /// Tuned, in so many rounds.
+    /// Tuned, in this many rounds.
     pub(crate) fn round(&self, rounds: usize) -> Cell {
         Cell { prune: AT, rounds, steps: self.steps, ..Cell::source() }
     }

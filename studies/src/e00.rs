@@ -28,7 +28,7 @@ pub(crate) struct Args {
     /// Standard deviation of the noise on observed positions
     #[arg(long, value_name = "LENGTH", default_value_t = Settings::default().noise)]
     noise: f64,
-    /// So many runs with different seeds
+    /// This many runs with different seeds
     #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u64).range(1..=100))]
     seeds: u64,
 }

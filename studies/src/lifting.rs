@@ -63,7 +63,7 @@ pub(crate) struct Findings {
     pub fitted_drift: Vec<f64>,
     /// Slope of log error over log frame: 1 is a bias, ½ a random walk.
     pub growth: Option<f64>,
-    /// Smoothing the lifted flow over time, so many passes: what it does at the first step and at the last.
+    /// Smoothing the lifted flow over time, this many passes: what it does at the first step and at the last.
     pub smoothing: Vec<Smoothed>,
     /// Mean length of true and of lifted scene flow, units per frame.
     pub flow_lengths: [f64; 2],

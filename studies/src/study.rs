@@ -97,8 +97,8 @@ pub(crate) struct Judged {
     pub raster_speed: f64,
 }
 
-/// Makes and measures every cell that is missing. `make`: None where it was stopped. `keep` hears of every new cell,
-/// with the present results. Returns whether all are complete.
+/// Makes and measures every cell that is missing. `make`: None where it was stopped. `keep` is called with every new
+/// cell, with the present results. Returns whether all are complete.
 pub(crate) fn fill(
     findings: &mut Findings,
     cells: &[Cell],

@@ -116,7 +116,7 @@ fn noise(stream: u64, k: u64) -> f64 {
     ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 52) as f64 - 1.0
 }
 
-/// What a camera hears: every sound after its way through the air, fainter with it.
+/// A camera's sound: every sound after its travel time, fainter with distance.
 fn sound(camera: usize, view: &Camera) -> Vec<i16> {
     let length = (TAKEN as f64 / FPS * f64::from(RATE)) as usize;
     let mut out: Vec<f64> = (0..length as u64).map(|k| NOISE * noise(1000 + camera as u64, k)).collect();

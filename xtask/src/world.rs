@@ -21,7 +21,7 @@ const WIDTH: usize = 200;
 const HEIGHT: usize = 150;
 /// Pixels; gives 58° across.
 const FOCAL: f64 = 180.0;
-/// Cameras are on an arc of so many degrees, alternately at two heights; one in the middle is held out.
+/// Cameras are on an arc of this many degrees, alternately at two heights; one in the middle is held out.
 const CAMERAS: usize = 8;
 const HELD_OUT: usize = 3;
 const ARC_DEGREES: f64 = 150.0;

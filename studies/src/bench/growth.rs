@@ -1,10 +1,10 @@
 //! How a training step's cost grows: with Gaussians, with pixels, with frames of the capture; and where memory is with
 //! a million Gaussians.
 //!
-//! The image stays the same. More Gaussians are those of the trained scene split, fewer are every so many-th of them
-//! widened, so that together they cover what they covered before: a Gaussian of n children of one parent has √(1/n) of
-//! its scales, and is where chance puts it inside the parent. All have the default recipe's model: one velocity each
-//! and a Gaussian life.
+//! The image stays the same. More Gaussians are those of the trained scene split, fewer are every n-th of them widened,
+//! so that together they cover what they covered before: a Gaussian of n children of one parent has √(1/n) of its
+//! scales, and is where chance puts it inside the parent. All have the default recipe's model: one velocity each and a
+//! Gaussian life.
 
 use super::rows::Row;
 use super::scenes::{Pinned, VIEWS, View};

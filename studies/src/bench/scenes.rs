@@ -105,7 +105,7 @@ pub(super) struct Pinned {
 pub(super) struct Skipped(pub String);
 
 impl Pinned {
-    /// Reads a scene. The inner error states that its file is not there, which is no fault.
+    /// Reads a scene. The inner error states that its file is not there, which is not a fault.
     pub(super) fn open(name: Name, places: &Places) -> Result<std::result::Result<Self, Skipped>> {
         if let Some((count, size)) = name.made() {
             return Ok(Ok(made_up(name.letter(), count, size)));

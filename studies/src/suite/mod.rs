@@ -46,7 +46,7 @@ Steps are fixed (studies/suite.toml), so that results of machines with more or l
 DIR/results.json (after every capture: the same command continues) and DIR/suite.md, runs are in
 DIR/runs. A cell is measured again when the program, its recipe or its capture's place has changed.";
 
-/// Train the recipe on a list of captures, each in so many steps, and compare
+/// Train the recipe on a list of captures, each in this many steps, and compare
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {

@@ -11,7 +11,7 @@ const LOSS: f64 = 0.1;
 /// What training views may lose during the run, dB.
 const FALL: f64 = 1.0;
 
-/// Training views after so many steps.
+/// Training views after this many steps.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Probe {
     pub step: usize,

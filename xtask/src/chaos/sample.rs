@@ -14,7 +14,7 @@ const DISTANCE: f64 = 3.0;
 /// Angle between neighbouring cameras, radians.
 const APART: f64 = 0.35;
 
-/// Writes it, of so many frames per camera, with masks of labels.
+/// Writes it, of this many frames per camera, with masks of labels.
 pub(super) fn write(folder: &Path, frames: usize) -> Result<()> {
     let cameras: Vec<Value> = (0..CAMERAS).map(|c| camera(folder, c, frames)).collect::<Result<_>>()?;
     let labels = json!(["wall", "square"]);

@@ -259,7 +259,7 @@ fn without_tests(words: &[String]) -> Vec<String> {
     out
 }
 
-/// A path that is named, and the name by which the file knows it.
+/// A path that is named, and its name in the file.
 type Named = (Vec<String>, String);
 
 /// Paths of a tree of imports, from its words on: `a::{b, c as d}` gives a::b and a::c. Returns the words that it

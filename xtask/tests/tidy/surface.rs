@@ -3,7 +3,7 @@
 use super::{code, files, is_test, is_word, read, report};
 
 /// Public items of a crate at most: lines of its sources, tests aside, that begin a `pub` function, method, type, trait
-/// or constant. `unreachable_pub` sees to it that such a line can be reached. A lower count lowers the limit; the goals
+/// or constant. `unreachable_pub` ensures that such a line can be reached. A lower count lowers the limit; the goals
 /// are 600 for `splat4d` and 250 for `splat4d-train`.
 const PUBLIC: [(&str, usize); 3] =
     [("crates/splat4d/src", 863), ("crates/splat4d-train/src", 469), ("crates/splat4d-import/src", 94)];
