@@ -59,7 +59,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         return Err("the scene has no control nodes: train it with --motion control".into());
     };
 
-    // Nodes as they are at this moment.
+    // Nodes at this time.
     let poses = motion.poses(&layer.params, t);
     let nodes = &layer.params[motion.skin.nodes];
     let now: Vec<[f64; 3]> =

@@ -254,7 +254,7 @@ mod tests {
         assert!((none[0] - 10.0).abs() < 1e-4 && (none[1] - 10.0).abs() < 1e-4);
         // One image states little of the depth, a second from the side states it.
         assert!(one[0] < none[0] && one[0] > 2.0 * both[0], "{one:?} {both:?}");
-        // What lives for a moment is not known better by an image of another time.
+        // An image of another time adds no information about short-lived Gaussians.
         let late = of(&[(&front, 0.5), (&side, 0.0)]);
         assert!(late[0] < 0.5 * one[0] && (late[1] / one[1] - 1.0).abs() < 1e-4, "{late:?}");
     }

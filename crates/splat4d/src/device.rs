@@ -287,7 +287,7 @@ fn gpu(_: Device, _: RenderConfig, _: &Wanted, _: Tables) -> Result<(Box<dyn Bac
 
 #[cfg(feature = "gpu")]
 fn gpu(device: Device, config: RenderConfig, wanted: &Wanted, tables: Tables) -> Result<(Box<dyn Backend>, String)> {
-    // Cheap, where opening a driver takes a moment. The CPU is chosen without advice to choose it.
+    // Cheap, where opening a driver takes a moment. The CPU is chosen without the advice to choose it.
     GpuRenderer::refuses(wanted).map_err(|refusal| Error::new(refusal.kind(), refusal.cause()))?;
     let adapters = if device == Device::Gpu { Adapters::Any } else { Adapters::Hardware };
     let open = || Gpu::open(adapters);
@@ -323,7 +323,7 @@ fn to_train(
         Ok((Box::new(renderer), name))
     };
     tested(open()?).or_else(|error| {
-        // What subgroups do is the newest part of drivers.
+        // Subgroups are the newest part of drivers.
         let portable = open()?.tuned(Tuning { subgroups: false, ..Tuning::default() });
         tested(portable).map_err(|_| error)
     })

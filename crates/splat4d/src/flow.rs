@@ -48,7 +48,7 @@ pub fn velocities<F: Real>(scene: &Scene<F>, instant: &Evaluation<F>) -> Table<F
     let mut first = 0;
     for (layer, tape) in scene.layers.iter().zip(instant.tapes()) {
         let mut own = Table::default();
-        layer.motion.velocity(&tape.question(&layer.params), &mut own);
+        layer.motion.velocity(&tape.query(&layer.params), &mut own);
         for j in 0..own.rows() {
             let v = own.read::<3>(j, 0);
             let framed = || layer.frame.vector(v.map(F::f64)).map(F::of);

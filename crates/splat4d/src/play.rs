@@ -206,7 +206,7 @@ impl<'a> Player<'a> {
             if needed <= have as u64 {
                 break;
             }
-            // Beyond the end nothing is requested: what is there states what is wrong with it.
+            // Beyond the end nothing is requested: reading reports the truncation.
             let want = needed.min(length) as usize;
             if want <= have {
                 break;

@@ -162,12 +162,12 @@ impl<'a> Bakery<'a> {
         if !(1..=MAX_REPEAT).contains(&options.repeat) {
             return Err(Error::input(format!("{} rounds", options.repeat)).remedy(format!("Give 1 to {MAX_REPEAT}.")));
         }
-        let tree = Tree::new(scene.clip, scene.fps, options.looks, options.segment, usize::MAX)?;
+        let tree = Tree::new(scene.clip, scene.fps, options.sample_rate, options.segment, usize::MAX)?;
         let cameras: Vec<_> =
             options.cameras.iter().chain(options.path.iter().map(|(_, camera)| camera)).cloned().collect();
         let sampling = Lookout::new(&cameras, &means(scene));
         let mut bakery = Self { scene, options, tree, sampling, weights: None, kept: Vec::new() };
-        bakery.tree = bakery.tree_of(options.looks)?;
+        bakery.tree = bakery.tree_of(options.sample_rate)?;
         Ok(bakery)
     }
 
@@ -192,8 +192,8 @@ impl<'a> Bakery<'a> {
         self.refine(&layers)?;
         let numbers = |l: &Cow<'_, Layer<f32>>| {
             let curved = Curved::new(l, &self.tree);
-            let looks = |(_, seen): &(usize, [f64; 2])| self.tree.around(*seen).map(|k| k as f64);
-            let all: f64 = curved.rows.iter().map(looks).map(|[first, last]| last - first + 1.0).sum();
+            let frames = |(_, seen): &(usize, [f64; 2])| self.tree.around(*seen).map(|k| k as f64);
+            let all: f64 = curved.rows.iter().map(frames).map(|[first, last]| last - first + 1.0).sum();
             all * (sample::GEOMETRY + curved.colors) as f64
         };
         let keeps = layers.iter().filter(|l| self.is_split(l)).map(numbers).sum::<f64>() <= KEPT as f64;
@@ -309,11 +309,11 @@ impl<'a> Bakery<'a> {
     }
 
     /// The tree with this many samples a second, as far as their number is allowed.
-    fn tree_of(&self, looks: f64) -> Result<Tree> {
+    fn tree_of(&self, rate: f64) -> Result<Tree> {
         let rows: usize = self.scene.layers.iter().filter(|l| self.is_split(l)).map(|l| l.params.len()).sum();
         let most = self.options.samples.checked_div(rows).unwrap_or(usize::MAX);
         let Scene { clip, fps, .. } = *self.scene;
-        Tree::new(clip, fps, looks, self.options.segment, most)
+        Tree::new(clip, fps, rate, self.options.segment, most)
     }
 
     /// Halves the time between samples while the motion between them would show.

@@ -95,20 +95,21 @@ impl Fitter<'_> {
     /// The best primitive of a node, and its error in pixels. None: no sample is finite, or the node is split whatever
     /// its shape is.
     fn fit(&self, subject: &Subject<'_>, span: Span) -> Option<(Primitive, f64)> {
-        let looks = self.looks(subject, span);
+        let samples = self.samples(subject, span);
         let single = span[1] - span[0] == 1;
-        let first = looks.first().filter(|l| !single || l.frame == span[0])?;
-        // The sample at a node's end belongs to the next node. The line goes through it, so that motion is whole
-        // between frames too, but a single frame is what it is.
-        let held = if single { &looks[..1] } else { &looks[..] };
+        let first = samples.first().filter(|l| !single || l.frame == span[0])?;
+        // The sample at a node's end belongs to the next node. The line goes through it, so that motion is continuous
+        // between frames too, but a single frame is exact.
+        let held = if single { &samples[..1] } else { &samples[..] };
 
         let weight = |l: &FrameSample| l.alpha + FAINT;
-        let total: f64 = looks.iter().map(weight).sum();
-        let time = looks.iter().map(|l| weight(l) * l.time).sum::<f64>() / total;
-        let mean: [f64; 3] = std::array::from_fn(|k| looks.iter().map(|l| weight(l) * l.mean[k]).sum::<f64>() / total);
-        let spread: f64 = looks.iter().map(|l| weight(l) * (l.time - time).powi(2)).sum();
+        let total: f64 = samples.iter().map(weight).sum();
+        let time = samples.iter().map(|l| weight(l) * l.time).sum::<f64>() / total;
+        let mean: [f64; 3] =
+            std::array::from_fn(|k| samples.iter().map(|l| weight(l) * l.mean[k]).sum::<f64>() / total);
+        let spread: f64 = samples.iter().map(|l| weight(l) * (l.time - time).powi(2)).sum();
         let velocity: [f64; 3] = std::array::from_fn(|k| {
-            let sum: f64 = looks.iter().map(|l| weight(l) * (l.time - time) * (l.mean[k] - mean[k])).sum();
+            let sum: f64 = samples.iter().map(|l| weight(l) * (l.time - time) * (l.mean[k] - mean[k])).sum();
             if spread > 0.0 { sum / spread } else { 0.0 }
         });
 
@@ -139,7 +140,7 @@ impl Fitter<'_> {
         if !single && worst(None) > self.accepted {
             return None;
         }
-        let shape = self.shape(subject, &looks, held, life.center, pixels);
+        let shape = self.shape(subject, &samples, held, life.center, pixels);
         let error = worst(Some(&shape));
         let ends = self.shown(subject, span);
         let share = ((ends[1] - ends[0]) / (self.tree.border(span[1]) - self.tree.border(span[0]))).clamp(0.0, 1.0);
@@ -153,26 +154,26 @@ impl Fitter<'_> {
     fn shape(
         &self,
         subject: &Subject<'_>,
-        looks: &[FrameSample],
+        samples: &[FrameSample],
         held: &[FrameSample],
         center: f64,
         pixels: f64,
     ) -> Shape {
         let own = shape(subject, held, center);
-        if held.len() == looks.len() {
+        if held.len() == samples.len() {
             return own;
         }
-        let turning = shape(subject, looks, center);
+        let turning = shape(subject, samples, center);
         let miss = |shape: &Shape, look: &FrameSample| {
             look.alpha * difference(shape.covariance(look.time - center), look.cov) * pixels
         };
-        let worst = |shape: &Shape| looks.iter().map(|l| miss(shape, l)).fold(0.0, f64::max);
+        let worst = |shape: &Shape| samples.iter().map(|l| miss(shape, l)).fold(0.0, f64::max);
         let allowed = held.iter().all(|l| miss(&turning, l) <= self.tolerance);
         if allowed && worst(&turning) < worst(&own) { turning } else { own }
     }
 
     /// The finite samples at a span's frames, its end included.
-    fn looks(&self, subject: &Subject<'_>, span: Span) -> Vec<FrameSample> {
+    fn samples(&self, subject: &Subject<'_>, span: Span) -> Vec<FrameSample> {
         let [first, last] = subject.row.frames;
         let look = |frame: usize| {
             let v = subject.samples.at(subject.row, frame);
@@ -193,23 +194,23 @@ impl Fitter<'_> {
     }
 
     /// Envelope and opacity: the learnt lifespan, or a constant where the samples differ from it.
-    fn life(&self, subject: &Subject<'_>, span: Span, looks: &[FrameSample]) -> (Envelope, f64) {
+    fn life(&self, subject: &Subject<'_>, span: Span, samples: &[FrameSample]) -> (Envelope, f64) {
         let [from, to] = [self.tree.border(span[0]), self.tree.border(span[1])];
         let still = Envelope::forever(0.5 * (from + to));
-        let range = looks.iter().fold([1.0f64, 0.0], |r, l| [r[0].min(l.alpha), r[1].max(l.alpha)]);
+        let range = samples.iter().fold([1.0f64, 0.0], |r, l| [r[0].min(l.alpha), r[1].max(l.alpha)]);
         let constant = (0.5 * (range[0] + range[1])).clamp(0.0, 1.0);
         let own = subject.life;
         if own.is_forever() {
-            return self.or_tail(subject, looks, (still, constant), 0.5 * (range[1] - range[0]));
+            return self.or_tail(subject, samples, (still, constant), 0.5 * (range[1] - range[0]));
         }
         let (mut above, mut below) = (0.0, 0.0);
-        for look in looks {
+        for look in samples {
             let sigma = own.sigma(look.time);
             above += look.alpha * sigma * (look.alpha + FAINT);
             below += sigma * sigma * (look.alpha + FAINT);
         }
         let opacity = if below > 0.0 { (above / below).clamp(0.0, 1.0) } else { 0.0 };
-        let miss = looks.iter().map(|l| (opacity * own.sigma(l.time) - l.alpha).abs()).fold(0.0, f64::max);
+        let miss = samples.iter().map(|l| (opacity * own.sigma(l.time) - l.alpha).abs()).fold(0.0, f64::max);
         let ends = self.shown(subject, span);
         let reach = (own.half + 3.0 * own.softness).min(to - from);
         let far = ends.iter().map(|t| (t - own.center).abs()).fold(0.0, f64::max) > FAR * reach;
@@ -217,14 +218,14 @@ impl Fitter<'_> {
         let enough = LEVEL_PIXELS * flat <= self.tolerance;
         let (life, opacity, miss) =
             if (far && enough) || flat < miss { (still, constant, flat) } else { (own, opacity, miss) };
-        self.or_tail(subject, looks, (life, opacity), miss)
+        self.or_tail(subject, samples, (life, opacity), miss)
     }
 
     /// What was found, or one side of an envelope where a cross-fade makes that a better fit.
     fn or_tail(
         &self,
         subject: &Subject<'_>,
-        looks: &[FrameSample],
+        samples: &[FrameSample],
         found: (Envelope, f64),
         miss: f64,
     ) -> (Envelope, f64) {
@@ -232,20 +233,20 @@ impl Fitter<'_> {
             return found;
         }
         let of = |&(life, opacity): &(Envelope, f64)| {
-            looks.iter().map(|l| (opacity * life.sigma(l.time) - l.alpha).abs()).fold(0.0, f64::max)
+            samples.iter().map(|l| (opacity * life.sigma(l.time) - l.alpha).abs()).fold(0.0, f64::max)
         };
-        tail(looks).filter(|tail| of(tail) < miss).unwrap_or(found)
+        tail(samples).filter(|tail| of(tail) < miss).unwrap_or(found)
     }
 }
 
 /// An envelope about the strongest sample that falls as the samples do: σ = exp(−½y²), y = (x − h)/s beyond h, is a
 /// line through √(−2 ln(α/α_max)).
-fn tail(looks: &[FrameSample]) -> Option<(Envelope, f64)> {
+fn tail(samples: &[FrameSample]) -> Option<(Envelope, f64)> {
     /// Samples close to full strength or close to zero, carry little information about the slope.
     const TELLING: std::ops::Range<f64> = 0.02..0.98;
-    let peak = looks.iter().max_by(|a, b| a.alpha.total_cmp(&b.alpha))?;
+    let peak = samples.iter().max_by(|a, b| a.alpha.total_cmp(&b.alpha))?;
     let share = |l: &FrameSample| l.alpha / peak.alpha;
-    let told: Vec<[f64; 3]> = looks
+    let told: Vec<[f64; 3]> = samples
         .iter()
         .filter(|l| TELLING.contains(&share(l)))
         .map(|l| [(l.time - peak.time).abs(), (-2.0 * share(l).ln()).sqrt(), share(l)])
@@ -264,33 +265,33 @@ fn tail(looks: &[FrameSample]) -> Option<(Envelope, f64)> {
 }
 
 /// The shape: the learnt one where the samples agree with it, else turning at a steady rate.
-fn shape(subject: &Subject<'_>, looks: &[FrameSample], center: f64) -> Shape {
+fn shape(subject: &Subject<'_>, samples: &[FrameSample], center: f64) -> Shape {
     let own = subject.own;
     let same = |cov: [f64; 6], other: [f64; 6]| {
         let trace = (cov[0] + cov[3] + cov[5]).abs();
         cov.iter().zip(other).all(|(a, b)| (a - b).abs() <= SAME_SHAPE * trace)
     };
     let learnt = own.covariance(0.0);
-    if looks.iter().all(|l| same(l.cov, learnt)) {
+    if samples.iter().all(|l| same(l.cov, learnt)) {
         return own;
     }
-    let clearest = looks.iter().max_by(|a, b| a.alpha.total_cmp(&b.alpha)).expect("a fit has looks");
+    let clearest = samples.iter().max_by(|a, b| a.alpha.total_cmp(&b.alpha)).expect("a fit has samples");
     let start = if same(clearest.cov, learnt) { own } else { decompose(clearest.cov) };
-    if looks.iter().all(|l| same(l.cov, clearest.cov)) {
+    if samples.iter().all(|l| same(l.cov, clearest.cov)) {
         return start;
     }
-    let seen: Vec<_> = looks.iter().map(|l| (l.time - center, l.alpha + FAINT, l.cov)).collect();
+    let seen: Vec<_> = samples.iter().map(|l| (l.time - center, l.alpha + FAINT, l.cov)).collect();
     start.fit(&seen)
 }
 
 /// SH coefficients: the Gaussian's own, or the weighted mean of what is seen.
-fn colors(subject: &Subject<'_>, looks: &[FrameSample]) -> [f32; COLORS] {
+fn colors(subject: &Subject<'_>, samples: &[FrameSample]) -> [f32; COLORS] {
     if let Some(own) = subject.colors {
         return own;
     }
     let mut sum = [0.0f64; COLORS];
-    let total: f64 = looks.iter().map(|l| l.alpha + FAINT).sum();
-    for look in looks {
+    let total: f64 = samples.iter().map(|l| l.alpha + FAINT).sum();
+    for look in samples {
         let seen = &subject.samples.at(subject.row, look.frame)[GEOMETRY..];
         sum.iter_mut().zip(seen).for_each(|(s, c)| *s += (look.alpha + FAINT) / total * f64::from(*c));
     }

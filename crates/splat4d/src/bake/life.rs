@@ -4,7 +4,7 @@ use crate::layers::Layer;
 use crate::scene::life::{CENTER, LOG_SOFTNESS, LOG_WIDTH};
 use crate::scene::{LIFE, LifeKind, Table};
 
-/// A half-width or softness above this counts as infinite, seconds: three years; intervals that stand for infinity have
+/// A half-width or softness above this counts as infinite, seconds: three years; intervals that represent infinity have
 /// thirty.
 const FOR_EVER: f64 = 1e8;
 /// A softness below this is an edge, seconds.

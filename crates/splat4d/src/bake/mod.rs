@@ -42,9 +42,9 @@ pub use compare::{Likeness, Shown, compare};
 pub const TOLERANCE: f64 = 0.25;
 /// Default of [`Options::segment`], seconds: what a player fetches for a seek; shorter ones repeat too much.
 pub const SEGMENT: f64 = 1.0;
-/// Default of [`Options::looks`]: the frame rate of players. Between the frames of a slow capture a network is not
-/// linear.
-pub const LOOKS: f64 = 30.0;
+/// Default of [`Options::sample_rate`]: the frame rate of players. Between the frames of a slow capture a network is
+/// not linear.
+pub const SAMPLE_RATE: f64 = 30.0;
 /// Most rounds of [`Options::repeat`].
 pub const MAX_REPEAT: usize = 10_000;
 /// Default of [`Options::renders`]: more do not improve the result.
@@ -61,7 +61,7 @@ pub struct Options {
     /// About how long a segment lasts, seconds.
     pub segment: f64,
     /// Time samples of the model per second, at least; each of the clip's frames is one, as far as `samples` allows.
-    pub looks: f64,
+    pub sample_rate: f64,
     /// Most samples of Gaussians at a time, over all Gaussians whose motion is not straight: bounds the time of baking.
     /// At least the clip's ends are sampled.
     pub samples: usize,
@@ -83,7 +83,7 @@ impl Default for Options {
         Self {
             tolerance: TOLERANCE,
             segment: SEGMENT,
-            looks: LOOKS,
+            sample_rate: SAMPLE_RATE,
             samples: SAMPLES,
             renders: RENDERS,
             repeat: 1,

@@ -125,7 +125,7 @@ mod tests {
     use super::*;
     use crate::math::Se3;
 
-    /// One that lives for `half` seconds about the middle of a second.
+    /// One with a lifespan of `half` seconds about the middle of a second.
     fn primitive(mean: [f64; 3], size: f32, half: f64, color: f32) -> Primitive {
         Primitive {
             mean,

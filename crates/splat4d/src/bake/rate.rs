@@ -1,7 +1,7 @@
 //! Rate and distortion: how many segments a Gaussian needs for how small an error of the images.
 //!
 //! Every node of the tree of time spans has the error that one segment leaves there: closed forms of running sums, so
-//! that a node costs the same however many looks it holds. For a price λ of a segment the best cut of the tree is known
+//! that a node costs the same for any number of samples. For a price λ of a segment the best cut of the tree is known
 //! from its leaves upwards (a node is cut where its halves and their price cost less). Cuts at all prices of a ladder
 //! at once give the curve of the whole scene, on which a budget of segments or a requested error is a price. (Optimal
 //! tree pruning: Chou, Lookabaugh, Gray 1989.)
@@ -92,7 +92,7 @@ pub(super) struct Sums<'a> {
     peak: f64,
     colors: usize,
     width: usize,
-    /// [looks + 1, width]
+    /// [samples + 1, width]
     sums: Vec<f64>,
 }
 
@@ -169,7 +169,7 @@ impl<'a> Sums<'a> {
     pub(super) fn error(&self, span: Span) -> f64 {
         let [first, last] = self.row.frames;
         let (a, b) = (first.max(span[0]), last.min(span[1]));
-        // A single frame is what it is, and goes straight on to the next.
+        // A single frame is exact, and moves linearly to the next.
         if span[1] - span[0] <= 1 || a >= b {
             return 0.0;
         }

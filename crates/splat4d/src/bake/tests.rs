@@ -116,7 +116,7 @@ fn a_cross_fade_is_baked_into_opacities() {
     let faded = baked(&scene, &options(0.25));
     let like = likeness(&scene, &faded);
     assert!(like.worst_psnr > 40.0, "{like:?}");
-    // Looked at in the midst of it: without the fade it is another image.
+    // Rendered in the middle of it: without the fade the image differs.
     scene.layers.iter_mut().for_each(|l| l.cross_fade = [0.0; 2]);
     assert!(likeness(&scene, &faded).worst_psnr < 35.0);
 }
@@ -153,7 +153,7 @@ fn straight_motion_with_every_kind_of_lifespan_is_exact() {
 
 #[test]
 fn the_general_algorithm_bakes_straight_motion_exactly() {
-    // The same scene twice: once as what it is, once behind an opaque model.
+    // The same scene twice: once visible, once behind an opaque model.
     let straight = scene(vec![layer(&spacetime(1, false), LifeKind::GaussHalf, 150, 0.3, 2.4)], 2.4);
     let mut hidden = straight.clone();
     hidden.layers[0].motion = Arc::new(Hidden(straight.layers[0].motion.clone()));
@@ -281,7 +281,7 @@ fn static_gaussians_of_repeated_rounds_are_stored_once() {
     let moving = once.report.primitives - still;
     assert!(thrice.report.primitives == still + 3 * moving && moving > 50);
     assert!((thrice.clip[1] - (2.0 + 29.0 / FPS)).abs() < 1e-9);
-    // The same frame of every round looks the same.
+    // The same frame of every round is the same.
     let mut moment = Moment::default();
     for k in [0, 7, 29] {
         let mut shown = Vec::new();
@@ -467,7 +467,7 @@ fn the_curve_gives_the_segments_needed_for_each_error() {
         let baked = bakery.bake(Cut::Price(price), &mut |_, _| {}).unwrap();
         let [pieces, error] = curve.at(price);
         assert!((0.9..1.1).contains(&(pieces / baked.report.primitives as f64)), "{pieces} {:?}", baked.report);
-        // Gaussians do not err independently, and fits are not what they are judged by: some decibels.
+        // Gaussians do not err independently, and fits minimise another error: some decibels.
         let psnr = likeness(&scene, &baked).psnr;
         assert!((psnr + 10.0 * error.log10()).abs() < 4.0, "{psnr} dB, foretold {}", -10.0 * error.log10());
     }

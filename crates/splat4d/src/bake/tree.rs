@@ -153,11 +153,11 @@ mod tests {
 
     #[test]
     fn low_frame_rates_are_sampled_between_frames() {
-        for (fps, looks, parts) in
+        for (fps, rate, parts) in
             [(10.0, 30.0, 3), (29.97, 30.0, 1), (24.0, 30.0, 2), (60.0, 30.0, 1), (10.0, 0.0, 1), (1e-6, 30.0, 32)]
         {
             let last = 11.0 / fps;
-            let tree = Tree::new([0.0, last], fps, looks, 1e9, usize::MAX).unwrap();
+            let tree = Tree::new([0.0, last], fps, rate, 1e9, usize::MAX).unwrap();
             assert_eq!(tree.frames(), 11 * parts + 1, "{fps} frames/s");
             assert!(
                 (0..=11).all(|k| (tree.time(k * parts) - k as f64 / fps).abs() <= 1e-12 * last),

@@ -2,7 +2,7 @@
 //!
 //! A Gaussian behind a wall, or one of its neighbours' colour, may err by pixels without a trace; the edge of a sign
 //! may not. [`Importance::sensitivities`] gives the exact second moment of the image's gradient for each Gaussian
-//! alone. Some cameras at some times stand for all. Of a camera that moves, each time has its own pose: a Gaussian
+//! alone. Some cameras at some times represent all. Of a camera that moves, each time has its own pose: a Gaussian
 //! counts when that camera sees it. A Gaussian that no render sees keeps a share of the weight that its size and
 //! opacity give, so that it is not lost for other views.
 
@@ -162,7 +162,7 @@ impl Weights {
         out
     }
 
-    /// The weight of row `row` of a layer that looks like `sample` where it is clearest.
+    /// The weight of row `row` of a layer that renders like `sample` where it is clearest.
     pub(super) fn of(&self, layer: usize, row: usize, sample: &[f32], sampling: &Lookout) -> Weight {
         let v: [f64; GEOMETRY] = std::array::from_fn(|k| f64::from(sample[k]));
         let square = v[SPLAT_OPACITY] * v[SPLAT_OPACITY];

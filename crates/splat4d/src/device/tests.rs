@@ -113,7 +113,7 @@ fn training_continues_on_the_cpu_with_equal_gradients() {
     let (with_extra, without) = (returned(cpu(config).as_mut(), &extra), returned(cpu(config).as_mut(), &plain));
     for going_back in [false, true] {
         let mut backend = WithCpu::new(Box::new(Failing { renderer: Renderer::new(config), drawn: 0, going_back }));
-        // What it refuses is reported once, and does not end it.
+        // Refused work is reported once, and does not end it.
         for _ in 0..2 {
             assert!(returned(&mut backend, &extra) == with_extra);
         }

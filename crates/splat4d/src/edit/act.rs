@@ -171,14 +171,14 @@ fn keep(scene: &mut Scene<f32>, selected: &Selected, wanted: bool) {
 }
 
 /// Whether opacity and colour at all times equal geometry and spherical harmonics times the lifespan.
-fn tables_say_all(layer: &Layer<f32>) -> bool {
+fn tables_suffice(layer: &Layer<f32>) -> bool {
     layer.motion.polynomial().is_some()
 }
 
 fn recolor(scene: &mut Scene<f32>, selected: &Selected, map: &ColorMap) -> Result<()> {
     let mut others = selected.clone();
     for (layer, selected) in scene.layers.iter_mut().zip(&mut others) {
-        if !tables_say_all(layer) {
+        if !tables_suffice(layer) {
             continue;
         }
         let table = &mut layer.params[SH];
@@ -196,7 +196,7 @@ fn recolor(scene: &mut Scene<f32>, selected: &Selected, map: &ColorMap) -> Resul
 fn fade(scene: &mut Scene<f32>, selected: &Selected, factor: f64) -> Result<()> {
     let mut others = selected.clone();
     for (layer, selected) in scene.layers.iter_mut().zip(&mut others) {
-        if !tables_say_all(layer) {
+        if !tables_suffice(layer) {
             continue;
         }
         let table = &mut layer.params[GEOMETRY];
@@ -335,7 +335,7 @@ fn merge(scene: &mut Scene<f32>, mut other: Scene<f32>, name: &str, at: Option<f
         }
         other.clip = other.clip.map(|t| t + later);
     }
-    // Both say where they are in their world, which is taken for one.
+    // Both state their world coordinates, and the worlds are taken as one.
     let mut to = *to;
     if scene.offset != [0.0; 3] && other.offset != [0.0; 3] {
         to.translation = std::array::from_fn(|k| to.translation[k] + other.offset[k] - scene.offset[k]);

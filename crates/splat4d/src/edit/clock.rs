@@ -34,7 +34,7 @@ pub(super) fn seen_in(layer: &Layer<f32>, [from, to]: [f64; 2]) -> usize {
     if span[0] >= span[1] {
         return 0;
     }
-    // As they live, whatever the window: those that live in it.
+    // By lifespan, for any window: those alive in it.
     layer.spans().iter().filter(|[first, last]| first.max(span[0]) <= last.min(span[1])).count()
 }
 
@@ -116,18 +116,18 @@ fn retimed(motion: &Arc<dyn Motion>, rate: f64, offset: f64, layer: &mut Layer<f
 
 /// A clock around the model, which must not read the lifespans that are about to change.
 fn clocked(motion: &Arc<dyn Motion>, rate: f64, offset: f64, layer: &mut Layer<f32>) -> Result<Arc<dyn Motion>> {
-    if reads_lives(motion.as_ref()) && layer.params[LIFE].width() > 0 {
+    if reads_lifespans(motion.as_ref()) && layer.params[LIFE].width() > 0 {
         return Err(Error::new(ErrorKind::Unsupported, format!("layer `{}` cannot run on another clock", layer.name))
             .remedy("Bake the scene first; baked scenes can"));
     }
     Ok(Arc::new(Edited::around(motion.clone(), Change::Clock { rate, offset }, &mut layer.params)?))
 }
 
-fn reads_lives(motion: &dyn Motion) -> bool {
+fn reads_lifespans(motion: &dyn Motion) -> bool {
     let any: &dyn Any = motion;
     any.is::<Spacetime>()
-        || Filtered::of(motion).is_some_and(|f| reads_lives(f.inner().as_ref()))
-        || Edited::of(motion).is_some_and(|e| reads_lives(e.inner().as_ref()))
+        || Filtered::of(motion).is_some_and(|f| reads_lifespans(f.inner().as_ref()))
+        || Edited::of(motion).is_some_and(|e| reads_lifespans(e.inner().as_ref()))
 }
 
 fn rising<K>(mut keys: Vec<K>, rate: f64) -> Vec<K> {

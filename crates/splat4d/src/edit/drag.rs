@@ -69,7 +69,7 @@ pub(super) struct Asked<'a> {
 }
 
 impl Asked<'_> {
-    fn check_moment(&self, scene: &Scene<f32>) -> Result<()> {
+    fn check_time(&self, scene: &Scene<f32>) -> Result<()> {
         let bad = |what: String, remedy: &str| Err(Error::input(what).remedy(remedy.to_owned()));
         if !(scene.clip[0]..=scene.clip[1]).contains(&self.at) {
             return bad(format!("{} s is not in the clip", self.at), "Give a second of the clip as `at`");
@@ -82,7 +82,7 @@ impl Asked<'_> {
 
     fn check(&self, scene: &Scene<f32>) -> Result<()> {
         let bad = |what: String, remedy: &str| Err(Error::input(what).remedy(remedy.to_owned()));
-        self.check_moment(scene)?;
+        self.check_time(scene)?;
         let sound = |h: &DragHandle| {
             let numbers = h.keys.iter().flat_map(|k| k.by.into_iter().chain([k.t]));
             !h.keys.is_empty()
@@ -229,8 +229,8 @@ impl Dragging {
     ) -> Result<Self> {
         scene.without_head("a drag under the hand")?;
         let asked = Asked { at, nodes, handles: &[], pins: &[] };
-        asked.check_moment(scene)?;
-        Asked { at: now, ..asked }.check_moment(scene)?;
+        asked.check_time(scene)?;
+        Asked { at: now, ..asked }.check_time(scene)?;
         // Frame by frame, as a step follows them.
         let between = |t: &f64| (at.min(now)..=at.max(now)).contains(t);
         let mut times: Vec<f64> = asked.times(scene).0.into_iter().filter(between).chain([now]).collect();
@@ -257,7 +257,7 @@ impl Dragging {
         }
         let (paths, times) = ([start.clone()], [at]);
         let bent = Bend { start: &start, paths: &paths, times: &times, at }.around(&mut still, &chosen)?;
-        // The ties are those of the places, as a step has them.
+        // The ties are those of the positions, as in a step.
         let elastic = Elastic::new(&places).at_rest(&start);
         let mut out = Self { scene: still, elastic, places, nodes: start, bent };
         out.fill(&unmoved(&out.nodes));
@@ -415,10 +415,10 @@ fn pulls(layer: &Layer<f32>, bend: &Bend<'_>, neighbours: usize) -> Vec<(u32, f3
     }
     let radius = spacing(bend.start);
     let mut out = vec![(0, 0.0); spans.len() * neighbours];
-    let questions: Vec<(Rows<'_>, Time)> =
+    let queries: Vec<(Rows<'_>, Time)> =
         asked.iter().zip(bend.times).map(|(ids, t)| (Rows::Some(ids), Time(*t))).collect();
     // Tables without any pull yet: the result is that of the model inside.
-    sweep(layer, &questions, |k, tape| {
+    sweep(layer, &queries, |k, tape| {
         let nodes = &bend.paths[k];
         let one = |j: usize| {
             let x = tape.out().read::<3>(j, 0).map(f64::from);

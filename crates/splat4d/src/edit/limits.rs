@@ -14,7 +14,7 @@ const MOST_FRAMES: f64 = 1e6;
 /// Most changes around a model, each inside the next: readers of JSON take a hundred and some levels.
 const MOST_NESTED: usize = 40;
 /// Times of the clip at which all numbers are checked to be finite.
-const LOOKS: usize = 3;
+const TIMES: usize = 3;
 
 /// Rows and bytes of some Gaussians.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -112,9 +112,9 @@ pub(super) fn check_sound(scene: &Scene<f32>) -> Result<()> {
         return Err(Error::input(what).remedy("Put keys of several steps into one"));
     }
     let mut seen = Evaluation::default();
-    for i in 0..LOOKS {
+    for i in 0..TIMES {
         let [from, to] = scene.clip;
-        let t = from + (to - from) * i as f64 / (LOOKS - 1) as f64;
+        let t = from + (to - from) * i as f64 / (TIMES - 1) as f64;
         scene.at(Time(t), &mut seen);
         for (layer, tape) in scene.layers.iter().zip(seen.tapes()) {
             if tape.out().first_non_finite().is_some() {

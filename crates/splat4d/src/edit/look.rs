@@ -12,7 +12,7 @@ use crate::scene::{Camera, Color, GEOMETRY, Rows, Space, Table, Time, features, 
 use crate::{Error, Result};
 
 /// Times at which a Gaussian is examined, at most, evenly over its lifespan: a bit each.
-const LOOKS: usize = 8;
+const SAMPLES: usize = 8;
 /// Times of the clip at which neighbours are sought.
 const NEIGHBOUR_LOOKS: usize = 8;
 /// Share of the images that have a Gaussian in them in which it must be on the subject: others may hide it, whose
@@ -28,12 +28,12 @@ pub type Selected = Vec<Vec<bool>>;
 ///
 /// Errors: names of cameras, layers or masks that there are not; masks of another size than their camera.
 pub fn select(expr: &Expr, scene: &Scene<f32>, context: &dyn Context) -> Result<Selected> {
-    let looks = Looks::over_lives(scene, expr);
+    let looks = Looks::over_lifespans(scene, expr);
     let bits = evaluate(expr, scene, &looks, context)?;
     Ok(most(&bits, &looks))
 }
 
-/// Samples of one layer: [`LOOKS`] entries for row i from `LOOKS · i` on, of which `count[i]` are used.
+/// Samples of one layer: [`SAMPLES`] entries for row i from `SAMPLES · i` on, of which `count[i]` are used.
 struct LayerLooks {
     count: Vec<u8>,
     means: Vec<[f32; 3]>,
@@ -54,7 +54,7 @@ type Bits = Vec<Vec<u8>>;
 
 impl Looks {
     /// Samples spread over lifespans, on frames.
-    fn over_lives(scene: &Scene<f32>, expr: &Expr) -> Self {
+    fn over_lifespans(scene: &Scene<f32>, expr: &Expr) -> Self {
         let fps = if scene.fps > 0.0 && scene.fps.is_finite() { scene.fps } else { crate::scene::time::DEFAULT_FPS };
         let [start, end] = scene.clip;
         let frames = ((end - start) * fps).round().max(0.0) as usize + 1;
@@ -62,7 +62,7 @@ impl Looks {
         let of = |layer: &Layer<f32>| {
             let seen: Vec<[f64; 2]> = layer.spans().iter().map(|[from, to]| [from.max(start), to.min(end)]).collect();
             let frame = |t: f64| ((t - start) * fps).clamp(0.0, (frames - 1) as f64);
-            // By frame: the rows that are examined then, and the place of that look.
+            // By frame: the rows that are examined then, and the index of that sample.
             let mut asked: Vec<(Vec<u32>, Vec<u8>)> = vec![Default::default(); frames];
             // Who is never seen is examined nowhere: no predicate of places holds, and its negation does.
             let mut count = vec![1; seen.len()];
@@ -71,7 +71,7 @@ impl Looks {
                 // A lifespan between two frames is examined at the nearer one.
                 let (first, last) =
                     if first > last { [frame(0.5 * (from + to)).round() as usize; 2].into() } else { (first, last) };
-                let looks = LOOKS.min(last - first + 1);
+                let looks = SAMPLES.min(last - first + 1);
                 count[row] = looks as u8;
                 for i in 0..looks {
                     let k = first + (last - first) * i / (looks - 1).max(1);
@@ -80,8 +80,8 @@ impl Looks {
                 }
             }
             let asked: Vec<_> = asked.into_iter().enumerate().filter(|(_, a)| !a.0.is_empty()).collect();
-            let questions: Vec<Query<'_>> = asked.iter().map(|(k, a)| (Time(time(*k)), a)).collect();
-            LayerLooks::of(layer, expr, seen, count, &questions)
+            let queries: Vec<Query<'_>> = asked.iter().map(|(k, a)| (Time(time(*k)), a)).collect();
+            LayerLooks::of(layer, expr, seen, count, &queries)
         };
         Self(scene.layers.iter().map(of).collect())
     }
@@ -103,27 +103,27 @@ impl Looks {
 }
 
 impl LayerLooks {
-    fn of(layer: &Layer<f32>, expr: &Expr, seen: Vec<[f64; 2]>, count: Vec<u8>, questions: &[Query<'_>]) -> Self {
-        let wanted = |which: &dyn Fn(&Expr) -> bool| if expr.any(which) { LOOKS * count.len() } else { 0 };
+    fn of(layer: &Layer<f32>, expr: &Expr, seen: Vec<[f64; 2]>, count: Vec<u8>, queries: &[Query<'_>]) -> Self {
+        let wanted = |which: &dyn Fn(&Expr) -> bool| if expr.any(which) { SAMPLES * count.len() } else { 0 };
         let none = f32::NAN;
         let mut out = Self {
-            means: vec![[none; 3]; LOOKS * count.len()],
+            means: vec![[none; 3]; SAMPLES * count.len()],
             sizes: vec![none; wanted(&|e| matches!(e, Expr::Size(..)))],
             speeds: vec![none; wanted(&|e| matches!(e, Expr::Speed(..)))],
             colors: vec![[none; 3]; wanted(&|e| matches!(e, Expr::Color(..)))],
             count,
             seen,
         };
-        let asked: Vec<(Rows<'_>, Time)> = questions.iter().map(|(t, (ids, _))| (Rows::Some(ids), *t)).collect();
+        let asked: Vec<(Rows<'_>, Time)> = queries.iter().map(|(t, (ids, _))| (Rows::Some(ids), *t)).collect();
         let mut velocities = Table::default();
         sweep(layer, &asked, |i, tape| {
-            let (ids, places) = questions[i].1;
+            let (ids, places) = queries[i].1;
             let part = layer.part(tape);
             if !out.speeds.is_empty() {
-                layer.motion.velocity(&tape.question(&layer.params), &mut velocities);
+                layer.motion.velocity(&tape.query(&layer.params), &mut velocities);
             }
             for (j, (&id, &place)) in ids.iter().zip(places).enumerate() {
-                let at = LOOKS * id as usize + usize::from(place);
+                let at = SAMPLES * id as usize + usize::from(place);
                 out.means[at] = part.out.read::<3>(j, 0);
                 if !out.sizes.is_empty() {
                     out.sizes[at] = sym3::largest(part.out.read::<6>(j, COV).map(f64::from)).max(0.0).sqrt() as f32;
@@ -171,7 +171,7 @@ fn alike(scene: &Scene<f32>, looks: &Looks, place: [f64; 3], least: f64) -> Resu
     let mut nearest: Option<(f64, Vec<f32>)> = None;
     for (layer, l) in looks.0.iter().enumerate() {
         for row in 0..l.count.len() {
-            let far = |i: u8| norm(sub(l.means[LOOKS * row + usize::from(i)].map(f64::from), place));
+            let far = |i: u8| norm(sub(l.means[SAMPLES * row + usize::from(i)].map(f64::from), place));
             let far = (0..l.count[row]).map(far).fold(f64::INFINITY, f64::min);
             if far < nearest.as_ref().map_or(f64::INFINITY, |n| n.0)
                 && let Some(features) = of(layer, row)
@@ -209,7 +209,7 @@ fn evaluate(expr: &Expr, scene: &Scene<f32>, looks: &Looks, context: &dyn Contex
     let chosen = |selected: &Selected| rows(&|layer, row| selected[layer][row]);
     let moments = |holds: &dyn Fn(&LayerLooks, usize) -> bool| -> Bits {
         let bit = |looks: &LayerLooks, row: usize| {
-            let one = |i: &u8| holds(looks, LOOKS * row + usize::from(*i));
+            let one = |i: &u8| holds(looks, SAMPLES * row + usize::from(*i));
             (0..looks.count[row]).filter(one).map(|i| 1 << i).sum()
         };
         looks.0.iter().map(|l| (0..l.count.len()).map(|row| bit(l, row)).collect()).collect()

@@ -345,7 +345,7 @@ fn keys_move_over_time() {
         assert!(psnr(&draw(&moved, 0.1), &draw(&s, 0.1)) > 90.0);
         assert!(psnr(&draw(&moved, 0.5), &draw(&at("[0.3, 0, 0]", 30.0), 0.5)) > 60.0);
         assert!(psnr(&draw(&moved, 0.9), &draw(&at("[0.6, 0, 0]", 60.0), 0.9)) > 60.0);
-        // A single key holds at all times, and a time taken out has it.
+        // A single key holds at all times, and a removed time range has it.
         let one = run(r#"[{"do": "move", "select": "all", "keys": [{"t": 0, "shift": [0.3, 0, 0]}]}]"#, &s).unwrap();
         let frozen = crate::layers::moment(&one, Time(0.4)).unwrap();
         let still = Layer::new("now", frozen, std::sync::Arc::new(crate::motion::Still), LifeKind::Infinite);
@@ -734,7 +734,7 @@ fn an_overflow_is_refused_and_names_its_step() {
         for scene in scenes() {
             let text = format!("[{hide}, {step}]");
             let error = match run(&text, &scene) {
-                // What does not overflow is no NaN either.
+                // Values that do not overflow are not NaN either.
                 Ok(edited) => {
                     let written = write(&edited, &mut Vec::new());
                     assert!(written.is_ok(), "{step}: {written:?}");

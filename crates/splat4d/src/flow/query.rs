@@ -357,7 +357,7 @@ mod tests {
             for i in 0..SIDE * SIDE {
                 let r = b * SIDE * SIDE + i;
                 let at = |k: usize| (k as f64 / (SIDE - 1) as f64 - 0.5) * wide;
-                // A Gaussian that lives around its birth is then where the wall is then.
+                // A Gaussian alive around its birth is at the wall's position then.
                 let x = [at(i % SIDE), at(i / SIDE), z];
                 let x: [f64; 3] = std::array::from_fn(|k| x[k] + velocity[k] * (birth - 0.5));
                 p[GEOMETRY].write(r, 0, x.map(|x| x as f32));
@@ -410,13 +410,13 @@ mod tests {
             let x = x.expect("somebody carries it on");
             assert!(norm(sub(x, [0.1 + 0.4 * t, 0.2, 0.0])) < 1e-4, "{t}: {x:?}");
         }
-        // None of those that begin live to the end.
+        // None of the first ones is alive at the end.
         assert!(s.layers[0].spans().iter().all(|[from, to]| *from > 0.0 || *to < 1.0));
     }
 
     #[test]
     fn occluded_points_are_marked_and_empty_pixels_not_followed() {
-        // A small screen before a wall goes from left to right.
+        // A small screen before a wall moves from left to right.
         let s = scene(vec![wall(0.0, 6.0, [0.0; 3], None), wall(1.0, 0.6, [2.0, 0.0, 0.0], None)]);
         let seen = |t: f64, x: [f64; 3]| sights(&s, &camera(), Time(t), &[Some(x)])[0].unwrap();
         assert!(seen(0.0, [0.0; 3]).visible && !seen(0.5, [0.0; 3]).visible && seen(1.0, [0.0; 3]).visible);

@@ -210,7 +210,7 @@ mod tests {
             let other = Fade { width: fade.width * factor, ..fade };
             assert!(rms(400, seen.clip, |t| other.at(t) - seen.opacity * seen.sigma(t)) > miss);
         }
-        // A piece in the tail of a lifespan must not bring the whole lifespan along.
+        // A segment in the tail of a lifespan must not bring the whole lifespan along.
         let tail = Visibility { span: [0.0, 0.3], ..interval(1.0, 1e-9, 0.25) };
         assert_eq!(tail.exact(), None);
         assert!(tail.fit().is_none_or(|f| f.at(1.0) < 0.05), "{:?}", tail.fit());
@@ -220,7 +220,7 @@ mod tests {
 
     #[test]
     fn segments_of_one_path_fade_into_each_other() {
-        // One Gaussian with an infinite lifespan, cut into four pieces: together they must stay near 0.6.
+        // One Gaussian with an infinite lifespan, cut into four segments: together they must stay near 0.6.
         let pieces: Vec<Fade> = (0..4)
             .map(|i| {
                 let span = [0.5 * f64::from(i), 0.5 * f64::from(i + 1)];

@@ -156,8 +156,8 @@ fn radius(params: &Params, rows: &[usize]) -> f64 {
     of(means.iter().map(|m| norm(sub(*m, middle))).collect())
 }
 
-/// Reads values that are stored unconverted: lengths become logarithms, alphas logits, RGB coefficients. Says what was
-/// out of range.
+/// Reads values that are stored unconverted: lengths become logarithms, alphas logits, RGB coefficients. Returns what
+/// was out of range.
 pub fn from_linear(layer: &mut Layer<f32>, what: Linear) -> Warnings {
     let [geometry, sh] = layer.params.get_mut([GEOMETRY, SH]);
     let (mut outside, rows) = (0, geometry.rows());

@@ -55,7 +55,7 @@ impl Stated {
             "life": l.life.name(),
             "motion": spec_to_json(&l.motion.spec()),
         });
-        // JSON knows no infinity: a side that is open is null, and a layer that is always seen states nothing.
+        // JSON has no infinity: a side that is open is null, and a layer that is always seen states nothing.
         if l.span != ALWAYS {
             layer["span"] = json!(l.span.map(|t| t.is_finite().then_some(t)));
         }
@@ -603,7 +603,7 @@ mod tests {
         let bytes = unsealed(bytes);
         let with = |from: &str, to: &str| {
             assert_eq!(from.len(), to.len());
-            // Names of arrays stand in the list of checksums too.
+            // Names of arrays are in the list of checksums too.
             let places: Vec<usize> = (0..bytes.len()).filter(|&at| bytes[at..].starts_with(from.as_bytes())).collect();
             assert!(!places.is_empty(), "{from}");
             let mut b = bytes.clone();

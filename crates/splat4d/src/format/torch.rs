@@ -173,7 +173,7 @@ impl<'a> Torch<'a> {
     /// The numbers of a tensor, row-major. Errors: it is outside its storage, which is missing or too short.
     pub(super) fn numbers(&self, tensor: &Tensor) -> Result<Vec<f32>> {
         let name = format!("{}data/{}", self.folder, tensor.key);
-        // Storages are stored as they are: a small file cannot become a large one.
+        // Storages are stored uncompressed: a small file cannot become a large one.
         let most = self.archive.packed(&name).unwrap_or(0);
         let file = self.archive.file(&name, most).ok_or_else(|| damaged(format!("{name} is missing")))?;
         let (bytes, size) = (file?, tensor.kind.size());
@@ -417,7 +417,7 @@ impl<'a> Machine<'a> {
                 let made = self.call(callable, arguments)?;
                 self.push(made);
             }
-            // State for an object: of what is plain data nothing is missing, and nothing else was made.
+            // State for an object: plain data is complete without it, and nothing else is built.
             b'b' => drop(self.pop()?),
             0x81 => {
                 self.pop()?;

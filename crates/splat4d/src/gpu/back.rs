@@ -91,7 +91,7 @@ impl GpuRenderer {
     }
 
     /// [`Backend::vjp`](crate::render::Backend::vjp).
-    pub(super) fn take_back(
+    pub(super) fn backward_band(
         &mut self,
         shot: &Shot<'_, f32>,
         grads: &ImageGrads<'_, f32>,

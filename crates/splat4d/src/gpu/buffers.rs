@@ -57,7 +57,7 @@ impl Grown {
         if gpu.refused == Some(self.what) {
             return Err(gpu.error(ErrorKind::Memory, format!("{size} bytes of {}", self.what)));
         }
-        // The old one goes first: both together may be more than there is.
+        // The old one is freed first: both together may not fit.
         self.buffer = None;
         self.buffer = Some(gpu.device.create_buffer(&wgpu::BufferDescriptor {
             label: Some(self.what),

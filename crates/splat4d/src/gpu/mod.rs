@@ -222,7 +222,7 @@ impl GpuRenderer {
                 self.drawn.push((band, pairs));
                 continue;
             }
-            // Too many pairs for the room there is: more room, or two halves.
+            // Too many pairs for the buffers: larger ones, or two halves.
             if pairs <= self.most_pairs {
                 fresh |= self.make_room_for_pairs(pairs)?;
                 bands.push(band);
@@ -429,7 +429,7 @@ impl Backend<f32> for GpuRenderer {
         d: &mut RenderGrads<f32>,
     ) -> Result<()> {
         self.can(&Wanted { backward: true, ..shot.wanted() })?;
-        self.take_back(shot, grads, d_sh, d)
+        self.backward_band(shot, grads, d_sh, d)
     }
 
     /// Errors in addition: a gradient that is not finite. `None` in addition: the image must be rendered in bands, or

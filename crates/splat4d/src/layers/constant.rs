@@ -167,7 +167,7 @@ impl Turns {
         };
         let forms = self.0.iter().map(|(turn, axes)| (quat::product(q, *turn), axes.map(|a| s[a])));
         let best = forms.min_by(|a, b| cost(a.0, a.1).total_cmp(&cost(b.0, b.1))).expect("there are 24 forms");
-        // The shape as it is where nothing is gained but rounding.
+        // The unchanged shape where a conversion would only add rounding.
         let (q, s) = if cost(best.0, best.1) < cost(q, s) - 1e-6 { best } else { (q, s) };
         (signed(q), s)
     }

@@ -138,7 +138,7 @@ impl<F: Real> LayerTape<F> {
     }
 
     /// Requests the Gaussians of `layer` that are alive at t.
-    pub fn ask_active(&mut self, layer: &Layer<F>, t: Time) {
+    pub fn request_active(&mut self, layer: &Layer<F>, t: Time) {
         (self.of, self.t) = (Space::Gaussians, t);
         self.all = layer.active(t, &mut self.ids);
     }
@@ -164,7 +164,7 @@ impl<F: Real> LayerTape<F> {
     }
 
     /// The query as the motion model gets it.
-    pub fn question<'a>(&'a self, p: &'a Params<F>) -> At<'a, F> {
+    pub fn query<'a>(&'a self, p: &'a Params<F>) -> At<'a, F> {
         At { p, of: self.of, rows: self.rows(), t: self.t }
     }
 }
@@ -250,7 +250,7 @@ impl<F: Real> Layer<F> {
     /// of these.
     pub fn at(&self, cache: &Cache, tape: &mut LayerTape<F>) {
         let mut own = std::mem::take(&mut tape.tape);
-        self.motion.at(&tape.question(&self.params), cache, &mut own);
+        self.motion.at(&tape.query(&self.params), cache, &mut own);
         tape.tape = own;
         self.fade(tape);
         self.cross_fade(tape);
@@ -288,7 +288,7 @@ impl<F: Real> Layer<F> {
 
     /// The splats that the last [`at`](Self::at) left in `tape`.
     pub fn part<'a>(&'a self, tape: &'a LayerTape<F>) -> Part<'a, F> {
-        let color = self.motion.color(&tape.question(&self.params), &tape.tape);
+        let color = self.motion.color(&tape.query(&self.params), &tape.tape);
         let layer_from_world = if tape.of == Space::Gaussians { self.frame.directions() } else { None };
         Part { out: tape.out(), color, layer_from_world }
     }
@@ -334,16 +334,16 @@ impl<F: Real> Layer<F> {
             unfaded = SplatGrads { out: &d_fade, ..*d_out };
             &unfaded
         };
-        let question = tape.question(&self.params);
+        let query = tape.query(&self.params);
         if tape.life.width() == 0 {
-            d_time += self.motion.backward(&question, cache, &mut own, d_out, d_cache, d);
+            d_time += self.motion.backward(&query, cache, &mut own, d_out, d_cache, d);
         } else {
             // o_eff = o·σ: the motion gets dL/do = σ·dL/do_eff, the lifespan dL/dσ = o·dL/do_eff.
             envelope::to_motion(d_out.out, &tape.life, &mut d_motion);
             let [d_life] = d.of([LIFE]);
-            d_time += envelope::backward(question.rows, d_out.out, &tape.life, d_life);
+            d_time += envelope::backward(query.rows, d_out.out, &tape.life, d_life);
             let scaled = SplatGrads { out: &d_motion, ..*d_out };
-            d_time += self.motion.backward(&question, cache, &mut own, &scaled, d_cache, d);
+            d_time += self.motion.backward(&query, cache, &mut own, &scaled, d_cache, d);
         }
         tape.tape = own;
         tape.d_out = d_motion;
@@ -458,7 +458,7 @@ impl<F: Real> Scene<F> {
     pub fn at(&self, t: Time, evaluation: &mut Evaluation<F>) {
         evaluation.begin();
         for (index, layer) in self.layers.iter().enumerate() {
-            evaluation.ask_active(index, layer, t);
+            evaluation.request_active(index, layer, t);
         }
         evaluation.evaluate(&self.layers);
     }

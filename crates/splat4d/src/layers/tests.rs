@@ -196,7 +196,7 @@ fn infinite_life_equals_still_without_one() {
     let a = layer(&Spec::Still, LifeKind::Infinite, 10, 2);
     let (mut tape, mut ids) = (LayerTape::default(), Vec::new());
     assert!(a.active(Time(5.0), &mut ids));
-    tape.ask_active(&a, Time(5.0));
+    tape.request_active(&a, Time(5.0));
     a.at(&Cache::default(), &mut tape);
     let base = crate::motion::still::activate(a.params[GEOMETRY].read::<11>(3, 0));
     assert_eq!(tape.out().read::<10>(3, 0), base);

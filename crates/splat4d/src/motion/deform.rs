@@ -253,7 +253,7 @@ impl Deform {
     fn unit_time(&self, t: Time) -> (f64, f64) {
         let [from, to] = self.spec.clip;
         let length = to - from;
-        // A NaN becomes 0 here; nothing else of the model knows the time.
+        // A NaN becomes 0 here; nothing else of the model depends on time.
         if length > 0.0 && t.0 > from {
             if t.0 >= to { (1.0, 0.0) } else { ((t.0 - from) / length, 1.0 / length) }
         } else {
@@ -325,7 +325,7 @@ impl Deform {
     }
 
     /// The VJP of [`ask`](Self::request) from `own.d_heads`; returns dL/dt.
-    fn ask_backward<F: Real>(&self, q: &At<'_, F>, own: &mut Own<F>, d: &mut Grads<F>) -> f64 {
+    fn request_backward<F: Real>(&self, q: &At<'_, F>, own: &mut Own<F>, d: &mut Grads<F>) -> f64 {
         let slope = self.unit_time(q.t).1;
         let Own { x, shifts, kept, d_heads, .. } = &*own;
         match &self.eyes {
@@ -358,7 +358,7 @@ impl Deform {
                 own.d_points.resize(own.points.len(), F::ZERO);
                 let mut first = 0;
                 for (i, grid) in grids.iter().enumerate() {
-                    // The grid over space does not know the time, and x̂ is detached.
+                    // The grid over space does not depend on time, and x̂ is detached.
                     let d_points = (i > 0 && slope != 0.0).then_some(own.d_points.as_mut_slice());
                     grid.backward(q.p, &own.points, (&own.d_x, first, inputs), d_points, d);
                     first += grid.shape().outputs();
@@ -443,6 +443,6 @@ impl<F: Real> Motion<F> for Deform {
         let _ = scatter(&Spread(&own.d_rows), d.of([GEOMETRY]), q.rows);
         own.d_heads.resize(n * width, F::ZERO);
         Gather { d_rows: &own.d_rows, width }.run(&mut own.d_heads);
-        self.ask_backward(q, own, d)
+        self.request_backward(q, own, d)
     }
 }

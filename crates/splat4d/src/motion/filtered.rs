@@ -191,7 +191,7 @@ impl<F: Real> Filtered<F> {
     }
 
     /// Queries to the model inside in a step; one query a time, for all rows where queries differ in theirs.
-    fn questions<'a>(&self, q: &[At<'a, F>]) -> Vec<At<'a, F>> {
+    fn queries<'a>(&self, q: &[At<'a, F>]) -> Vec<At<'a, F>> {
         let mut all: Vec<At<'a, F>> = Vec::with_capacity(3 * q.len());
         let mut add = |new: At<'a, F>| match all.iter_mut().find(|old| old.of == new.of && old.t == new.t) {
             Some(old) => {
@@ -314,7 +314,7 @@ impl<F: Real> Motion<F> for Filtered<F> {
         if self.spec.fusion == Fusion::Off {
             return self.inner.prepare(p, q, cache);
         }
-        self.inner.prepare(p, &self.questions(q), &mut cache.get_or_default::<Shared>().inner);
+        self.inner.prepare(p, &self.queries(q), &mut cache.get_or_default::<Shared>().inner);
     }
 
     fn at(&self, q: &At<'_, F>, cache: &Cache, tape: &mut Tape<F>) {
@@ -445,7 +445,7 @@ impl<F: Real> Motion<F> for Filtered<F> {
         }
         let cache = &mut cache.get_or_default::<Shared>().inner;
         let d_cache = &mut d_cache.get_or_default::<Shared>().inner;
-        self.inner.finish(p, &self.questions(q), cache, d_cache, d);
+        self.inner.finish(p, &self.queries(q), cache, d_cache, d);
     }
 
     fn on_edit(&self, p: &mut Params<F>, edit: &RowEdit, rng: &Rng) {

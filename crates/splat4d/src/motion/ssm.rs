@@ -373,7 +373,7 @@ impl<F: Real> Trajectory<F> for Field {
         for (block, (grads, d_own)) in found.iter().enumerate() {
             sum.add(grads);
             for row in block * LANES..rows.min((block + 1) * LANES) {
-                // The embedding comes first of what a node sees; no gradient goes to the rest.
+                // The embedding is first among a node's inputs; the rest has no gradient.
                 (0..d_embeddings.width()).for_each(|k| *d_embeddings.get_mut(row, k) += d_own[k][row % LANES]);
             }
         }

@@ -39,7 +39,7 @@ pub(crate) fn local_frames(points: &[[f64; 3]]) -> Vec<Frame> {
     let whole = Axes::new(&all, &vec![1.0; all.len()]).complete(&WORLD);
     let mut frames = vec![WORLD; points.len()];
     let mut done = vec![false; points.len()];
-    // Roots in the order of how well they know their axes; the index decides ties.
+    // Roots in the order of how well-defined their axes are; the index decides ties.
     let mut roots: Vec<usize> = (0..points.len()).collect();
     roots.sort_by(|&a, &b| own[b].certainty().total_cmp(&own[a].certainty()).then(a.cmp(&b)));
     let around = symmetric(&near, points.len());
@@ -251,7 +251,7 @@ mod tests {
                 assert!(pose.orthogonality_error() < 1e-9, "{f:?}");
             }
         }
-        // A lattice: every inner point sees the same in all directions. Its frame comes from its neighbours.
+        // A lattice: every inner point has a symmetric neighbourhood. Its frame is that of its neighbours.
         let lattice: Vec<[f64; 3]> =
             (0..125).map(|i| [f64::from(i % 5), f64::from(i / 5 % 5), f64::from(i / 25)]).collect();
         assert!(local_frames(&lattice).iter().flatten().flatten().all(|x| x.is_finite()));

@@ -84,7 +84,7 @@ fn a_player_shows_exactly_what_the_scene_holds() {
 fn a_layer_with_infinite_lifespans_is_shown_whole() {
     let mut params = crate::scene::Params::new(3, 1, &[]);
     let motion = crate::motion::build(&crate::motion::Spec::Still, &mut params).unwrap();
-    // A model may raise an opacity that is next to nothing as it is learnt: the lookup must not judge by it.
+    // A model may raise an opacity whose raw value is nearly zero: the lookup must not judge by it.
     params[crate::scene::GEOMETRY].set(1, crate::scene::params::OPACITY, -20.0);
     let life = crate::scene::LifeKind::Infinite;
     for span in [ALWAYS, [0.5, 2.0]] {

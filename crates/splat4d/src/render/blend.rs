@@ -292,7 +292,7 @@ impl<F: Real, const N: usize> Visit<F> for Forward<'_, F, N> {
         let (tx, ty) = (t % SIDE, t / SIDE);
         let range = strip_range::<N>(r.tile_rows(tx, ty));
         let mut e = Exponent::<F, N>::new::<FMA>(r, tx, ty, range.start, &self.limits);
-        // Copies, of which LLVM knows that no store changes them.
+        // Copies, so that LLVM can assume that no store changes them.
         let ([red, green, blue], limits) = (r.channels, self.limits);
         let Tile { t, color } = &mut self.tiles[t];
         let [reds, greens, blues] = color.each_mut().map(|plane| strips::<F, N>(plane, range.clone()));
@@ -544,7 +544,7 @@ impl<F: Real, const N: usize, const WITH_ABS: bool> Visit<F> for Returning<'_, F
         let (tx, ty, limits) = (t % SIDE, t / SIDE, self.limits);
         let range = strip_range::<N>(r.tile_rows(tx, ty));
         let mut e = Exponent::<F, N>::new::<FMA>(r, tx, ty, range.start, &limits);
-        // Copies, of which LLVM knows that no store changes them.
+        // Copies, so that LLVM can assume that no store changes them.
         let (channels, [a, b, c], alpha_max) = (r.channels, [r.a, r.b, r.c], self.alpha_max);
         let (mut dy, dx) = (e.dy, offsets::<F, N>(r, tx));
         // In two loops: the second waits for T from splat to splat, and while it does the first, which waits for

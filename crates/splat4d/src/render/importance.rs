@@ -369,7 +369,7 @@ impl<F: Real, S: Score<F, NUMBERS>, const NUMBERS: usize> Walk<'_, F, S, NUMBERS
     fn walk<const FMA: bool, const N: usize>(self) {
         let mut tiles = [Tile::default(); TILES];
         let open = begin(&mut tiles, self.inside);
-        // From here on a tile's colour is the light that is still to come.
+        // From here on a tile's colour is the remaining light.
         for (tile, drawn) in tiles.iter_mut().zip(self.tiles).filter(|_| S::COLORS) {
             for (c, rest) in tile.color.iter_mut().enumerate() {
                 for (rest, (light, t)) in rest.iter_mut().zip(drawn.color[c].iter().zip(&drawn.t)) {

@@ -663,7 +663,7 @@ fn sensitivities_are_sums_of_squared_differences() {
     let view = camera(45, 31);
     // Colours that do not depend on the direction, and no thresholds.
     let config = smooth();
-    // A bare bell's tail counts as its middle does, as far as it is rendered.
+    // A bare bell's tail counts like its middle, where it is rendered.
     let cut = complete();
     let plain = |s: &Scene<f64>, config: &RenderConfig| {
         oracle::render(&Shot { sh_degree: 0, ..Shot::new(&s.splats(), &view, BACKGROUND) }, config).color.data

@@ -89,7 +89,7 @@ impl Subject {
         self.request(of, rows, t).1.out
     }
 
-    fn questions<'a>(&'a self, spaces: &[Space], rows: &'a [u32], times: &[f64]) -> Vec<At<'a, f64>> {
+    fn queries<'a>(&'a self, spaces: &[Space], rows: &'a [u32], times: &[f64]) -> Vec<At<'a, f64>> {
         let mut out = Vec::new();
         for &of in spaces {
             for (k, &t) in times.iter().enumerate() {
@@ -102,7 +102,7 @@ impl Subject {
 
     /// Σ weights · results over all queries of a step.
     fn value(&self, spaces: &[Space], rows: &[u32], times: &[f64], w: &Weights) -> f64 {
-        let q = self.questions(spaces, rows, times);
+        let q = self.queries(spaces, rows, times);
         let mut cache = Cache::default();
         self.motion.prepare(&self.p, &q, &mut cache);
         let mut sum = 0.0;
@@ -122,7 +122,7 @@ impl Subject {
 
     /// The gradient of [`value`](Self::value), and to every query's time.
     fn gradient(&self, spaces: &[Space], rows: &[u32], times: &[f64], w: &Weights) -> (Grads<f64>, Vec<f64>) {
-        let q = self.questions(spaces, rows, times);
+        let q = self.queries(spaces, rows, times);
         let (mut cache, mut d_cache) = (Cache::default(), Cache::default());
         let mut d = Grads::new(&self.p);
         self.motion.prepare(&self.p, &q, &mut cache);
@@ -340,7 +340,7 @@ pub(crate) fn starts_still(spec: &Spec, rows: usize) {
     let rest = Subject { p: still, motion: Arc::new(Still) };
     for t in TIMES {
         let (a, b) = (s.splats(Space::Gaussians, Rows::All, t), rest.splats(Space::Gaussians, Rows::All, t));
-        // Numbers past the last row mean nothing, so that blocks are not compared as they are.
+        // Numbers past the last row are undefined, so blocks are not compared directly.
         for (row, col) in (0..rows).flat_map(|row| (0..10).map(move |col| (row, col))) {
             let (a, b) = (a.get(row, col), b.get(row, col));
             assert!((a - b).abs() < 1e-9, "row {row} at {t}: {a}, the canonical cloud has {b}");

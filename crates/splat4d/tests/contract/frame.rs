@@ -59,7 +59,7 @@ fn worst<F: Real>(a: &[F], b: &[F]) -> f64 {
 fn ask<F: Real>(layer: &Layer<F>, t: f64) -> (Cache, LayerTape<F>) {
     let (mut cache, mut tape) = (Cache::default(), LayerTape::default());
     tape.request(Space::Gaussians, Rows::All, Time(t));
-    layer.motion.prepare(&layer.params, &[tape.question(&layer.params)], &mut cache);
+    layer.motion.prepare(&layer.params, &[tape.query(&layer.params)], &mut cache);
     layer.at(&cache, &mut tape);
     (cache, tape)
 }
@@ -140,7 +140,7 @@ fn gradient(mut layer: Layer<f64>, frozen: &[&str]) {
         let d_out = weights(tape.out());
         let d_out = SplatGrads { out: &d_out, color: None, weights: None };
         layer.backward(&cache, &mut tape, &d_out, &mut d_cache, &mut d);
-        layer.motion.finish(&layer.params, &[tape.question(&layer.params)], &mut cache, &mut d_cache, &mut d);
+        layer.motion.finish(&layer.params, &[tape.query(&layer.params)], &mut cache, &mut d_cache, &mut d);
     }
     let mut slope = 0.0;
     let keys: Vec<_> = layer.params.keys().filter(|&k| layer.params.info(k).trainable && k != SH).collect();

@@ -124,7 +124,7 @@ pub(super) fn plain(params: &Params) -> Result<(File<'static>, Warnings)> {
 /// that have accessors without bytes. Errors: there are none.
 pub(super) fn compressed(params: &Params) -> Result<(File<'static>, Warnings)> {
     let mut bytes = Vec::new();
-    // Version 2 names no axes: those of .ply draw no remark.
+    // Version 2 names no axes: those of .ply cause no remark.
     let warnings = spz::write(params, SPZ_VERSION, Y_DOWN, &mut bytes)?;
     let (decoded, ..) = spz::read(&bytes)?;
     let mut mesh = Mesh { count: decoded.len(), ..Mesh::default() };

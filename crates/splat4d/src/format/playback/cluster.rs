@@ -234,7 +234,7 @@ impl Set<'_> {
         let find = |&id: &u32| {
             let x = self.point(id);
             let score = |c: usize| dot(x, &coarse.centroids[c * self.stride..(c + 1) * self.stride]) - half_coarse[c];
-            // The best few so far, best first; of equals the first stays before the later one.
+            // The best few, best first; of equals the first stays before the later one.
             let mut near = [(f32::NEG_INFINITY, usize::MAX); NEAREST];
             for c in 0..count {
                 let score = score(c);

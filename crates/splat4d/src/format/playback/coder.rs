@@ -92,7 +92,7 @@ impl Kernel for Encode<'_> {
     }
 }
 
-/// Rows there and back.
+/// Rows encoded and decoded.
 struct Show<'a, 'b> {
     source: Rows<'a>,
     depths: &'a Depths,

@@ -384,7 +384,7 @@ impl Header {
             return Err(foreign());
         }
         let [major, minor] = [8, 10].map(|at| u16::from_le_bytes([bytes[at], bytes[at + 1]]));
-        // Asked first: a newer format may have another header behind these bytes.
+        // Checked first: a newer format may have another header behind these bytes.
         if major != VERSION[0] && major != GROWING[0] {
             return Err(Error::new(
                 ErrorKind::Unsupported,

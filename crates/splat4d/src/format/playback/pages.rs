@@ -105,7 +105,7 @@ pub fn write_pages(draft: &PagesDraft<'_>, config: &WriteConfig, out: &mut dyn W
     let start = meta.clip[0];
     let mut file = Sections::new(meta, draft.poster, config.deflate_level)?;
     let pages: Vec<usize> = (0..n).filter(|&i| !draft.layers[i].params.is_empty()).collect();
-    // As `write` has it: before the palette come the important Gaussians of the clip's start, in their base colours.
+    // As in `write`: before the palette come the important Gaussians of the clip's start, in their base colours.
     let first =
         |i: &&usize| draft.tiers[**i] == 0 && draft.layers[**i].span[0] <= start && start < draft.layers[**i].span[1];
     let before = pages.iter().take_while(first).count();

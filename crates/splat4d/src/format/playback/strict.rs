@@ -53,7 +53,7 @@ fn of_header(bytes: &[u8], index: &Index, out: &mut Vec<String>) {
     }
     let least = index.least_version();
     if !grows && minor > VERSION[1] {
-        out.push(format!("the minor version is {minor}, this splat4d knows {}", VERSION[1]));
+        out.push(format!("the minor version is {minor}, this splat4d supports {}", VERSION[1]));
     } else if !grows && minor > least[1] {
         let [a, b] = least;
         out.push(format!("the version is {major}.{minor}, and nothing in the file needs more than {a}.{b}"));

@@ -32,7 +32,7 @@ impl<'a> Rows<'a> {
     /// The numbers of property `property` in rows `first..`, rounded to f32.
     #[inline]
     pub(super) fn read(&self, property: usize, first: usize, out: &mut [f32]) {
-        assert!(first + out.len() <= self.count, "rows past the end of an element were asked for");
+        assert!(first + out.len() <= self.count, "rows past the end of an element were requested");
         match &self.body {
             Body::Binary { bytes, stride, big, fields } => {
                 let (scalar, offset) = fields[property];

@@ -157,7 +157,7 @@ fn rgb_colours_are_base_colours() {
         let info = opened.ply.unwrap();
         assert!(info.rgb && info.extra_properties.is_empty() && opened.warnings.lines()[0].contains("RGB"));
     }
-    // Coefficients go first, and a cloud of points stays one.
+    // Coefficients have priority, and a point cloud stays one.
     let colors = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "red", "green", "blue"].map(|n| ("float", n));
     let both = [&colors[..], &SHAPE];
     let (p, info) = read(&text(&both.concat(), &["1 2 3 0.1 0.2 0.3 9 9 9 0.5 -4 -5 -6 1 0 0 0"])).unwrap();
@@ -288,7 +288,7 @@ fn positions_of_a_map_keep_their_digits() {
     let apart = apart.map(|(row, k)| (place(&far.scene, row)[k] - place(&scene, row)[k]).abs()).fold(0.0, f64::max);
     assert!(apart < 1e-6 && far.scene.offset != [0.0; 3], "{apart}");
     assert!(far.warnings.lines().is_empty(), "{:?}", far.warnings);
-    // Other formats have no room for such numbers.
+    // Other formats cannot store such numbers.
     let options = WriteOptions { world: true, ..WriteOptions::default() };
     let refused = crate::format::splat::DIALECT.write(&scene, &options, &mut Vec::new()).unwrap_err();
     assert!(refused.to_string().contains("double precision"), "{refused}");

@@ -77,7 +77,7 @@ fn is_archive(bytes: &[u8]) -> bool {
 fn read_archive(bytes: &[u8]) -> Result<Opened> {
     let archive = zip::Archive::open(bytes)?;
     let name = archive.first().ok_or_else(|| damaged("the archive is empty"))?.to_owned();
-    // An archive of USD stores its files as they are.
+    // An archive of USD stores its files uncompressed.
     let most = archive.packed(&name).unwrap_or(0);
     let layer = archive.file(&name, most).expect("it is one of the names")?;
     if layer.starts_with(BINARY) {

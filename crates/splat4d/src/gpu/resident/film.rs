@@ -38,7 +38,7 @@ impl GpuRenderer {
         let film = Film { alpha_min, background, frames };
         self.keep(layers, None, &[[1.0; 2]])?;
         loop {
-            // Once to make room, and once for the clock.
+            // Once as a warm-up, and once for the measurement.
             for measured in [false, true] {
                 let seconds = self.with_tables(|renderer, tables| renderer.show(tables, &film))?;
                 let [_, _, _, stop, wanted] = self.counts()?;
@@ -72,7 +72,7 @@ impl GpuRenderer {
             if fresh || self.groups.is_none() {
                 self.groups = Some(Groups::new(&self.gpu, &self.kernels, &self.buffers));
             }
-            tables.write_asks(&self.gpu, *t, film.alpha_min);
+            tables.write_queries(&self.gpu, *t, film.alpha_min);
             let shot = Shot::new(&nothing, camera, film.background);
             self.write_uniforms(&shot, band, across, Way { view: VIEW, ..Way::default() })?;
             let mut recorder = Recorder::new(&self.gpu, &self.queries, StageClock::Off);
@@ -98,7 +98,7 @@ impl GpuRenderer {
 
 impl Tables {
     /// Writes the queries at a time, without rules of learning.
-    fn write_asks(&self, gpu: &crate::gpu::Gpu, t: Time, alpha_min: f64) {
+    fn write_queries(&self, gpu: &crate::gpu::Gpu, t: Time, alpha_min: f64) {
         let mut out = vec![0u8; self.pages.len() * at::ALL * UNIFORM_STRIDE as usize];
         let mut first_splat = 0;
         for (i, page) in self.pages.iter().enumerate() {

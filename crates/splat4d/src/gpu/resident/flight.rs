@@ -308,13 +308,13 @@ impl GpuRenderer {
                     self.flights.done.push(stepped);
                     return Ok(());
                 }
-                view => self.begin_anew(step, view as usize - 1, record.words[1] as usize)?,
+                view => self.begin_again(step, view as usize - 1, record.words[1] as usize)?,
             }
         }
     }
 
     /// Enlarges buffers, then restarts a step from the view with this many pairs, and all later steps.
-    fn begin_anew(&mut self, step: Begun, view: usize, pairs: usize) -> Result<()> {
+    fn begin_again(&mut self, step: Begun, view: usize, pairs: usize) -> Result<()> {
         let mut steps = vec![step];
         self.gpu.wait()?;
         while let Some(Flight { step, record, .. }) = self.flights.under_way.pop_front() {
@@ -395,4 +395,4 @@ impl GpuRenderer {
     }
 }
 
-const _: () = assert!(RESPONSES == 12, "record.wgsl has so many columns a camera");
+const _: () = assert!(RESPONSES == 12, "record.wgsl has this many columns per camera");

@@ -59,9 +59,9 @@ fn slices_equal_the_model_forward_and_backward() {
     let spec = Native4dSpec { speed: 2.0, min_life: 0.05, max_life: 3.0, ..Native4dSpec::default() };
     let ((single, own, _), (double, _, motion), t) = (params::<f32>(&spec), params::<f64>(&spec), 0.125);
     // The result and its gradients, in f64.
-    let question = At { p: &double, of: Space::Gaussians, rows: Rows::All, t: Time(t) };
+    let query = At { p: &double, of: Space::Gaussians, rows: Rows::All, t: Time(t) };
     let (mut tape, mut d) = (Tape::default(), Grads::new(&double));
-    motion.at(&question, &Cache::default(), &mut tape);
+    motion.at(&query, &Cache::default(), &mut tape);
     let mut pulled = Table::<f64>::new(&crate::scene::splats::SPLAT_COLUMNS, ROWS);
     let mut back = Vec::new();
     for row in 0..ROWS {
@@ -73,7 +73,7 @@ fn slices_equal_the_model_forward_and_backward() {
     }
     d.activate(Space::Gaussians, Rows::All);
     let d_out = SplatGrads { out: &pulled, color: None, weights: None };
-    motion.backward(&question, &Cache::default(), &mut tape, &d_out, &mut Cache::default(), &mut d);
+    motion.backward(&query, &Cache::default(), &mut tape, &d_out, &mut Cache::default(), &mut d);
     // The same by the kernels: the first of two views, after which nothing learns.
     let moves = moves(motion.as_ref());
     let table = |key: Key| ResidentTable { width: single[key].width(), params: single[key].data(), moments: &[] };
@@ -242,7 +242,7 @@ fn steps_in_flight_buffer_sizes_bands_and_pages_change_no_bit() {
     let [first, then, last] = far_and_near();
     let steps: Vec<(&[Camera], f64)> =
         [&first, &first, &then, &first, &last, &then, &first].iter().map(|c| (&c[..], 0.01)).collect();
-    // One after the other, with all the room they need.
+    // One after the other, with buffers as large as needed.
     r.ahead = 0;
     stepped(&mut r, &steps);
     let (again, pairs) = (r.flights.again, r.pair_capacity());

@@ -140,7 +140,7 @@ fn value_and_gradient_equal_the_definition_and_the_cpu() {
             let what = format!("camera {i}, {weighted}, {response:?}, {eight}");
             let (got, d, d_sh) = compared(&mut r, &shot, &target);
             let d_picture: Vec<f32> = read(&r.gpu, &r.buffers.d_planes, 3 * truth.pixels());
-            // The same through the CPU: the image comes down, its gradient goes up.
+            // The same through the CPU: the image is downloaded, its gradient uploaded.
             let mut image = Image::default();
             r.render(&shot, &mut image).expect("it is drawn");
             let (expected, d_expected) = defined(&image.color, &target);
@@ -184,7 +184,7 @@ fn comparison_repeats_bit_for_bit_at_any_budget_and_images_are_uploaded_once() {
     };
     let first = bits(compared(&mut r, &shot, &target(0)));
     assert!(first == bits(compared(&mut r, &shot, &target(0))) && r.pictures.sent == 1, "the same, sent once");
-    // Little room at first, which must overflow.
+    // Small buffers at first, which must overflow.
     (r.buffers, r.groups) = (Buffers::new(), None);
     r.make_room_for_pairs(1000).expect("a little room");
     assert!(first == bits(compared(&mut r, &shot, &target(0))), "room changes no bit");

@@ -168,7 +168,7 @@ fn bands_make_the_same_image() {
     r.render(&shot(&scene.splats(), &camera), &mut whole).expect("it is drawn");
     let (pairs, one) = (r.stats().pairs, r.stats().bands);
     assert!(one == 1 && pairs > 1 << 16, "{pairs} pairs must be more than there was room for at first");
-    // A renderer without memory yet, so that there is little room.
+    // A renderer without memory yet, so that its buffers are small.
     let Some(mut r) = own_renderer() else { return };
     r.most_pairs = pairs / 4;
     r.render(&shot(&scene.splats(), &camera), &mut bands).expect("it is drawn");

@@ -81,7 +81,7 @@ fn active_rows_are_merged_with_requested_rows() {
     assert!(!layer.active(t, &mut alive) && !alive.is_empty() && alive.len() < ROWS);
     let dead = (0..ROWS as u32).find(|id| !alive.contains(id)).unwrap();
     let mut e = Evaluation::default();
-    e.ask_active(0, layer, t);
+    e.request_active(0, layer, t);
     assert_eq!(ids(e.tape(0).rows()), Some(alive.clone()));
     let mut both = alive;
     both.push(dead);
@@ -93,7 +93,7 @@ fn active_rows_are_merged_with_requested_rows() {
         if asks_first {
             ask(&mut e);
         }
-        assert_eq!(e.ask_active(0, layer, t), 0);
+        assert_eq!(e.request_active(0, layer, t), 0);
         if !asks_first {
             ask(&mut e);
         }
@@ -153,7 +153,7 @@ fn gradients(layers: &[Layer<f64>]) -> (Vec<Grads<f64>>, Vec<f64>) {
         }
     }
     e.backward(layers, &mut d);
-    let times = e.questions.iter().map(|q| q.d_time).collect();
+    let times = e.queries.iter().map(|q| q.d_time).collect();
     (d, times)
 }
 
@@ -173,15 +173,15 @@ fn the_backward_pass_equals_the_motion_model_bit_for_bit() {
             tape.request(Space::Gaussians, ASKED[i].1.map_or(Rows::All, Rows::Some), Time(ASKED[i].2));
         }
         let (mut cache, mut d_cache, mut d) = (Cache::default(), Cache::default(), Grads::new(&layer.params));
-        let questions: Vec<At<'_, f64>> = tapes.iter().map(|t| t.question(&layer.params)).collect();
-        layer.motion.prepare(&layer.params, &questions, &mut cache);
+        let queries: Vec<At<'_, f64>> = tapes.iter().map(|t| t.query(&layer.params)).collect();
+        layer.motion.prepare(&layer.params, &queries, &mut cache);
         for (tape, &i) in tapes.iter_mut().zip(&mine) {
             layer.at(&cache, tape);
             let d_out = SplatGrads { out: &d_outs[i], color: None, weights: None };
             assert_eq!(got_times[i], layer.backward(&cache, tape, &d_out, &mut d_cache, &mut d));
         }
-        let questions: Vec<At<'_, f64>> = tapes.iter().map(|t| t.question(&layer.params)).collect();
-        layer.motion.finish(&layer.params, &questions, &mut cache, &mut d_cache, &mut d);
+        let queries: Vec<At<'_, f64>> = tapes.iter().map(|t| t.query(&layer.params)).collect();
+        layer.motion.finish(&layer.params, &queries, &mut cache, &mut d_cache, &mut d);
         assert_eq!(bits(&got[index], &layer.params), bits(&d, &layer.params), "layer {index}");
     }
 }

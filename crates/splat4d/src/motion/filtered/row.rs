@@ -228,7 +228,7 @@ impl Fused {
                 let k = mul(&predicted.cov, &precision);
                 let step = apply(&predicted.cov, weighed);
                 let mean = std::array::from_fn(|i| predicted.mean[i] + step[i]);
-                // (I − K)Σₚ = Σₚ − Σₚ S⁻¹ Σₚ is symmetric by itself.
+                // (I − K)Σₚ = Σₚ − Σₚ S⁻¹ Σₚ is already symmetric.
                 let cov = mix(1.0, &predicted.cov, -1.0, &sandwich(&predicted.cov, &precision));
                 let state = Normal { mean, cov };
                 out.point = Normal {

@@ -60,7 +60,7 @@ fn kalman_halves_the_variance_of_agreeing_values_and_keeps_certain_ones() {
     let merged = Fused::new(Fusion::Literal, &seen, &predicted, 0.3, 1.0, 0.0).point;
     assert!((merged.mean[0] - 0.5).abs() < 1e-9);
     assert_near(&merged.cov, &ball([0.0; 3], 0.2 * 0.5f64.sqrt()).cov, 1e-9);
-    // The sign that goes wrong elsewhere, Σ + KΣ, would leave more doubt than there was.
+    // The sign that is wrong elsewhere, Σ + KΣ, would leave more doubt than there was.
     let wrong = mix(1.5, &predicted.cov, 0.0, &predicted.cov);
     assert!(merged.cov[0][0] < predicted.cov[0][0] && wrong[0][0] > predicted.cov[0][0]);
     let vague = ball([9.0, 0.0, 0.0], 1e4);
@@ -237,7 +237,7 @@ fn noise_around_a_steady_path_is_calmed_and_an_onset_is_not_lagged() {
     let short = followed(seen, |s| s.gain = 5.0 / 6.0);
     assert!(rmse(&short, &truth) < 0.98 * raw, "{} of {raw}", rmse(&short, &truth));
 
-    // At rest, then gone at once by many times its size a frame.
+    // At rest, then a sudden motion of many times its size per frame.
     let onset: Vec<[f64; 3]> = (0..40).map(|i| [if i < 20 { 0.0 } else { 9.0 * (i - 19) as f64 }, 0.0, 0.0]).collect();
     let reset = followed(onset.clone(), |s| (s.history, s.gain) = (8, 0.2));
     assert!((0..40).all(|i| reset[i] == onset[i] || (reset[i][0] - onset[i][0]).abs() < 1e-9), "{reset:?}");

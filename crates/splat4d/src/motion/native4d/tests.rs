@@ -352,7 +352,7 @@ fn colours_in_time_have_their_period_are_even_and_join_the_table() {
     let (a, b) = (weights(&l, mean + 0.13), weights(&l, mean - 0.13 + spec.period));
     assert!((0..3).all(|c| (a.get(3, c) - b.get(3, c)).abs() < 1e-12) && a.get(3, 0) == 1.0);
     assert!((a.get(3, 1) - (TAU / 0.8 * 0.13).cos()).abs() < 1e-12);
-    // A file's wide table is claimed as it is; one of no whole number of blocks is refused.
+    // A file's wide table is claimed unchanged; one of no whole number of blocks is refused.
     l.params[SH].set(2, 8, 0.5);
     let table = l.params[SH].clone();
     widen(&mut l.params, 3).unwrap();

@@ -124,7 +124,7 @@ fn results_are_equivariant_to_fifty_motions_of_the_scene() {
 
 #[test]
 fn non_equivariant_networks_are_detected() {
-    // The same test must fail for a network that knows where nodes are, and for frames where the scene is mirrored.
+    // The same test must fail for a network with positions as inputs, and for frames where the scene is mirrored.
     for (e, mirrors) in [(Equivariance::None, false), (Equivariance::None, true), (Equivariance::Frames, true)] {
         let spec = small(e, Output::Absolute, Mode::Bidirectional);
         let rest = at_rest(&spec);

@@ -182,8 +182,8 @@ fn the_gradient_equals_differences_everywhere() {
 
 #[test]
 fn uneven_ticks_sample_the_same_response_to_first_order() {
-    // A smooth input on even ticks, and on ticks moved by up to a third: y at the same moment nearly agrees, and twice
-    // as near with half the step.
+    // A smooth input on even ticks, and on ticks moved by up to a third: y at the same time nearly agrees, and twice as
+    // near with half the step.
     let shape = Shape { channels: 1, states: 4, copies: 1 };
     let w = weights_of(shape, 14);
     let error = |ticks: usize| {
@@ -200,7 +200,7 @@ fn uneven_ticks_sample_the_same_response_to_first_order() {
         let other = Discrete::<f64>::new(shape, &w, &moved);
         let a = scan(&steady, Direction::Forward, &even, &steady.rest()).0;
         let b = scan(&other, Direction::Forward, &uneven, &other.rest()).0;
-        // Every second tick is at the same moment.
+        // Every second tick is at the same time.
         (1..ticks).step_by(2).map(|t| (a[t][0] - b[t][0]).abs()).fold(0.0, f64::max)
     };
     let (coarse, fine) = (error(80), error(160));

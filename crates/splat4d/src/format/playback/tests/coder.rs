@@ -1,4 +1,4 @@
-//! Layers that are pages: there and back, at any depth, and the coder against the file.
+//! Layers that are pages: round trips, at any depth, and the coder against the file.
 
 use super::*;
 use crate::layers::Layer;
@@ -54,7 +54,7 @@ fn the_coder_equals_a_reader_bit_for_bit() {
         Depths { position: 2, center: 2, scale: 2, opacity: 2, rotation: 2, shift: 2, turn: 2, color: 2, life: 2 };
     for (degree, depths) in [(0, Depths::default()), (1, coarse()), (3, Depths::default()), (2, least)] {
         let mut pages = trained(2300, degree, 20 + degree as u64);
-        // Numbers at the edge of what there is.
+        // Numbers at the edge of the range.
         let p = &mut pages.layers[0].params;
         p[GEOMETRY].write(0, QUAT, [0.0; 4]);
         p[GEOMETRY].write(1, LOG_SCALE, [-300.0, 60.0, 0.0]);
@@ -193,7 +193,7 @@ fn coarse_codes_leave_their_low_bits_alone() {
         assert!(page.words.iter().all(|w| [0, 255].contains(&(w[6] >> 24)) || (w[6] >> 24) % 8 == 1));
         assert!(page.words.iter().any(|w| w[6] >> 24 == 255));
     }
-    // Synthetic numbers are noise: what is saved is what the low bits would have cost.
+    // Synthetic numbers are noise: the saving is the cost of the low bits.
     let stored = |file: &[u8]| -> u32 { Index::parse(file, None).unwrap().pages().map(|(_, e)| e.stored).sum() };
     let (few, all) = (stored(&file), stored(&written(&pages, Depths::default())));
     assert!(100 * few < 80 * all, "{few} bytes instead of {all}");

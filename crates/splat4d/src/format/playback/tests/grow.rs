@@ -39,10 +39,10 @@ fn a_growing_file_plays_and_readers_of_an_older_header_are_not_disturbed() {
     assert_eq!([&first, &second].map(|b| shown(b, 0.7).len()), [0, 1]);
     assert_eq!((shown(&first, 0.2).len(), shown(&first, 0.2)), (1, shown(&second, 0.2)));
     assert_eq!(second[64..first.len()], first[64..], "nothing but the header is written again");
-    // The first header, and all that has come since.
+    // The first header, and all later content.
     let stale = [&first[..64], &second[64..]].concat();
     assert_eq!(read(&stale).unwrap().clip, [0.0, 0.5]);
-    // By its start alone it is known where the index lies.
+    // Its start alone gives the index's position.
     let place = Index::place(&second[..64]).unwrap();
     let index = Index::of(&second[..64], &second[place.start as usize..place.end as usize]).unwrap();
     assert_eq!((index.meta.parts.clone(), index.meta.gaussians), (vec!["0".into(), "1".into()], 1800 - 2 * 450));

@@ -82,7 +82,7 @@ fn mutants_are_read_or_refused() {
 
 #[test]
 fn bytes_of_headers_and_tables_are_each_tried() {
-    // A small file whose every byte before the bodies takes nasty values, checksums mended.
+    // A small file whose every byte before the bodies takes nasty values, checksums corrected.
     let (sample, _) = bytes_of(&tiny(), &WriteConfig::default());
     let end = Index::needed(&sample).unwrap();
     for at in 8..end {
