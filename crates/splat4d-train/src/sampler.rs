@@ -94,7 +94,7 @@ impl Timeline {
         let step_rng = rng.fork(step as u64 + 1);
         let (times, n) = (self.frames.len(), self.count);
         let flat = |i: usize| {
-            // The i-th draw without replacement: which epoch, and where in its permutation.
+            // The i-th sample without replacement: which epoch, and where in its permutation.
             self.shuffled(seed, (stage * 1_000_003 + i / n) as u64, n, i % n)
         };
         let any_of = |group: &[u32], draw: u64| group[step_rng.below(draw, group.len())] as usize;

@@ -20,8 +20,8 @@ const CAMERAS: usize = 5;
 const FRAMES: usize = 6;
 /// Decibels that rounding may make.
 const ROUNDING: f64 = 0.01;
-/// Decibels that are lost at least where a model is asked for what it did not learn: its motion goes the wrong way, and
-/// what it renders of it in 300 steps is little. An image of a world that was not turned loses more.
+/// Decibels that are lost at least where a model is queried for motion that it did not learn: its motion goes the wrong
+/// way, and what it renders of it in 300 steps is little. An image of a world that was not turned loses more.
 const LOST: f64 = 0.25;
 
 /// Where the ball is, in units of the world.

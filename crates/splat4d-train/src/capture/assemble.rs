@@ -139,7 +139,7 @@ const BEFORE_POINTS: f64 = 0.5;
 /// Some distance there must be, of the extent: the projection divides by it.
 const SMALLEST_NEAR: f64 = 1e-3;
 
-/// Of the requested share, where no points indicate how near things come.
+/// Of the requested share, where no points give the nearest distance.
 const UNKNOWN_DEPTH: f64 = 0.25;
 
 /// How near splats are rendered, scene units: this share of the extent, or half way to the nearest of the capture's
@@ -549,7 +549,7 @@ fn check_masks(take: &RawCapture, has_alpha: bool) -> Result<()> {
         match picture::any_foreground(frame.mask.as_deref().unwrap_or(&frame.image), frame.mask.is_none()) {
             Ok(true) => return Ok(()),
             Ok(false) => {}
-            // A broken image has its own error, with more to say, when it is loaded.
+            // A broken image has its own, more detailed error when it is loaded.
             Err(_) if frame.mask.is_none() => return Ok(()),
             Err(e) => return Err(e),
         }
@@ -571,7 +571,7 @@ fn check_mask_shapes(take: &RawCapture) -> Result<()> {
         let header = picture::header(mask)?;
         if ![header.stored, header.upright()].iter().any(|&size| fits(size, &own)) {
             picture::check_not_larger("mask", header.upright(), &own).map_err(|e| e.at(mask.display()))?;
-            picture::check_beside(mask, "mask", header.stored, &own)?;
+            picture::check_companion(mask, "mask", header.stored, &own)?;
         }
     }
     Ok(())
@@ -635,6 +635,6 @@ fn estimate_up(frames: &[RawFrame]) -> [f64; 3] {
     for frame in frames {
         (0..3).for_each(|k| sum[k] -= frame.source.cam_from_world.rotation[1][k]);
     }
-    // Cameras all round a scene that look straight down cancel out; then any axis is as good.
+    // Cameras all round a scene that point straight down cancel out; then any axis will do.
     if norm(sum) > 1e-3 * frames.len() as f64 { normalize(sum) } else { [0.0, 0.0, 1.0] }
 }

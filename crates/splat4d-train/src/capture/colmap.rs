@@ -256,7 +256,7 @@ fn check_errors(points: &[Point], warnings: &mut Vec<String>) {
 
 /// The points of a COLMAP model that is next to `marker`, whose frames are `frames`: in their world, if the cameras
 /// agree. The result is reported.
-pub(super) fn points_beside(
+pub(super) fn companion_points(
     root: &Path,
     marker: &Path,
     frames: &[RawFrame],

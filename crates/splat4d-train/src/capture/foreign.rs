@@ -165,7 +165,7 @@ impl Images {
                     first.display(),
                     second.display()
                 );
-                // A copy in another size would be as good; which one is meant is the user's to say.
+                // A copy in another size would be as good; the user must state which one is meant.
                 Err(Error::input(what).remedy("Move the others out of the capture's folder."))
             }
         }

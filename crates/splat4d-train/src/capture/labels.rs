@@ -38,7 +38,7 @@ pub(crate) fn read(frame: &Frame, capture: &Capture) -> Result<Option<Vec<u8>>> 
 }
 
 fn decode(path: &Path, camera: &Camera, count: usize) -> Result<Vec<u8>> {
-    let raster = picture::decode_beside(path, "mask of labels", camera)?;
+    let raster = picture::decode_companion(path, "mask of labels", camera)?;
     let remedy = "Write grey PNGs of 8 or 16 bits: 0 for the first label of `labels`, 1 for the second, and the \
                   largest value (255, 65535) where the label is unknown";
     let n = raster.width * raster.height;

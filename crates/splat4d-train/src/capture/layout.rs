@@ -110,8 +110,8 @@ fn is_model(path: &Path, marker: &str, file: &Path) -> bool {
     if marker != colmap::SPARSE {
         return colmap::is_marker(file);
     }
-    // An empty `sparse` is reported as empty, and one without images as having none; but workspaces with images go
-    // first.
+    // An empty `sparse` is reported as empty, and one without images as having none; but workspaces with images have
+    // priority.
     let own_images = |workspace: &&str| {
         let model = path.join(workspace);
         colmap::is_model(&model) && model.parent().is_some_and(|above| above != path && colmap::has_images(above))
@@ -141,7 +141,7 @@ pub(super) fn is_capture(folder: &Path) -> bool {
 
 /// Reports which of several layouts was read, why, and how to choose another.
 fn remark(take: &mut RawCapture, path: &Path, marker: &str, others: &[&str]) {
-    // Files of one family describe the same images, and a model next to poses was asked for its points.
+    // Files of one family describe the same images, and a model next to poses was used for its points.
     let family = [transforms::TRAIN, transforms::ALL];
     let (same, foreign): (Vec<&str>, Vec<&str>) = others
         .iter()

@@ -146,7 +146,7 @@ impl Lookup {
     /// Where names relative to the capture's folder lead.
     pub(super) fn bases(&self) -> Vec<PathBuf> {
         let mut bases = self.folders();
-        // The capture's own folder goes first: names may hold that of the images.
+        // The capture's own folder has priority: names may hold that of the images.
         bases.sort_by_key(|folder| *folder != self.root);
         bases
     }

@@ -146,7 +146,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
             let own = about.get(id).and_then(|n| n.opt(key)?.map(|n| n.count()).transpose());
             own.map_err(|e| e.at(path.display()))
         };
-        // Warp codes count times; later takes say it in so many words.
+        // Warp codes count times; later takes state it explicitly.
         let index = match (of("time_id")?, of("warp_id")?, of("appearance_id")?) {
             (Some(n), ..) | (_, Some(n), _) | (.., Some(n)) => n,
             _ => {

@@ -348,7 +348,7 @@ fn read_camera(context: &Context<'_>, node: &Node<'_>, frames: &mut Vec<RawFrame
             ..RawFrame::new((context.camera, index, time + offset), source, image)
         });
     }
-    // Where the pixels of the last frame go is unknown.
+    // The flow of the last frame is unknown.
     if let Some(last) = frames[first..].last_mut() {
         last.flow = None;
     }

@@ -236,7 +236,7 @@ pub(super) fn check_size(path: &Path, size: (usize, usize), camera: &Camera) -> 
 }
 
 /// An error unless what is next to an image, `what` in words, is of that image's size.
-pub(super) fn check_beside(path: &Path, what: &str, size: (usize, usize), camera: &Camera) -> Result<()> {
+pub(super) fn check_companion(path: &Path, what: &str, size: (usize, usize), camera: &Camera) -> Result<()> {
     if size == (camera.width, camera.height) {
         return Ok(());
     }
@@ -260,9 +260,9 @@ pub(super) fn check_not_larger(what: &str, size: (usize, usize), camera: &Camera
 /// Decodes what is next to an image, `what` in words. Errors before its pixels are read where its size is not that
 /// of the
 /// stored image.
-pub(super) fn decode_beside(path: &Path, what: &str, camera: &Camera) -> Result<Raster> {
+pub(super) fn decode_companion(path: &Path, what: &str, camera: &Camera) -> Result<Raster> {
     let header = header(path)?;
-    check_beside(path, what, header.upright(), camera)?;
+    check_companion(path, what, header.upright(), camera)?;
     decode(path, None)
 }
 

@@ -73,7 +73,7 @@ impl Lists {
         let known: BTreeSet<&String> = keys.iter().collect();
         let mut split_of: BTreeMap<String, Split> = BTreeMap::new();
         let mut lost = Vec::new();
-        // Only a validation list: that is what there is to measure on.
+        // Only a validation list: it is the only set to evaluate.
         let of_validation = if test.is_empty() { Split::Held } else { Split::Validation };
         for (names, split) in [(train, Split::Train), (validation, of_validation), (test, Split::Held)] {
             let mut found = 0;

@@ -231,7 +231,8 @@ impl ImageStore {
         let mut worker = self.worker.lock().unwrap_or_else(|e| e.into_inner());
         if worker.is_none() {
             let shared = Arc::clone(&self.shared);
-            // Without a thread (a process limit, say) images are simply decoded when they are requested.
+            // Without a thread (because of a process limit, for example) images are simply decoded when they are
+            // requested.
             *worker = std::thread::Builder::new().name("prefetch".into()).spawn(move || shared.work()).ok();
         }
     }
@@ -417,7 +418,7 @@ fn read_mask(path: &Path, camera: &Camera, upright: bool) -> Result<Vec<f32>> {
         return Ok(values);
     }
     if !picture::is_resized(size, camera) {
-        picture::check_beside(path, "mask", size, camera)?;
+        picture::check_companion(path, "mask", size, camera)?;
     }
     let near = |i: usize, from: usize, to: usize| ((2 * i + 1) * from / (2 * to)).min(from - 1);
     let at = |p: usize| values[near(p / width, size.1, height) * size.0 + near(p % width, size.0, width)];

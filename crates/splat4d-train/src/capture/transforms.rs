@@ -72,7 +72,7 @@ pub(super) fn read(root: &Path, marker: &Path, options: &CaptureOptions) -> Resu
     let (file, told) = first.points.unzip();
     let points = match told {
         Some(points) => Some(points),
-        None => colmap::points_beside(root, marker, &frames, &mut warnings, &mut notes),
+        None => colmap::companion_points(root, marker, &frames, &mut warnings, &mut notes),
     };
     warnings.extend(first.warning);
     lookup.report(&mut account);

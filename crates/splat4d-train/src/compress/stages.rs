@@ -68,7 +68,7 @@ pub(super) fn float_stages(prepared: &Prepared) -> Result<Vec<Stage>> {
             let steps = s.fine_tune * (round + 1) / s.rounds - s.fine_tune * round / s.rounds;
             let mut stage = host_stage(prepared, steps)?;
             stage.name = format!("pruned {}/{}", round + 1, s.rounds);
-            // Equal shares of what is left, so that the last round leaves what was asked for.
+            // Equal shares of what is left, so that the last round reaches the requested number.
             let share = 1.0 - (1.0 - s.prune).powf(1.0 / s.rounds as f64);
             let last = round + 1 == s.rounds;
             stage.start = Some(pruning(prepared.clone(), share, filter && last));

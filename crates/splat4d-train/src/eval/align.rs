@@ -81,7 +81,7 @@ impl Align {
         let steps = self.settings.align_steps;
         for (done, (_, places)) in groups.iter().enumerate() {
             for step in 0..steps {
-                // Spread over the capture, so that all of its times have a say however few the steps are.
+                // Spread over the capture, so that all of its times are used even in few steps.
                 let place = places[step * places.len() / steps.min(places.len()) % places.len()];
                 let frame = info(frames[place]);
                 let stored = store.load(frames[place])?;

@@ -48,7 +48,7 @@ pub const SURE: f64 = 1.0 / 3.0;
 
 /// The query.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Question {
+pub struct Query {
     /// How the scene is rendered.
     pub antialias: Antialias,
     /// Whether the focal length is searched for too.
@@ -109,15 +109,15 @@ pub fn localise(
     scene: &Scene<f32>,
     picture: &Planes<f32>,
     starts: &[Camera],
-    question: Question,
+    query: Query,
     told: &mut dyn FnMut(usize, usize),
 ) -> Result<Located> {
     assert!(!starts.is_empty(), "localisation has a start camera");
     let fits = |c: &Camera| (c.width, c.height) == (picture.width, picture.height);
     assert!(starts.iter().all(fits), "starts have the image's size");
-    let backend = device::cpu(RenderConfig { antialias: question.antialias, ..RenderConfig::default() });
+    let backend = device::cpu(RenderConfig { antialias: query.antialias, ..RenderConfig::default() });
     let (instant, image) = (Evaluation::default(), Image::default());
-    let mut search = Search { scene, backend, instant, image, lens: question.lens };
+    let mut search = Search { scene, backend, instant, image, lens: query.lens };
     let mut candidates = search.tried(picture, starts)?;
     let (all, mut done) = (LEVELS.iter().map(|l| l.1).sum(), 0);
     let mut chance = 0.0;
@@ -405,7 +405,7 @@ mod tests {
         let starts: Vec<Camera> = (0..6).map(|k| camera(f64::from(k), 0.3)).collect();
         let (truth, when) = (camera(2.12, 0.55), 0.37);
         let mut found =
-            localise(&scene, &drawn(&scene, &truth, when), &starts, Question::default(), &mut |_, _| {}).unwrap();
+            localise(&scene, &drawn(&scene, &truth, when), &starts, Query::default(), &mut |_, _| {}).unwrap();
         let off = |c: &Camera| {
             let apart: [f64; 3] = std::array::from_fn(|k| c.center()[k] - truth.center()[k]);
             apart.iter().map(|x| x * x).sum::<f64>().sqrt()
@@ -417,7 +417,7 @@ mod tests {
         for row in strange.data.chunks_mut(SIZE) {
             row.reverse();
         }
-        let lost = localise(&scene, &strange, &starts, Question::default(), &mut |_, _| {}).unwrap();
+        let lost = localise(&scene, &strange, &starts, Query::default(), &mut |_, _| {}).unwrap();
         assert!(!lost.is_sure(), "{lost:?}");
         (found.residual, found.chance) = (0.0, 0.0);
         assert!(!found.is_sure(), "a picture of one colour tells nothing");

@@ -90,7 +90,7 @@ pub fn point_errors(scene: &Scene<f32>, capture: &Capture) -> Result<Option<Poin
     }
     let mut pixels = Distances::new(PIXELS);
     let (mut right, mut asked) = (0usize, 0usize);
-    let cameras = lookers(capture);
+    let cameras = viewing_cameras(capture);
     for &(rig, camera) in &cameras {
         for k in 1..frames.len() {
             let seen = sights(scene, camera, Time(times[k]), &places(k));
@@ -122,7 +122,7 @@ pub fn point_errors(scene: &Scene<f32>, capture: &Capture) -> Result<Option<Poin
 }
 
 /// Fixed cameras for the comparison, with their numbers: held out, or else of training.
-fn lookers(capture: &Capture) -> Vec<(usize, &Camera)> {
+fn viewing_cameras(capture: &Capture) -> Vec<(usize, &Camera)> {
     let of = |frames: &[usize]| {
         let mut out: Vec<(usize, &Camera)> = Vec::new();
         for frame in frames.iter().map(|&i| &capture.frames[i]).filter(|f| capture.cameras[f.camera].fixed) {

@@ -224,7 +224,7 @@ pub fn assess(
     let mut test = judge.split(options.measured.frames(capture), whole, name, listen)?;
     let dynamic_share = judge.dynamic_share();
     let frames = options.measured.frames(capture);
-    // What was trained on stands where training put it.
+    // Training views keep the poses of training.
     let align = options.align.as_ref().filter(|_| options.measured != Measured::Train && !frames.is_empty());
     let aligned = align.map(|align| judge.align(align, frames, &mut test, listen)).transpose()?;
     let some =

@@ -50,7 +50,7 @@ impl TrajectoryError {
 }
 
 /// Compares the training cameras of a capture, as they were found, with those of the same names in another, which
-/// knows. Fixed cameras have one pose, of moving ones every image has its own. Neighbours for the relative error are
+/// contains. Fixed cameras have one pose, of moving ones every image has its own. Neighbours for the relative error are
 /// images of one moving camera, and fixed cameras in the capture's order.
 ///
 /// Errors: fewer than three cameras have a ground truth, or differ in position.

@@ -179,10 +179,10 @@ mod tests {
         assert!(life >= 0.5 * gap && life <= 2.0 * gap, "{life}");
         let none = points(&deep.0, 400, true, Rng::new(1, "test", 0)).unwrap();
         assert!(none.is_empty(), "no maps, no points");
-        // Gaussians that live through the whole clip begin with what moves at one time of it.
+        // Gaussians that are alive during the whole clip begin with the moving points of one time.
         let recipe = Recipe::default().with(|r| r.init.count = 400);
         let plan = TrainContext { clip: [deep.0.time_of(0), deep.0.time_of(2)], times: 3, fps: 10.0, ..recipe.plan() };
-        let one = super::super::one_moment(&plan, &recipe.init, &deep, None).unwrap();
+        let one = super::super::one_time(&plan, &recipe.init, &deep, None).unwrap();
         let off = |i: usize, k: usize| norm(sub(one.points[i], deep.0.object_at(deep.0.time_of(k)))) - Made::RADIUS;
         let near = |i: usize, k: usize| off(i, k).abs() < 1e-3;
         let count = |k: usize| (0..one.len()).filter(|&i| near(i, k)).count();

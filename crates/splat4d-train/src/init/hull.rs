@@ -47,7 +47,7 @@ pub(crate) fn carve(
 ) -> Result<Seeds> {
     let each = count.div_ceil(times.len().max(1));
     let mut out = Seeds::default();
-    // A single camera sees one side at a time: all times together carve one hull, good for every time.
+    // A single camera sees one side at a time: all times together carve one hull for every time.
     let monocular = pictures_near(frames, times[0]).1.len() < MIN_VIEWS;
     for (k, &t) in times.iter().enumerate() {
         let (near, mut pictures) = pictures_near(frames, t);
@@ -67,7 +67,7 @@ pub(crate) fn carve(
             Ok(())
         };
         let silhouettes = Silhouettes { count: pictures.len(), misses: MISSES, shown: &shown };
-        let mut kept = carve_moment(&silhouettes, volume, wanted, rng.fork(k as u64))?;
+        let mut kept = carve_time(&silhouettes, volume, wanted, rng.fork(k as u64))?;
         kept.times.fill(stamp);
         out.append(kept);
         if monocular {
@@ -138,7 +138,7 @@ pub(crate) fn carve_moving(
             Ok(())
         };
         let silhouettes = Silhouettes { count: views.len(), misses: MOVING_MISSES, shown: &shown };
-        let mut kept = carve_moment(&silhouettes, volume, each, rng.fork(k as u64))?;
+        let mut kept = carve_time(&silhouettes, volume, each, rng.fork(k as u64))?;
         kept.times.fill(Some(t));
         out.append(kept);
     }
@@ -173,7 +173,7 @@ struct Silhouettes<'a> {
 
 /// Carves one time in rounds: each searches only the box of the points that the last one kept, so that a small object
 /// in a large volume still gets its points.
-fn carve_moment(silhouettes: &Silhouettes<'_>, volume: &Volume, wanted: usize, rng: Rng) -> Result<Seeds> {
+fn carve_time(silhouettes: &Silhouettes<'_>, volume: &Volume, wanted: usize, rng: Rng) -> Result<Seeds> {
     let mut low = volume.center.map(|c| c - volume.radius);
     let mut high = volume.center.map(|c| c + volume.radius);
     let mut out = Seeds::default();

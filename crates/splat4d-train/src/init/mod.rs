@@ -245,7 +245,7 @@ pub fn seeds(
         }
     }
     if have_depth {
-        // What a map shows no hull knows better.
+        // Depth maps are more accurate than hulls.
     } else if use_hull {
         out.append(hull::carve(frames, &volume, &times, count, moving, rng.fork(1))?);
     } else if settings.source == Source::Auto && have_points && moving {
@@ -259,7 +259,7 @@ pub fn seeds(
 
 /// Initial points for Gaussians that are alive during the whole clip: those of its middle, where moving objects are on
 /// average nearest to where it will be.
-pub(crate) fn one_moment(
+pub(crate) fn one_time(
     plan: &TrainContext,
     settings: &InitSettings,
     frames: &dyn Frames,

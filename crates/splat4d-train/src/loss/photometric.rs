@@ -1,6 +1,6 @@
 //! The image loss of 3DGS, (1 − λ)·L1 + λ·(1 − SSIM), and its gradient, in one pass over the image.
 
-use super::image::{ImageTerm, LossValue, PictureGrads, Shown, View};
+use super::image::{ImageTerm, LossGrads, LossValue, Shown, View};
 use super::kernel::{self, Scratch, Strip};
 use super::terms::StepInfo;
 use rayon::prelude::*;
@@ -137,7 +137,7 @@ fn total<F: Real>(weight: &[F], length: usize, sums: &mut [[f64; 3]]) -> f64 {
 }
 
 impl<F: Real> ImageTerm<F> for Photometric<F> {
-    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
+    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut LossGrads<F>) -> f64 {
         self.measured = match d.color.overwrite() {
             Some(d_color) => self.loss_and_grad(shown.color, view.truth, view.weight, d_color),
             None => {

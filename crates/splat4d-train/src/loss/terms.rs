@@ -95,9 +95,9 @@ pub trait Codec<F: Real>: Send + Sync {
     fn show(&self, scene: &Scene<F>, times: &[Time], shown: &mut Scene<F>);
     /// All of `scene` as a reader would see it. Changes nothing of what `show` remembers.
     fn whole(&self, scene: &Scene<F>) -> Scene<F>;
-    /// After a step's gradients, before the parameters' own optimiser: learns what rows share and is notified which rows
-    /// are about to change. `progress` is the share of the stage that is done; every rate is multiplied by `scale`.
-    /// Returns whether all numbers are finite.
+    /// After a step's gradients, before the parameters' own optimiser: learns what rows share and is notified which
+    /// rows are about to change. `progress` is the share of the stage that is done; every rate is multiplied by
+    /// `scale`. Returns whether all numbers are finite.
     fn learn(&self, d: &mut [Grads<F>], progress: f64, scale: f64) -> bool;
     /// The scene changed in other ways than by a step: whatever was shown of it is stale.
     fn reset(&self) {}

@@ -157,7 +157,7 @@ impl<'a> Places<'a> {
             }
             !veils
         };
-        // Rows are neighbours: two cameras that see one of them mostly see the next one, and the others are not asked.
+        // Rows are neighbours: two cameras that see one of them mostly see the next one, and the others are not tested.
         let rows = points.par_chunks(NEIGHBOURS).flat_map_iter(|points| {
             let mut hint = [0; 2];
             points.iter().map(move |&x| stays(&mut hint, x))

@@ -20,7 +20,7 @@ use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Born, Camera, GEOMETRY, LIFE, Planes, RowEdit, SH, Space, Time};
 
 /// Views that are examined each time.
-const LOOKS: usize = 24;
+const VIEWS: usize = 24;
 /// Views in which Gaussians are added.
 const WORST_VIEWS: usize = 2;
 /// Side of a patch, pixels.
@@ -139,7 +139,7 @@ impl Maintenance for Guided {
             geometry.set(row, OPACITY, logit(OPACITY_START));
             p[SH].write(row, 0, point.color.map(rgb_to_dc));
             if p[LIFE].width() >= 2 {
-                // As long as the clip, around the moment at which it was missed.
+                // As long as the clip, around the time of the error.
                 p[LIFE].write(row, 0, [point.time.0 as f32, clip.ln() as f32]);
             }
         }
@@ -152,7 +152,7 @@ fn looks(scene: &Scene<f32>, frames: &dyn Frames, antialias: Antialias, rng: Rng
     let mut backend = device::cpu(RenderConfig { antialias, ..RenderConfig::default() });
     let (mut instant, mut image, mut picture) = (Evaluation::default(), Image::default(), Picture::default());
     let mut worst: Vec<ViewError> = Vec::new();
-    let count = LOOKS.min(frames.len());
+    let count = VIEWS.min(frames.len());
     for k in 0..count {
         let frame = ((k as f64 + rng.uniform(0)) * frames.len() as f64 / count as f64) as usize;
         let frame = frame.min(frames.len() - 1);

@@ -109,7 +109,7 @@ impl MergeSettings {
         }
         let mut edit = RowEdit::prune(Space::Gaussians, keep.iter().copied());
         if self.pair == Pair::Merge {
-            // Moments of what a merged row was would push it back.
+            // The old moments of a merged row would push it back.
             let mut merged = vec![false; n];
             pairs.iter().for_each(|&(a, b)| (merged[a], merged[b]) = (true, true));
             for (born, row) in edit.born.iter_mut().zip(&edit.parent) {

@@ -128,12 +128,12 @@ mod tests {
         let g = &mut s.layers[0].params[GEOMETRY];
         for r in 0..200 {
             g.write(r, LOG_SCALE, [-1.5f32; 3]);
-            // Those that go are below what is drawn at all, so that only the arrival could be seen.
+            // Relocated ones are fainter than what is rendered, so that only their arrival could be visible.
             g.set(r, OPACITY, if r < 30 { -6.0 - 0.1 * r as f32 } else { -1.0 });
         }
         let before = picture(&s);
         let mut train_state = TrainState::new(s);
-        // Row 150 alone has a gradient: half of all draws are its.
+        // Row 150 alone has a gradient: half of all samples are its.
         train_state.stats_mut().tables[0].write(150, 0, [1.0, 1.0, 3.0]);
         let limits = Limits { cap: 300, extent: 4.0, min_opacity: 0.005 };
         let mut relocate = RELOCATE;

@@ -14,7 +14,7 @@ use splat4d::scene::{LifeKind, RowEdit, Rows, Space, Time};
 use std::sync::Arc;
 
 /// Times at which rows are examined, evenly over the clip: an odd number has the middle.
-const LOOKS: usize = 17;
+const TIMES: usize = 17;
 /// A row whose lifespan falls below this share anywhere in the clip appears or vanishes, and is not static.
 const LASTING: f64 = 0.9;
 /// Change of the covariance, of its trace, from which on a shape counts as changed.
@@ -104,9 +104,9 @@ fn still_rows(layer: &Layer<f32>, clip: [f64; 2], reach: f64) -> Vec<bool> {
     let n = layer.params.len();
     let mut still = vec![layer.span == ALWAYS && layer.masks.is_none(); n];
     let times: Vec<Time> =
-        (0..LOOKS).map(|k| Time(clip[0] + (clip[1] - clip[0]) * k as f64 / (LOOKS - 1) as f64)).collect();
+        (0..TIMES).map(|k| Time(clip[0] + (clip[1] - clip[0]) * k as f64 / (TIMES - 1) as f64)).collect();
     let look = |t: Time| Evaluation::of_layer(layer, Space::Gaussians, Rows::All, t);
-    let middle = look(times[LOOKS / 2]);
+    let middle = look(times[TIMES / 2]);
     let (kind, lives) = layer.lives();
     for t in times {
         let now = look(t);

@@ -7,7 +7,7 @@ use crate::capture::frames::{Frames, Picture};
 use splat4d::scene::Planes;
 
 /// Cameras of the rig that are examined, and pairs of neighbouring frames of each.
-const LOOKS: (usize, usize) = (4, 8);
+const SAMPLED: (usize, usize) = (4, 8);
 /// A pixel that changes by more than this from frame to frame (mean of the channels, in [0, 1]) has moved: above the
 /// noise of ordinary cameras.
 const CHANGED: f32 = 0.06;
@@ -94,11 +94,11 @@ fn motion_energy(frames: &dyn Frames) -> Result<Option<f64>> {
     for rig in &mut rigs {
         rig.sort_by(|&a, &b| frames.time(a).0.total_cmp(&frames.time(b).0));
     }
-    let step = rigs.len().div_ceil(LOOKS.0).max(1);
+    let step = rigs.len().div_ceil(SAMPLED.0).max(1);
     let (mut changed, mut pixels) = (0usize, 0usize);
     let mut pair = [Picture::default(), Picture::default()];
     for rig in rigs.iter().step_by(step) {
-        let stride = (rig.len() - 1).div_ceil(LOOKS.1).max(1);
+        let stride = (rig.len() - 1).div_ceil(SAMPLED.1).max(1);
         for n in (0..rig.len() - 1).step_by(stride) {
             for (picture, &i) in pair.iter_mut().zip(&rig[n..n + 2]) {
                 frames.load(i, picture)?;

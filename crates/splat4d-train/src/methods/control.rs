@@ -129,7 +129,7 @@ impl Method for ControlMethod {
         Ok(())
     }
 
-    fn one_moment(&self, _plan: &TrainContext) -> bool {
+    fn one_time(&self, _plan: &TrainContext) -> bool {
         true
     }
 

@@ -97,7 +97,7 @@ impl Method for DeformMethod {
         check(plan, &self.deform)
     }
 
-    fn one_moment(&self, _plan: &TrainContext) -> bool {
+    fn one_time(&self, _plan: &TrainContext) -> bool {
         true
     }
 
@@ -193,7 +193,7 @@ fn learns(learns: bool) -> super::Hook {
 }
 
 fn set_learns(spec: &DeformSpec, p: &mut Params<f32>, learns: bool) -> Result<()> {
-    // The names are those of a model of this spec, wherever its tables lie.
+    // The names are those of a model of this spec, wherever its tables are.
     for column in Deform::new(spec.clone(), &mut Params::<f32>::new(0, 1, &[]))?.network_columns() {
         if let Some(key) = p.find(&column) {
             p.info_mut(key).trainable = learns;

@@ -1,10 +1,9 @@
 //! `filtered`: any program with a temporal filter around its model, and the transport losses on any model.
 //!
 //! The inner program's stages are not changed; the filter is there from the start, switched off, and is switched on in
-//! the middle of whichever stage runs by then, so that no schedule notices. Hooks of the inner program see its own
-//! model: the filter is taken off around them. At the end the filter is disabled and the network kept, unless the
-//! recipe states otherwise: the filter has then taught the model to move steadily, and playing costs no more than
-//! without.
+//! the middle of whichever stage runs then, so that no schedule notices. Hooks of the inner program see its own model:
+//! the filter is taken off around them. At the end the filter is disabled and the network kept, unless the recipe
+//! states otherwise: the filter has then taught the model to move steadily, and playing costs no more than without.
 
 use super::{Group, Hook, InitialMotion, Method, Stage, TrainContext};
 use crate::Result;
@@ -112,8 +111,8 @@ impl Method for FilteredMethod {
         self.inner.check(plan)
     }
 
-    fn one_moment(&self, plan: &TrainContext) -> bool {
-        self.inner.one_moment(plan)
+    fn one_time(&self, plan: &TrainContext) -> bool {
+        self.inner.one_time(plan)
     }
 
     fn first(&self, plan: &TrainContext) -> TrainContext {
@@ -177,7 +176,7 @@ impl Method for FilteredMethod {
     }
 }
 
-/// Switches the filter after a share of all steps, in the stage that runs by then.
+/// Switches the filter after a share of all steps, in the stage that runs then.
 fn switch(stages: &mut [Stage], share: f64, fusion: Fusion) {
     let total: usize = stages.iter().map(|s| s.iterations).sum();
     let mut left = (share * total as f64).round() as usize;

@@ -91,7 +91,7 @@ impl Method for HexplaneMethod {
         Spec::Hexplane(self.spec_of(plan))
     }
 
-    fn one_moment(&self, _plan: &TrainContext) -> bool {
+    fn one_time(&self, _plan: &TrainContext) -> bool {
         true
     }
 

@@ -350,11 +350,11 @@ pub trait Method: Send + Sync {
         build(&self.spec(plan), params)
     }
     /// The lifespan its Gaussians have: the recipe's. Where it leaves the choice to the model, those of a cloud that
-    /// lasts ([`one_moment`](Self::one_moment)) may appear and vanish with fixed cameras, which see that a place is
-    /// empty before an object appears there (docs/models.md); a camera that moves sees every place at few times, and
+    /// lasts ([`one_time`](Self::one_time)) may appear and vanish with fixed cameras, which see that a place is empty
+    /// before an object appears there (docs/models.md); a camera that moves sees every place at few times, and
     /// lifespans gain nothing. Others, and those whose future is to be predicted, are there forever.
     fn life(&self, plan: &TrainContext) -> LifeKind {
-        let lasting = self.one_moment(plan) && plan.fixed_cameras > 0 && !plan.predicted;
+        let lasting = self.one_time(plan) && plan.fixed_cameras > 0 && !plan.predicted;
         plan.common.life.kind.unwrap_or(if lasting { LifeKind::Interval } else { LifeKind::Infinite })
     }
     /// The plan of the initial points: the whole clip, or its part that is learnt first.
@@ -369,7 +369,7 @@ pub trait Method: Send + Sync {
     }
     /// Whether all Gaussians are alive during the whole clip, so that training should start from one time's cloud and
     /// not from the clouds of many times together.
-    fn one_moment(&self, _plan: &TrainContext) -> bool {
+    fn one_time(&self, _plan: &TrainContext) -> bool {
         false
     }
     /// Properties of the model.
@@ -430,7 +430,7 @@ pub(crate) fn tuning(program: &dyn Method, plan: &TrainContext) -> Stage {
     (stage.sh_interval, stage.half_size_steps) = (0, 0);
     (stage.start, stage.end) = (None, None);
     stage.time_noise = TimeNoise::default();
-    // What came in late in training is there by now.
+    // Parts that start late in training are enabled now.
     stage.groups.iter_mut().for_each(|g| (g.from, g.warm_up) = (0, 0));
     stage
 }

@@ -42,7 +42,7 @@ impl OwnMotion {
         }
         register_motion(&self.name, self.make.clone())?;
         let mut own = OWN.write().unwrap_or_else(PoisonError::into_inner);
-        // Names live as long as the process, as those of the library do.
+        // Names need a static lifetime, as those of the library.
         let name = own.get_key_value(self.name.as_str()).map(|(name, _)| *name);
         let name = name.unwrap_or_else(|| String::leak(self.name.clone()));
         own.insert(name, Arc::new(self));
@@ -95,7 +95,7 @@ impl Method for OwnMethod {
         Ok(())
     }
 
-    fn one_moment(&self, _plan: &TrainContext) -> bool {
+    fn one_time(&self, _plan: &TrainContext) -> bool {
         true
     }
 

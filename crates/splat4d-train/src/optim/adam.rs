@@ -18,7 +18,7 @@ const EPSILON: f64 = 1e-15;
 
 type Lane<F> = [F; BLOCK];
 
-/// c₁ and c₂ by step count, up to the count from which both are 1 for good (some 17,000 in f32: 130 kB).
+/// c₁ and c₂ by step count, up to the count from which both are exactly 1 (some 17,000 in f32: 130 kB).
 pub(crate) fn corrections<F: Real>() -> Vec<[F; 2]> {
     let correction = |beta: f64, n: i32| F::of(1.0 / (1.0 - beta.powi(n)));
     // A row that has taken no step is not active; its entry is never used.

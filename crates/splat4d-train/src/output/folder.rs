@@ -112,7 +112,7 @@ impl OutputFolder {
         recover(path)?;
         let plan = plan(path, request)?;
         if let (Plan::Begin, Mixes::Anything) = (&plan, request.mixes) {
-            // A list of files that are all gone: what comes under their names is not of then.
+            // A list of files that are all deleted: later files of these names are not ours.
             let _ = std::fs::remove_file(path.join(STATE).join(list::FILE));
         }
         let list = List::keep(path)?;
@@ -239,7 +239,7 @@ impl OutputFolder {
             moved.map_err(|e| cannot_write(&from, e))?;
             remove_empty(&self.path, &from);
         }
-        // The list last: as long as it is in its place, all of it is put back.
+        // The list is moved last: while it is in place, everything is restored.
         let state = self.path.join(STATE);
         for name in [ASKED, list::FILE] {
             match std::fs::rename(state.join(name), aside.join(name)) {
@@ -263,13 +263,13 @@ impl Drop for OutputFolder {
         }
         let state = self.path.join(STATE);
         if state.join(ASIDE).exists() {
-            // Which list is the new output's and which the old one's, `recover` knows.
+            // `recover` distinguishes the lists of the new and the old output.
             let _ = recover(&self.path);
             return;
         }
         let _ = clear(&self.path, &self.list);
         let _ = std::fs::remove_file(state.join(ASKED));
-        // Nothing of ours is left: the lock, which is still held, goes last.
+        // Nothing of ours is left: the lock, which is still held, is removed last.
         if let Some(owner) = self.owner.take() {
             self.give_back(owner);
         }

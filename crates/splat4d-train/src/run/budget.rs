@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 /// Clock readings in a whole run. A change of speed is detected within one interval and treated as lasting after some:
 /// what the last ones miss is less than a tenth of the time ([`tests`] holds it on machines that turn slower and
 /// faster).
-const LOOKS: f64 = 32.0;
+const READINGS: f64 = 32.0;
 /// Of the time, what the end may be off before a run is planned again.
 const TOLERANCE: f64 = 0.015;
 /// Weight of the measurement since the last reading in the machine's speed: one busy time is not taken for the rest.
@@ -105,7 +105,7 @@ impl Planner {
     pub(super) fn new(budget: Budget, now: f64, replans: &[ScheduleChange]) -> Self {
         let last = replans.last().map_or(0, |row| row.at);
         // A part that begins late in a command is examined as often as one that begins at once.
-        let interval = (60.0 * budget.minutes - now).max(0.0) / LOOKS;
+        let interval = (60.0 * budget.minutes - now).max(0.0) / READINGS;
         Self { budget, interval, looked: now, taken: [0.0; 2], slowness: None, last }
     }
 
@@ -187,7 +187,7 @@ mod tests {
         let stages =
             [Stage { maintenance: r.plan().common.maintenance(), half_size_steps, ..Stage::new("all", STEPS) }];
         let timing = timing([START, CAP], [0.004, 0.012], [0.009, 0.025]);
-        // What was planned is what fits.
+        // The plan is what fits.
         let planned = timing.rest(&stages, [0, 0], START, CAP) + FINISH * timing.last(&stages, CAP);
         let budget = Budget { minutes: planned / 60.0, before: 0.0, finish: FINISH, timing };
         let (mut planner, mut rows) = (Planner::new(budget, 0.0, &[]), Vec::new());
@@ -253,7 +253,7 @@ mod tests {
         for (name, slow) in machines {
             let (end, planned, rows) = drive(slow);
             assert!((0.9..=1.1).contains(&end), "{name}: {end:.3} of {planned:.0} s, {rows:?}");
-            assert!(rows.len() <= LOOKS as usize, "{name}: {} plans", rows.len());
+            assert!(rows.len() <= READINGS as usize, "{name}: {} plans", rows.len());
         }
     }
 

@@ -184,7 +184,7 @@ pub fn read(bytes: &[u8], trainer: &mut Trainer<'_>, identity: &Identity) -> Res
         iteration: count("iteration")?,
         stage: count("stage")?,
         stage_step: count("stage_step")?,
-        // Files from before runs were planned again do not say: there a step is one of the schedule.
+        // Files from before replanning do not state it: there a step is one of the schedule.
         taken: if meta["taken"].is_null() { count("stage_step")? } else { count("taken")? },
         rests: meta["rests"].as_bool().unwrap_or(false),
         rate_scale: number(&meta["rate_scale"], "rate_scale")?,

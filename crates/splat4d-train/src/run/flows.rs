@@ -36,7 +36,7 @@ pub(super) fn complete(
     let kept = crate::files::read(&run.join(FOLDER).join(MARK)).is_ok_and(|text| text == mark.as_bytes());
     if !kept {
         let mut progress = Progress(listen);
-        // Of most images the pyramid is needed twice: as where flow comes from and where it goes.
+        // Of most images the pyramid is needed twice: as source and as target of flow.
         let mut last: Option<(usize, Pyramid)> = None;
         for (done, (frame, file)) in wanted.iter().enumerate() {
             progress.phase("flow from images", done, wanted.len());

@@ -12,7 +12,7 @@ pub(super) fn identity(capture: &Capture, recipe: &Recipe, text: &str) -> Identi
 
 /// A recipe in 16 hexadecimal digits, as it was written before it had tables: runs of then continue.
 pub(super) fn recipe_print(recipe: &Recipe, text: &str) -> String {
-    // Settings that only say how memory is spent never reach a result and may change between resumes.
+    // Settings of memory alone never affect a result and may change between resumes.
     let neutral = recipe.clone().with(|r| {
         r.run.image_memory = 0;
         r.run.memory_limit = 0;

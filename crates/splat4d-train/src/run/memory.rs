@@ -64,8 +64,8 @@ fn model(recipe: &Recipe, plan: &TrainContext, rows: usize) -> Result<u64> {
     let few = Few::new(program.as_ref(), plan, rows)?;
     let tables = few.tables(rows);
     let checkpoint = tables * CHECKPOINT[0] / CHECKPOINT[1];
-    let question = rows as u64 * ANSWER * F32 + few.motion.scratch_bytes(&few.params, rows);
-    Ok(tables + checkpoint + program.growth_bytes(plan, rows) + plan.batch_size as u64 * question)
+    let query = rows as u64 * ANSWER * F32 + few.motion.scratch_bytes(&few.params, rows);
+    Ok(tables + checkpoint + program.growth_bytes(plan, rows) + plan.batch_size as u64 * query)
 }
 
 /// A program's model on few rows: as many as it needs for its nodes.

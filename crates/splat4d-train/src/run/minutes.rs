@@ -72,8 +72,8 @@ impl Timing {
             listen(&Event::Phase { name: "timing steps".into(), done, total: 2 });
         };
         tell(listen, 0);
-        // A filter would be switched on later than the probes look.
-        // The number of Gaussians may become smaller, and the initial one with it: the fewest are timed.
+        // A filter would be switched on later than the probes measure. The number of Gaussians may become smaller, and
+        // the initial one with it: the fewest are timed.
         let least = recipe.clone().with(|r| r.densify.max_cap = 0).initial_count();
         let recipe = recipe.unresolved().with(|r| (r.filter.start, r.init.count) = (0.0, least));
         let plan = opened.plan(&recipe);

@@ -258,8 +258,8 @@ impl OpenCapture {
             self.capture.points.as_ref().map(Seeds::of)
         };
         let (first, frames) = (program.first(plan), self.frames.as_ref());
-        match moving && program.one_moment(plan) {
-            true => init::one_moment(&first, &recipe.initial(), frames, points),
+        match moving && program.one_time(plan) {
+            true => init::one_time(&first, &recipe.initial(), frames, points),
             false => init::seeds(&first, &recipe.initial(), frames, points, moving),
         }
     }

@@ -119,7 +119,7 @@ fn moments(recipe: &Recipe, plan: &TrainContext) -> Result<Vec<f64>> {
     if !program.capabilities(plan).moves || plan.times < 2 {
         return Ok(Vec::new());
     }
-    if program.one_moment(plan) {
+    if program.one_time(plan) {
         settings.keyframes = 1;
     }
     Ok(init::keyframes(&program.first(plan), &settings))
@@ -148,7 +148,7 @@ mod tests {
         };
         assert!(train(), "the capture has no points");
         assert!(!train(), "what was found is still there");
-        // The file is taken at its word as long as it is of the same capture and wish.
+        // The file is trusted if it is of the same capture and settings.
         let file = run.join(FILE);
         let text = String::from_utf8_lossy(&std::fs::read(&file).unwrap()).into_owned();
         let mark = text.lines().find(|l| l.starts_with("comment")).unwrap().to_owned();

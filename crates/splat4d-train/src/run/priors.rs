@@ -360,7 +360,7 @@ mod tests {
         let (hidden, _) =
             believed(opened(folder.path(), "metric", &|x| depth(x) * if x < 21 { 1.0 } else { 0.5 }), &recipe).unwrap();
         assert_eq!(before(&hidden, &recipe).unwrap(), Vec::<String>::new());
-        // What claims no unit is held against the scene alone, and what is not read is not examined.
+        // Maps without a unit are compared with the scene alone, and unread ones are not examined.
         let relative = opened(folder.path(), "relative", &|x| depth(SIDE - 1 - x));
         assert_eq!(believed(relative, &recipe).unwrap().1, None);
         let off = recipe.with(|r| r.loss.depth = 0.0);

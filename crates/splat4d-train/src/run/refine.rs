@@ -71,7 +71,7 @@ pub(crate) fn refine(
     }
     let total: usize = job.stages.iter().map(|s| s.iterations).sum();
     let begun = !checkpoint::list(run).is_empty();
-    // What a run that was begun followed; not what was followed by the run that the scene comes from.
+    // The plan of this run, not that of the run that produced the scene.
     let replans = if begun { followed(run)? } else { ScheduleChanges::default() };
     let recipe = job
         .recipe
@@ -103,7 +103,7 @@ pub(crate) fn refine(
     }
     let state = if begun {
         let state = session.restore(&mut trainer, listen)?;
-        // The budget is that of this command: what was trained before it does not count.
+        // The budget is that of this command: earlier training does not count.
         let before = options.clock.seconds() - state.seconds;
         session.budget = session.budget.map(|b| Budget { before, ..b });
         state

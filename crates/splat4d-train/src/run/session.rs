@@ -125,7 +125,7 @@ pub(super) fn restore_newest(
             .and_then(|bytes| checkpoint::read(&bytes, trainer, identity).map_err(|e| e.at(path.display())));
         match read {
             Ok(state) => return Ok((state, first_error.map(|e: Error| e.to_string()))),
-            // Another version or capture is not damage: older ones would say the same.
+            // Another version or capture is not damage: older ones would fail alike.
             Err(e) if e.kind() == ErrorKind::Unsupported => return Err(e),
             Err(e) => first_error = first_error.or(Some(e)),
         }
@@ -295,7 +295,7 @@ impl Session<'_> {
                 planner.add(between + seconds, expected);
                 if let Some(new) = planner.look(clock + lead, &Place::of(trainer)) {
                     recipe.run.replans.push(new.row);
-                    // What is on disk is what is followed, and the other way round.
+                    // The plan on disk equals the one in use.
                     self.write_recipe(&recipe)?;
                     trainer.replan(recipe.run.replans.rows());
                     if let Some(late) = new.late.filter(|_| !warned) {
@@ -329,7 +329,7 @@ impl Session<'_> {
                 listen(&self.progress(trainer, &state, &steps));
             }
             let i = trainer.progress.iteration;
-            // What the start of a later stage did may have taken long: it is not to be done twice.
+            // The start of a later stage may have taken long: it must not be repeated.
             let due = i.is_multiple_of(self.recipe.run.checkpoint_interval) || entered && i > 1;
             let looked_at = due || snapshots.as_ref().is_some_and(Snapshots::is_due);
             if looked_at {

@@ -124,11 +124,11 @@ impl Snapshots {
     }
 
     fn bytes(&self, scene: &Scene<f32>) -> Result<Vec<u8>> {
-        // Without a tolerance nothing is split: one look at every frame, one piece a Gaussian.
-        // A page that follows a run has the whole file at once: nothing is ranked.
+        // Without a tolerance nothing is split: one sample per frame, one segment per Gaussian. A page that follows a
+        // run has the whole file at once: nothing is ranked.
         let options = Options {
             tolerance: f64::INFINITY,
-            looks: 0.0,
+            sample_rate: 0.0,
             cameras: self.poses.clone(),
             rank: false,
             ..Options::default()

@@ -44,7 +44,7 @@ fn capture_on_disk(moments: usize) -> TempDir {
     let made = Made::new(CAMERAS, MOMENTS, SIZE);
     let mut picture = Picture::default();
     for i in 0..CAMERAS * moments {
-        // To and fro, so that it stays in sight.
+        // Back and forth, so that it stays visible.
         let moment = [0, 1, 2, 1][i / CAMERAS % 4];
         made.load(CAMERAS * moment + i % CAMERAS, &mut picture).unwrap();
         let path = folder.path().join(format!("images/{}/{:04}.png", i % CAMERAS, i / CAMERAS));
@@ -462,7 +462,7 @@ fn foreign_checkpoints_are_refused_with_a_reason() {
     std::fs::write(run.join("recipe.toml"), other.to_toml()).unwrap();
     let error = resume_quietly(&run).unwrap_err().to_string();
     assert!(error.contains("another recipe") && error.contains("start a new run"), "{error}");
-    // What only states how memory is spent may change.
+    // Settings of memory alone may change.
     let run = copy("memory");
     let other = base.resolve().with(|r| {
         r.run.image_memory = 1 << 20;
@@ -672,7 +672,7 @@ fn results_report_conditions_and_colour_corrected_psnr() {
     let recipe = recipe(&["hold_out=camera=0"]);
     place.train("a", &recipe).unwrap();
     let mut scene = splat4d::format::scene::read(&place.scene("a")).unwrap();
-    // The images are opaque, but say that they were not.
+    // The images are opaque, but are declared not to be.
     let open = |background| Arc::new(Capture { background: Some(background), ..(*place.open(&recipe)).clone() });
     let mut measure = |capture: &Arc<Capture>, measured, entry: Option<&str>| {
         let options =

@@ -5,7 +5,7 @@
 
 use super::channels::{Channels, Source};
 use crate::Result;
-use crate::loss::image::{Channel, PictureGrads, Shown};
+use crate::loss::image::{Channel, LossGrads, Shown};
 pub(crate) use crate::loss::image::{ImageTerm, View};
 pub(crate) use crate::loss::terms::{ParamLoss, Probe, ProbeLoss, StepInfo};
 pub(crate) use crate::train_state::Observation;
@@ -150,7 +150,7 @@ impl<F: Real> Chain<F> {
         self.evaluation.begin();
         for view in step.views {
             for (index, layer) in step.scene.layers.iter().enumerate() {
-                self.evaluation.ask_active(index, layer, view.t);
+                self.evaluation.request_active(index, layer, view.t);
             }
         }
         for probe in probes.iter().flatten() {
@@ -162,7 +162,7 @@ impl<F: Real> Chain<F> {
         for view in step.views {
             for t in image.needs(view).extra.iter().filter_map(|channel| channel.other_time(view)) {
                 for i in self.asked(step.scene, view.t) {
-                    self.evaluation.ask_again(i, t);
+                    self.evaluation.request_again(i, t);
                 }
             }
         }
@@ -170,9 +170,8 @@ impl<F: Real> Chain<F> {
 
     /// By layer the query for its Gaussians at a time of this step.
     fn asked(&self, scene: &Scene<F>, t: Time) -> Vec<usize> {
-        let question =
-            |layer| self.evaluation.find(layer, Space::Gaussians, t).expect("every time of a step was queried");
-        (0..scene.layers.len()).map(question).collect()
+        let query = |layer| self.evaluation.find(layer, Space::Gaussians, t).expect("every time of a step was queried");
+        (0..scene.layers.len()).map(query).collect()
     }
 
     /// Renders one view, compares it, and takes the gradient back to its splats.
@@ -257,7 +256,7 @@ impl<F: Real> Chain<F> {
 #[derive(Default)]
 struct Compared<F> {
     image: Image<F>,
-    d_image: PictureGrads<F>,
+    d_image: LossGrads<F>,
     d_splats: RenderGrads<F>,
 }
 

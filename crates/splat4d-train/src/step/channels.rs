@@ -24,7 +24,7 @@ pub(super) struct Source<'a, F: Real> {
 
 /// The results in which a layer's splats are at another time.
 struct Later {
-    question: usize,
+    query: usize,
     /// A row per splat of the view; `None`: it was not requested.
     rows: Vec<Option<usize>>,
 }
@@ -99,8 +99,8 @@ impl<F: Real> Channels<F> {
         let (mut first, mut all) = (0, Vec::new());
         for (layer, &i) in source.asked.iter().enumerate() {
             let now = evaluation.tape(i);
-            let question = evaluation.find(layer, Space::Gaussians, truth.to).expect("a flow's time was queried");
-            let then = evaluation.tape(question);
+            let query = evaluation.find(layer, Space::Gaussians, truth.to).expect("a flow's time was queried");
+            let then = evaluation.tape(query);
             let row = |id: usize| match then.rows() {
                 Rows::All => Some(id),
                 Rows::Some(ids) => ids.binary_search(&(id as u32)).ok(),
@@ -116,7 +116,7 @@ impl<F: Real> Channels<F> {
             let values = ways.iter().map(|w| w.unwrap_or([F::ZERO; 3]));
             values.enumerate().for_each(|(r, w)| self.table.write(first + r, column, w));
             first += rows.len();
-            all.push(Later { question, rows });
+            all.push(Later { query, rows });
         }
         self.later.push((channel.clone(), all));
     }
@@ -133,8 +133,8 @@ impl<F: Real> Channels<F> {
         let mut first = 0;
         for (&i, later) in source.asked.iter().zip(all) {
             // Where the flow has no duration, it has no effect on the splats.
-            if later.question != i {
-                let (now, then) = (evaluation.tape(i).out(), evaluation.tape(later.question).out());
+            if later.query != i {
+                let (now, then) = (evaluation.tape(i).out(), evaluation.tape(later.query).out());
                 let back = |r: usize| {
                     let (to, d): (usize, [F; 2]) = (later.rows[r]?, d_table.read(first + r, column));
                     if self.table.get(first + r, column + 2) == F::ZERO || d == [F::ZERO; 2] {
@@ -149,7 +149,7 @@ impl<F: Real> Channels<F> {
                 let ends = || ways.iter().enumerate().filter_map(|(r, ends)| Some((r, ends.as_ref()?)));
                 let d_now = evaluation.d_out(i);
                 ends().for_each(|(r, (d, _))| d_now.add(r, 0, *d));
-                let d_then = evaluation.d_out(later.question);
+                let d_then = evaluation.d_out(later.query);
                 ends().for_each(|(r, (_, d))| d_then.add(later.rows[r].expect("it has an end"), 0, *d));
             }
             first += later.rows.len();

@@ -17,7 +17,7 @@ use splat4d::scene::{Planes, Time};
 use std::collections::BTreeMap;
 
 /// Images of a camera that are examined, spread over the capture.
-const LOOKS: usize = 6;
+const IMAGES: usize = 6;
 /// Neighbouring searches use different images: this many positions between two of them, in turn.
 const TURNS: usize = 3;
 /// Images are halved until their longer side is at most so long, pixels: that is quick, and a shift shows farther.
@@ -59,7 +59,7 @@ impl OffsetImages<'_> {
         let within = |i: &usize| time(*i) + ends[0] >= scene.clip[0] && time(*i) + ends[1] <= scene.clip[1];
         let mut frames: Vec<usize> = frames.iter().copied().filter(within).collect();
         frames.sort_by(|&a, &b| time(a).total_cmp(&time(b)));
-        let looks = LOOKS.min(frames.len());
+        let looks = IMAGES.min(frames.len());
         let mut backend = device::cpu(RenderConfig { antialias: self.antialias, ..RenderConfig::default() });
         let (mut instant, mut image, mut picture) = (Evaluation::default(), Image::default(), Picture::default());
         for k in 0..looks {

@@ -78,11 +78,11 @@ mod tests {
         let slow = Pace::new(100, &[row(20, 60), row(40, 120)]);
         assert_eq!([40, 41, 42, 43, 119, 120].map(|i| slow.done_after(i)), [60, 60, 61, 61, 99, 100]);
         assert_eq!([fast.total(), slow.total()], [60, 120]);
-        // A change that comes when nothing is left changes nothing.
+        // A change when no step is left changes nothing.
         assert_eq!(Pace::new(10, &[row(10, 30)]).total(), 10);
     }
 
-    /// The schedule is gone through in order, to its end and with the last step only, and in equal parts.
+    /// The schedule is processed in order, to its end and with the last step only, and in equal parts.
     #[test]
     fn every_replanning_continues_the_schedule() {
         for rows in [vec![row(1, 2)], vec![row(7, 900), row(8, 30)], vec![row(99, 100), row(150, 151)]] {

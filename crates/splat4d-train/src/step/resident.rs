@@ -33,7 +33,7 @@ enum Newest {
 }
 
 /// A step that the device is still at.
-struct UnderWay {
+struct InFlight {
     /// From 1.
     iteration: usize,
     /// Share of D-SSIM in the loss, by view, and the frames.
@@ -53,7 +53,7 @@ pub(crate) struct DeviceEngine<'a> {
     rates: Rates,
     /// Tables that are kept, by layer.
     known: Vec<ResidentMotion>,
-    under_way: VecDeque<UnderWay>,
+    under_way: VecDeque<InFlight>,
     /// Measurements of finished steps, not reported yet.
     ready: Vec<Measured>,
 }
@@ -125,7 +125,7 @@ impl<'a> DeviceEngine<'a> {
     /// Stores the measurements of finished steps. Errors: one is invalid.
     fn take_in(&mut self, train_state: &TrainState, done: Vec<ResidentStepped>) -> std::result::Result<(), Fault> {
         for stepped in done {
-            let UnderWay { iteration, dssim, frames } =
+            let InFlight { iteration, dssim, frames } =
                 self.under_way.pop_front().expect("what is done was begun before");
             let views = dssim.len();
             let mut now = Measured { iteration, loss: stepped.loss, ..Measured::default() };
@@ -213,7 +213,7 @@ fn known(
         }
         all.push(known);
     }
-    // Ties go by the poses of a frame, of Gaussians that are all there.
+    // Ties use the poses of a frame of all Gaussians.
     let posed = all.iter().zip(&scene.layers).all(|(k, l)| k.moves == Moves::Posed && l.life == LifeKind::Infinite);
     let knows = |kept: Option<ResidentLoss>| match kept {
         Some(ResidentLoss::Rows(_)) => true,
@@ -320,7 +320,7 @@ impl Engine for DeviceEngine<'_> {
         let resident = self.cpu.backend().resident().expect("it was there before");
         let done = match resident.step(&step) {
             Ok(Some(done)) => done,
-            // An image too large for one piece: the CPU's engine renders it in several.
+            // An image too large for one buffer: the CPU's engine renders it in several.
             Ok(None) => return self.step_on_cpu(train_state, plan, notices),
             Err(error) => {
                 if self.newest != Newest::Both {
@@ -340,7 +340,7 @@ impl Engine for DeviceEngine<'_> {
             }
         };
         self.newest = Newest::Device;
-        self.under_way.push_back(UnderWay {
+        self.under_way.push_back(InFlight {
             iteration: plan.info.iteration + 1,
             dssim: views.iter().map(|v| v.target.dssim).collect(),
             frames: plan.views.iter().map(|v| v.frame).collect(),

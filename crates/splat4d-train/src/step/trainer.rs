@@ -306,7 +306,7 @@ impl<'a> Trainer<'a> {
         self.correct(&out)?;
         let clock = Clock::now();
         let (place, next) = (self.progress.stage_step, self.next_place());
-        if self.looked_at_after(place + 1..=next) {
+        if self.read_after(place + 1..=next) {
             match self.settle() {
                 Ok(measured) => out.measured.extend(measured),
                 Err(fault) => return Ok(Err(fault)),
@@ -362,7 +362,7 @@ impl<'a> Trainer<'a> {
     }
 
     /// Whether maintenance, a hook or another stage reads the learner after these steps of the stage's schedule.
-    fn looked_at_after(&self, mut passed: RangeInclusive<usize>) -> bool {
+    fn read_after(&self, mut passed: RangeInclusive<usize>) -> bool {
         let stage = &self.stages[self.progress.stage];
         let last = *passed.end() == stage.iterations;
         last || passed.any(|step| stage.maintenance.iter().any(|u| u.due(&At { step, steps: stage.iterations })))

@@ -2,9 +2,9 @@
 //!
 //! A correction of a pose is a twist ξ = (ρ, θ) in the camera's axes, `exp(ξ)·cam_from_world`; all frames of a fixed
 //! camera share one. A correction of a focal length is a share of it, of a camera. A correction of a clock is a shift
-//! of all times of a camera. Images carry no information about where the scene as a whole stands, how large it is and
-//! when it begins: the cameras' mean motion, their mean growth and the median of their clocks stay. The median, since
-//! of a rig with one clock that is wrong the others are right.
+//! of all times of a camera. Images carry no information about the scene's absolute position, how large it is and when
+//! it begins: the cameras' mean motion, their mean growth and the median of their clocks stay. The median, since of a
+//! rig with one clock that is wrong the others are right.
 
 use crate::optim::step_row;
 use crate::settings::settings;

@@ -89,8 +89,7 @@ pub(crate) fn pairs(cameras: &[&Camera]) -> Vec<[usize; 2]> {
             .map(|b| (distance(b), b))
             .collect();
         others.sort_by(|x, y| x.0.total_cmp(&y.0).then(x.1.cmp(&y.1)));
-        // Near ones look most alike, far ones measure depth best: in steps that grow, because nothing is known of
-        // depth.
+        // Near ones match best, far ones measure depth best: in steps that grow, because nothing is known of depth.
         let mut rank = 0.0_f64;
         for _ in 0..NEIGHBOURS {
             let Some(&(_, b)) = others.get(rank as usize) else { break };

@@ -198,7 +198,7 @@ impl<'a> Reference<'a> {
             let importance = |b: usize| {
                 let other = views[b].camera.center();
                 let one = |(x, _): &([f64; 3], f64)| match sees(&views[b], *x) {
-                    Some(_) => angle_worth(angle_at(*x, center, other).to_degrees()),
+                    Some(_) => angle_weight(angle_at(*x, center, other).to_degrees()),
                     None => 0.0,
                 };
                 seen.iter().map(one).sum::<f64>()
@@ -375,7 +375,7 @@ fn correlation(window: &Window, other: &Other<'_>, patch: Patch) -> Option<f32> 
 }
 
 /// The weight of a neighbour at this angle for measuring depth.
-fn angle_worth(degrees: f64) -> f64 {
+fn angle_weight(degrees: f64) -> f64 {
     if !ANGLES.contains(&degrees) {
         return 0.0;
     }

@@ -78,13 +78,13 @@ pub(super) fn one(capture: &Capture, frame: usize, upright: bool) -> Option<Smal
 }
 
 /// Finds the features of all.
-pub(super) fn describe(looks: &mut [SmallImage], detail: Detail) {
-    describe_each(&mut looks.iter_mut().collect::<Vec<_>>(), detail);
+pub(super) fn describe(images: &mut [SmallImage], detail: Detail) {
+    describe_each(&mut images.iter_mut().collect::<Vec<_>>(), detail);
 }
 
 /// [`describe`] of some.
-pub(super) fn describe_each(looks: &mut [&mut SmallImage], detail: Detail) {
-    looks.par_iter_mut().for_each(|look| {
+pub(super) fn describe_each(images: &mut [&mut SmallImage], detail: Detail) {
+    images.par_iter_mut().for_each(|look| {
         let limits = Limits { contrast: CONTRAST, most: detail.features };
         let found = find(&grey(&look.color), limits, &|_, _| true);
         let mark = |feature: Feature| Some(Mark { ray: look.ray(feature.pixel)?, feature });

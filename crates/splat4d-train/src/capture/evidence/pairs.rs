@@ -26,15 +26,15 @@ const FITTING: f64 = 0.2;
 
 /// A match of features of these two images: their rays.
 pub(super) struct Match {
-    looks: [usize; 2],
+    images: [usize; 2],
     rays: [[f64; 2]; 2],
 }
 
 #[cfg(test)]
 impl Match {
     /// The two images.
-    pub(super) fn looks(&self) -> [usize; 2] {
-        self.looks
+    pub(super) fn images(&self) -> [usize; 2] {
+        self.images
     }
 }
 
@@ -72,14 +72,14 @@ pub(super) fn prefers(m: &Measure) -> bool {
 }
 
 /// Mutual best matches of all pairs of images except those of one pose, which agree in any convention.
-pub(super) fn matches(looks: &[SmallImage]) -> Vec<Match> {
-    let all = (0..looks.len()).flat_map(|a| (a + 1..looks.len()).map(move |b| [a, b]));
-    let pairs: Vec<[usize; 2]> = all.filter(|&[a, b]| !same_pose(&looks[a].camera, &looks[b].camera)).collect();
-    pairs.par_iter().flat_map_iter(|&[a, b]| between([a, b], &looks[a].marks, &looks[b].marks, RATIO)).collect()
+pub(super) fn matches(images: &[SmallImage]) -> Vec<Match> {
+    let all = (0..images.len()).flat_map(|a| (a + 1..images.len()).map(move |b| [a, b]));
+    let pairs: Vec<[usize; 2]> = all.filter(|&[a, b]| !same_pose(&images[a].camera, &images[b].camera)).collect();
+    pairs.par_iter().flat_map_iter(|&[a, b]| between([a, b], &images[a].marks, &images[b].marks, RATIO)).collect()
 }
 
 /// Mutual best matches of two images whose second best is 1/`ratio` times farther away.
-pub(super) fn between(looks: [usize; 2], from: &[Mark], to: &[Mark], ratio: f64) -> Vec<Match> {
+pub(super) fn between(images: [usize; 2], from: &[Mark], to: &[Mark], ratio: f64) -> Vec<Match> {
     let mut back = vec![(u32::MAX, 0); to.len()];
     let mut forth = Vec::with_capacity(from.len());
     for (i, a) in from.iter().enumerate() {
@@ -101,20 +101,20 @@ pub(super) fn between(looks: [usize; 2], from: &[Mark], to: &[Mark], ratio: f64)
     }
     let good = |(i, ((d, j), second)): (usize, ((u32, usize), u32))| {
         let clear = f64::from(d).sqrt() < ratio * f64::from(second).sqrt();
-        (d < u32::MAX && clear && back[j].1 == i).then(|| Match { looks, rays: [from[i].ray, to[j].ray] })
+        (d < u32::MAX && clear && back[j].1 == i).then(|| Match { images, rays: [from[i].ray, to[j].ray] })
     };
     forth.into_iter().enumerate().filter_map(good).collect()
 }
 
 /// Measures every convention; `poses` are those of the images in each convention, the first as read.
-pub(super) fn measure(matches: &[Match], looks: &[SmallImage], poses: &[Option<Vec<Se3>>]) -> Vec<Measure> {
+pub(super) fn measure(matches: &[Match], images: &[SmallImage], poses: &[Option<Vec<Se3>>]) -> Vec<Measure> {
     let fits: Vec<Vec<bool>> = poses
         .iter()
         .map(|poses| match poses {
             Some(poses) => {
                 let centers: Vec<[f64; 3]> = poses.iter().map(|p| p.inverse().translation).collect();
                 let least = least(&centers);
-                matches.iter().map(|m| fits(m, looks, poses, least)).collect()
+                matches.iter().map(|m| fits(m, images, poses, least)).collect()
             }
             None => vec![false; matches.len()],
         })
@@ -131,10 +131,10 @@ pub(super) fn measure(matches: &[Match], looks: &[SmallImage], poses: &[Option<V
 }
 
 /// Number of matches of two images that agree with their poses.
-pub(super) fn fitting(matches: &[Match], looks: &[SmallImage], poses: &[Se3]) -> usize {
+pub(super) fn fitting(matches: &[Match], images: &[SmallImage], poses: &[Se3]) -> usize {
     let centers: Vec<[f64; 3]> = poses.iter().map(|p| p.inverse().translation).collect();
     let least = least(&centers);
-    matches.iter().filter(|m| fits(m, looks, poses, least)).count()
+    matches.iter().filter(|m| fits(m, images, poses, least)).count()
 }
 
 /// Baselines from which cameras are in two places.
@@ -145,29 +145,29 @@ fn least(centers: &[[f64; 3]]) -> f64 {
 
 /// How far every match is from its epipolar line if focal lengths are `times` as long, pixels of the small image;
 /// infinite where the rays do not meet in front of both cameras.
-pub(super) fn residuals(matches: &[Match], looks: &[SmallImage], poses: &[Se3], times: f64) -> Vec<f64> {
+pub(super) fn residuals(matches: &[Match], images: &[SmallImage], poses: &[Se3], times: f64) -> Vec<f64> {
     let centers: Vec<[f64; 3]> = poses.iter().map(|p| p.inverse().translation).collect();
     let least = least(&centers);
     let residual = |m: &Match| {
-        let m = Match { looks: m.looks, rays: m.rays.map(|ray| ray.map(|x| x / times)) };
-        let [a, b] = m.looks;
+        let m = Match { images: m.images, rays: m.rays.map(|ray| ray.map(|x| x / times)) };
+        let [a, b] = m.images;
         let motion = poses[b].after(&poses[a].inverse());
         let in_one_place = norm(motion.translation) <= least;
         let in_front = in_one_place || meet(&m, &motion);
-        let focal = 0.5 * times * (looks[a].focal() + looks[b].focal());
+        let focal = 0.5 * times * (images[a].focal() + images[b].focal());
         if in_front { focal * offset(&m, &motion, in_one_place) } else { f64::INFINITY }
     };
     matches.iter().map(residual).collect()
 }
 
 /// The distance of a match from its position or epipolar line in a static scene, pixels of the small image.
-pub(super) fn distance(m: &Match, looks: &[SmallImage], poses: &[Se3]) -> f64 {
-    let [a, b] = m.looks;
+pub(super) fn distance(m: &Match, images: &[SmallImage], poses: &[Se3]) -> f64 {
+    let [a, b] = m.images;
     let motion = poses[b].after(&poses[a].inverse());
     let centers = [a, b].map(|k| norm(poses[k].inverse().translation));
     let baseline = norm(motion.translation);
     let in_one_place = baseline <= ONE_PLACE * (centers[0] + centers[1] + baseline);
-    0.5 * (looks[a].focal() + looks[b].focal()) * offset(m, &motion, in_one_place)
+    0.5 * (images[a].focal() + images[b].focal()) * offset(m, &motion, in_one_place)
 }
 
 /// The Sampson distance of a match from its epipolar line, or of the turned ray where the cameras have the same
@@ -188,10 +188,10 @@ fn offset(m: &Match, motion: &Se3, in_one_place: bool) -> f64 {
 }
 
 /// Whether two rays meet, in front of both cameras.
-fn fits(m: &Match, looks: &[SmallImage], poses: &[Se3], least: f64) -> bool {
-    let [a, b] = m.looks;
+fn fits(m: &Match, images: &[SmallImage], poses: &[Se3], least: f64) -> bool {
+    let [a, b] = m.images;
     let motion = poses[b].after(&poses[a].inverse());
-    let tolerance = NEAR * 2.0 / (looks[a].focal() + looks[b].focal());
+    let tolerance = NEAR * 2.0 / (images[a].focal() + images[b].focal());
     let in_one_place = norm(motion.translation) <= least;
     let near = offset(m, &motion, in_one_place) <= tolerance;
     near && (in_one_place || meet(m, &motion))
@@ -204,7 +204,7 @@ fn meet(m: &Match, motion: &Se3) -> bool {
     let (from, to) = (normalize(mat_vec(&motion.rotation, p)), normalize(q));
     let normal = cross(from, to);
     if norm(normal) < PARALLEL {
-        // Far away, or along the baseline: both look the same way at least.
+        // Far away, or along the baseline: both have at least the same direction.
         return dot(from, to) > 0.0;
     }
     // t + s·from = r·to, in the plane of the rays.

@@ -115,11 +115,11 @@ pub(super) fn frames(capture: &Capture) -> Vec<usize> {
     capture.train.iter().step_by(step).copied().collect()
 }
 
-/// Measures one convention: `spread` are frames with their poses in it, `looks` are images with theirs.
+/// Measures one convention: `spread` are frames with their poses in it, `images` are images with theirs.
 pub(super) fn measure(
     capture: &Capture,
     (frames, poses): (&[usize], &[Se3]),
-    (looks, look_poses): (&[SmallImage], &[Se3]),
+    (images, look_poses): (&[SmallImage], &[Se3]),
 ) -> Measure {
     let Some(cloud) = &capture.points else { return Measure::default() };
     let chosen: Vec<usize> = (0..cloud.points.len()).step_by(step(cloud)).collect();
@@ -130,7 +130,7 @@ pub(super) fn measure(
         seen += chosen.iter().filter(|&&p| pixel_of(camera, &lens, pose, cloud.points[p]).is_some()).count();
     }
     let share = seen as f64 / (chosen.len() * frames.len()).max(1) as f64;
-    let (gain, compared) = gain(capture, &chosen, looks, look_poses, Trial::AS_READ).unzip();
+    let (gain, compared) = gain(capture, &chosen, images, look_poses, Trial::AS_READ).unzip();
     Measure { asked: chosen.len(), seen: share, gain, compared: compared.unwrap_or(0) }
 }
 
@@ -333,15 +333,15 @@ pub(super) fn unreadable_depth(capture: &Capture) -> Option<Error> {
 }
 
 /// How much nearer colours of some points are to the images there than to those at other points.
-pub(super) fn gain_of(capture: &Capture, looks: &[SmallImage], poses: &[Se3]) -> Option<f64> {
-    gain_if(capture, looks, poses, Trial::AS_READ)
+pub(super) fn gain_of(capture: &Capture, images: &[SmallImage], poses: &[Se3]) -> Option<f64> {
+    gain_if(capture, images, poses, Trial::AS_READ)
 }
 
 /// The same with other intrinsics.
-pub(super) fn gain_if(capture: &Capture, looks: &[SmallImage], poses: &[Se3], trial: Trial) -> Option<f64> {
+pub(super) fn gain_if(capture: &Capture, images: &[SmallImage], poses: &[Se3], trial: Trial) -> Option<f64> {
     let cloud = capture.points.as_ref()?;
     let chosen: Vec<usize> = (0..cloud.points.len()).step_by(step(cloud)).collect();
-    gain(capture, &chosen, looks, poses, trial).map(|(gain, _)| gain)
+    gain(capture, &chosen, images, poses, trial).map(|(gain, _)| gain)
 }
 
 /// How much nearer colours are to the image there than to that at other points, and how many were compared, with
@@ -349,7 +349,7 @@ pub(super) fn gain_if(capture: &Capture, looks: &[SmallImage], poses: &[Se3], tr
 fn gain(
     capture: &Capture,
     chosen: &[usize],
-    looks: &[SmallImage],
+    images: &[SmallImage],
     poses: &[Se3],
     trial: Trial,
 ) -> Option<(f64, usize)> {
@@ -361,7 +361,7 @@ fn gain(
     if chosen.iter().all(|&p| apart(&cloud.colors[p], &first) < ONE_COLOUR) {
         return None;
     }
-    for (look, pose) in looks.iter().zip(poses) {
+    for (look, pose) in images.iter().zip(poses) {
         let camera = look.tried(trial);
         let there = |p: usize| look.color_of(&camera, pose, cloud.points[p]);
         let pairs: Vec<([f32; 3], [f32; 3])> =

@@ -27,8 +27,8 @@ const AIMED: f64 = 0.35;
 const ONE_MASK: f64 = 0.01;
 
 /// Part of the images whose foreground is at the place that is nearest to all; `None`: too few have one.
-pub(super) fn measure(looks: &[SmallImage], poses: &[Se3]) -> Option<f64> {
-    at_one_place(looks, poses, |look| look.foreground).map(|(share, _)| share)
+pub(super) fn measure(images: &[SmallImage], poses: &[Se3]) -> Option<f64> {
+    at_one_place(images, poses, |look| look.foreground).map(|(share, _)| share)
 }
 
 /// What masks show about themselves: white counts.
@@ -42,9 +42,9 @@ pub(super) enum Masks {
 }
 
 /// Whether masks or alpha hide the cameras' target and show its surroundings.
-pub(super) fn masks(looks: &[SmallImage], poses: &[Se3]) -> Masks {
-    let shown: Vec<&Shown> = looks.iter().filter_map(|l| l.shown.as_ref()).collect();
-    if shown.is_empty() || measure(looks, poses).is_some_and(|share| share >= CONVINCES) {
+pub(super) fn masks(images: &[SmallImage], poses: &[Se3]) -> Masks {
+    let shown: Vec<&Shown> = images.iter().filter_map(|l| l.shown.as_ref()).collect();
+    if shown.is_empty() || measure(images, poses).is_some_and(|share| share >= CONVINCES) {
         return Masks::Fine;
     }
     let mean = |of: fn(&Shown) -> f64| shown.iter().map(|s| of(s)).sum::<f64>() / shown.len() as f64;
@@ -55,7 +55,7 @@ pub(super) fn masks(looks: &[SmallImage], poses: &[Se3]) -> Masks {
         let apart = s.weights.iter().zip(first).map(|(a, b)| f64::from((a - b).abs())).sum::<f64>();
         s.weights.len() != first.len() || apart > ONE_MASK * first.len() as f64
     };
-    match at_one_place(looks, poses, |look| look.hidden) {
+    match at_one_place(images, poses, |look| look.hidden) {
         Some((part, aimed)) if part >= INVERTED && aimed <= AIMED && of_edge >= EDGE && shown.iter().any(differs) => {
             Masks::Inverted(part, share, of_edge)
         }
@@ -66,12 +66,12 @@ pub(super) fn masks(looks: &[SmallImage], poses: &[Se3]) -> Masks {
 /// Part of the images that have `what` at the place that is nearest to all, and the median angle between that place and
 /// the cameras' axes, radians; `None`: too few meet it.
 fn at_one_place(
-    looks: &[SmallImage],
+    images: &[SmallImage],
     poses: &[Se3],
     what: impl Fn(&SmallImage) -> Option<[f64; 2]>,
 ) -> Option<(f64, f64)> {
     let mut rays = Vec::new();
-    for (look, pose) in looks.iter().zip(poses) {
+    for (look, pose) in images.iter().zip(poses) {
         let Some([x, y]) = what(look) else { continue };
         let back = pose.inverse();
         let center = back.translation;

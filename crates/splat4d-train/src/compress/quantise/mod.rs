@@ -210,11 +210,11 @@ pub(crate) fn stage(
         name: "quantised".into(),
         iterations,
         groups: tuned(base.groups, share).into_iter().map(|g| Group { layer: EVERY, ..g }).collect(),
-        // Pages say with a width next to nothing that a lifespan is a time.
+        // Pages encode a single time as a lifespan of nearly zero width.
         min_log_life: None,
         half_size_steps: 0,
         sh_interval: 0,
-        // Rows that came or went would leave the file's labels behind.
+        // Added or removed rows would not match the file's labels.
         maintenance: Vec::new(),
         codec: Some(codec),
         ..base

@@ -1,6 +1,6 @@
 //! Known depth: the rendered depth of a pixel equals that of the capture's depth map, where the map has it.
 
-use super::{ImageTerm, Needs, PictureGrads, SEEN, Shown, View, expected_depth_backward, over_rows};
+use super::{ImageTerm, LossGrads, Needs, SEEN, Shown, View, expected_depth_backward, over_rows};
 use crate::capture::DepthKind;
 use crate::capture::frames::DepthTruth;
 use crate::loss::terms::StepInfo;
@@ -21,11 +21,11 @@ impl<F: Real> ImageTerm<F> for Depth {
         Needs { depth: view.depth.is_some(), extra: Vec::new() }
     }
 
-    fn looks_at(&self, view: &View<'_, F>) -> bool {
+    fn applies_to(&self, view: &View<'_, F>) -> bool {
         view.depth.is_some()
     }
 
-    fn eval(&mut self, info: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
+    fn eval(&mut self, info: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut LossGrads<F>) -> f64 {
         let Some(truth) = view.depth else { return 0.0 };
         let weight = self.0 * LAST.powf(info.progress);
         depth([shown.depth, shown.alpha], truth, weight, [d.depth.add(), d.alpha.add()])

@@ -1,6 +1,6 @@
 //! Flow and tracks: the rendered displacement of a pixel equals the truth, to the next frame or to any other.
 
-use super::{Channel, ImageTerm, Needs, PictureGrads, SEEN, Shown, View, over_rows};
+use super::{Channel, ImageTerm, LossGrads, Needs, SEEN, Shown, View, over_rows};
 use crate::loss::terms::StepInfo;
 use splat4d::math::Real;
 use splat4d::scene::Planes;
@@ -14,11 +14,11 @@ impl<F: Real> ImageTerm<F> for Flow {
         Needs { depth: false, extra: view.flow.map(|_| Channel::Flow).into_iter().collect() }
     }
 
-    fn looks_at(&self, view: &View<'_, F>) -> bool {
+    fn applies_to(&self, view: &View<'_, F>) -> bool {
         view.flow.is_some()
     }
 
-    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
+    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut LossGrads<F>) -> f64 {
         let (Some(truth), Some((first, drawn))) = (&view.flow, shown.channel(&Channel::Flow)) else { return 0.0 };
         let mut d_drawn = Planes::new(3, drawn.height, drawn.width);
         let value = flow(&drawn, truth.vectors, self.0, &mut d_drawn);
@@ -36,11 +36,11 @@ impl<F: Real> ImageTerm<F> for Tracks {
         Needs { depth: false, extra: view.tracks.map(|_| Channel::Tracks).into_iter().collect() }
     }
 
-    fn looks_at(&self, view: &View<'_, F>) -> bool {
+    fn applies_to(&self, view: &View<'_, F>) -> bool {
         view.tracks.is_some()
     }
 
-    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
+    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut LossGrads<F>) -> f64 {
         let (Some(truth), Some((first, drawn))) = (&view.tracks, shown.channel(&Channel::Tracks)) else { return 0.0 };
         let mut d_drawn = Planes::new(3, drawn.height, drawn.width);
         let value = tracks(&drawn, truth.vectors, self.0, &mut d_drawn);

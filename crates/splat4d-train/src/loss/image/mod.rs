@@ -17,7 +17,7 @@ mod term;
 mod tests;
 pub(crate) mod tv;
 
-pub use term::{Channel, Gradient, ImageTerm, LossValue, Needs, PictureGrads, Shown, View};
+pub use term::{Channel, Gradient, ImageTerm, LossGrads, LossValue, Needs, Shown, View};
 
 use super::{LossSettings, Photometric};
 use rayon::prelude::*;

@@ -1,6 +1,6 @@
 //! Agreement of depth and normals: splats are flat on the surface of their rendered depth.
 
-use super::{Channel, ImageTerm, Needs, PictureGrads, SEEN, Shown, View, expected_depth_backward, over_rows};
+use super::{Channel, ImageTerm, LossGrads, Needs, SEEN, Shown, View, expected_depth_backward, over_rows};
 use crate::loss::terms::StepInfo;
 use splat4d::math::Real;
 use splat4d::math::vec3::{cross, dot};
@@ -15,7 +15,7 @@ impl<F: Real> ImageTerm<F> for DepthNormal {
         Needs { depth: true, extra: vec![Channel::Normals] }
     }
 
-    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64 {
+    fn eval(&mut self, _: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut LossGrads<F>) -> f64 {
         let (first, normals) = shown.channel(&Channel::Normals).expect("normals are rendered where they are needed");
         let mut d_normals = Planes::new(3, normals.height, normals.width);
         let pictures = [shown.depth, shown.alpha, &normals];

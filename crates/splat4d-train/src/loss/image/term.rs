@@ -174,7 +174,7 @@ impl<F: Real> Gradient<F> {
 
 /// The gradient to an image.
 #[derive(Clone, Debug, Default)]
-pub struct PictureGrads<F = f32> {
+pub struct LossGrads<F = f32> {
     /// To colour, [3, h, w].
     pub color: Gradient<F>,
     /// To alpha, [1, h, w].
@@ -185,7 +185,7 @@ pub struct PictureGrads<F = f32> {
     pub extra: Gradient<F>,
 }
 
-impl<F: Real> PictureGrads<F> {
+impl<F: Real> LossGrads<F> {
     /// Zeros in the shape of `image`.
     pub(crate) fn begin(&mut self, image: &Image<F>) {
         self.color.begin(&image.color);
@@ -221,12 +221,12 @@ pub trait ImageTerm<F: Real = f32>: Send {
     }
 
     /// Whether it applies to this view: if not, its value is 0 and it adds no gradient.
-    fn looks_at(&self, _view: &View<'_, F>) -> bool {
+    fn applies_to(&self, _view: &View<'_, F>) -> bool {
         true
     }
 
     /// Its value for one view; adds its gradient to `d`.
-    fn eval(&mut self, info: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut PictureGrads<F>) -> f64;
+    fn eval(&mut self, info: &StepInfo, view: &View<'_, F>, shown: &Shown<'_, F>, d: &mut LossGrads<F>) -> f64;
 
     /// The loss of a view as plain data, where it is that of 3DGS and nothing else: a device may then compute it.
     fn target<'a>(&self, _view: &View<'a, F>) -> Option<Target<'a, F>> {

@@ -86,7 +86,7 @@ pub(crate) fn key_masks(
     }
     for (layer, mut masks) in scene.layers.iter_mut().zip(masks) {
         for (row, [from, to]) in layer.spans().into_iter().enumerate().filter(|(_, [from, to])| from <= to) {
-            // The keys around its first moment; it meets none if it is over before the later one.
+            // The keys around its first time; it meets none if it is over before the later one.
             let [l, r] = masks.keys_at(from);
             if l != r && to < keys[r] {
                 masks.set(l, row);

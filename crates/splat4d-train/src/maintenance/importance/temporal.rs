@@ -1,11 +1,11 @@
 //! How much of the clip a Gaussian's lifespan serves: the temporal half of the score of 4DGS-1K (Yuan et al. 2025,
 //! §4.1), and its variants.
 //!
-//! The paper's S^TV = Σ_t 1/(½ tanh p''(t) + ½), p the lifespan, summed over the whole clip, ranks the other way round
-//! than its text states: a term is 1 + exp(−2p''), so that it overflows at the peak of a short lifespan, and a time at
-//! which the Gaussian is not there counts 2, the most that |p''| could give. The reading that does what the text states
-//! takes the product with the spatial score time by time: absent times vanish, and each present one weighs 1 (flickers)
-//! to 2 (lasts). That is [`Temporal::InstantAbs`], the default; the others are kept for comparison.
+//! The paper's S^TV = Σ_t 1/(½ tanh p''(t) + ½), p the lifespan, summed over the whole clip, ranks in the opposite
+//! order than its text states: a term is 1 + exp(−2p''), so that it overflows at the peak of a short lifespan, and a
+//! time at which the Gaussian is not there counts 2, the most that |p''| could give. The reading that does what the
+//! text states takes the product with the spatial score time by time: absent times vanish, and each present one weighs
+//! 1 (flickers) to 2 (lasts). That is [`Temporal::InstantAbs`], the default; the others are kept for comparison.
 
 use crate::settings::nearest;
 use crate::{Error, Result};

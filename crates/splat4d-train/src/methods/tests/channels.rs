@@ -12,7 +12,7 @@ impl ImageTerm<f64> for Weighted {
         self.0.clone()
     }
 
-    fn eval(&mut self, _: &StepInfo, _: &View<'_, f64>, shown: &Shown<'_, f64>, d: &mut PictureGrads<f64>) -> f64 {
+    fn eval(&mut self, _: &StepInfo, _: &View<'_, f64>, shown: &Shown<'_, f64>, d: &mut LossGrads<f64>) -> f64 {
         let mut sum = 0.0;
         let mut weigh = |name: &str, d: &mut Planes<f64>, image: &Planes<f64>| {
             let rng = Rng::new(1, name, 0);

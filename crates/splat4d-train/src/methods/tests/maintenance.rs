@@ -1,5 +1,5 @@
 //! Edits of rows in the middle of a stage: every loss is notified of them, and guided sampling finds what no Gaussian
-//! stands for.
+//! represents.
 
 use super::*;
 use crate::maintenance::importance::Spatial;

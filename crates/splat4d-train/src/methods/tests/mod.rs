@@ -21,7 +21,7 @@ mod wrapper;
 
 use super::*;
 use crate::capture::frames::{Frames, Picture};
-use crate::loss::image::{ImageTerm, PictureGrads, Shown};
+use crate::loss::image::{ImageTerm, LossGrads, Shown};
 use crate::maintenance::Limits;
 use crate::recipe::Recipe;
 use crate::recipe::parts::PROGRAMS;
@@ -137,7 +137,7 @@ impl Backend<f64> for Oracle {
 struct Squared;
 
 impl ImageTerm<f64> for Squared {
-    fn eval(&mut self, _: &StepInfo, view: &View<'_, f64>, shown: &Shown<'_, f64>, d: &mut PictureGrads<f64>) -> f64 {
+    fn eval(&mut self, _: &StepInfo, view: &View<'_, f64>, shown: &Shown<'_, f64>, d: &mut LossGrads<f64>) -> f64 {
         let n = shown.color.data.len() as f64;
         let d_color = d.color.overwrite().expect("there is one term");
         d_color.clone_from(shown.color);

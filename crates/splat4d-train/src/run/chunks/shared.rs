@@ -192,7 +192,7 @@ fn medians(
     let (mut cameras, mut names) = (Vec::new(), Vec::new());
     for rig in 0..capture.cameras.len() {
         listen(&Event::Phase { name: "static background".into(), done: rig, total: capture.cameras.len() });
-        // Frames of the data set stand in the order of `train`.
+        // Frames of the data set are in the order of `train`.
         let frames: Vec<usize> =
             (0..capture.train.len()).filter(|&i| capture.frames[capture.train[i]].camera == rig).collect();
         if frames.is_empty() {

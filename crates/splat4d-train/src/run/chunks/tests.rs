@@ -3,7 +3,7 @@
 
 use super::tie::{Neighbour, Tie};
 use super::*;
-use crate::loss::image::{ImageTerm, PictureGrads, Shown, View};
+use crate::loss::image::{ImageTerm, LossGrads, Shown, View};
 use crate::loss::terms::StepInfo;
 use crate::run::Stopwatch;
 use crate::run::tests::{Place, recipe};
@@ -170,7 +170,7 @@ fn the_tie_is_the_mean_difference_to_the_neighbour_where_both_are() {
             rig: 0,
         };
         let info = StepInfo { iteration: 0, times: vec![view.t], seed: 0, progress: 0.0 };
-        let mut d = PictureGrads::default();
+        let mut d = LossGrads::default();
         d.begin(&image);
         let value = tie.eval(&info, &view, &Shown::new(&image, &[]), &mut d);
         (value, d.grads().color.data.clone())

@@ -2,7 +2,7 @@
 
 use super::shared::read_file;
 use crate::Result;
-use crate::loss::image::{ImageTerm, PictureGrads, Shown, View};
+use crate::loss::image::{ImageTerm, LossGrads, Shown, View};
 use crate::loss::terms::StepInfo;
 use crate::run::identity::file_print;
 use crate::train_state::Exposure;
@@ -55,7 +55,7 @@ impl Tie {
 }
 
 impl ImageTerm for Tie {
-    fn eval(&mut self, _: &StepInfo, view: &View<'_>, shown: &Shown<'_>, d: &mut PictureGrads) -> f64 {
+    fn eval(&mut self, _: &StepInfo, view: &View<'_>, shown: &Shown<'_>, d: &mut LossGrads) -> f64 {
         let within = |n: &&Neighbour| n.window[0] <= view.t.0 && view.t.0 <= n.window[1];
         let Some(Neighbour { scene, .. }) = self.neighbours.iter().find(within) else { return 0.0 };
         scene.at(view.t, &mut self.seen);

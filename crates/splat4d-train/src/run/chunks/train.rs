@@ -57,7 +57,7 @@ pub(super) fn train(
         listen(&Event::Phase { name: "initial points".into(), done: 0, total: 0 });
         first_scene(&opened, &recipe, &plan, &shared, &neighbours)?
     } else {
-        // The checkpoint has it.
+        // It is in the checkpoint.
         opened.scene(&recipe, &plan, program.as_ref(), &Seeds::default(), shared.background)?
     };
     let prints: Vec<&str> =
@@ -128,10 +128,10 @@ fn first_scene(
         }
     }
     let room = plan.common.densify.max_cap.saturating_sub(still.map_or(0, |l| l.params.len())).max(1);
-    // A Gaussian that lives all the time starts where it is in the middle of the chunk, of which neighbours know
+    // A Gaussian with an infinite lifespan starts at its position in the middle of the chunk, of which neighbours know
     // nothing.
     let mut taken: Vec<Params<f32>> = Vec::new();
-    if !program.one_moment(plan) {
+    if !program.one_time(plan) {
         let share = (TAKEN_OVER * room as f64) as usize / neighbours.len().max(1);
         for n in neighbours {
             taken.push(alive(&n.scene, 0.5 * (n.window[0] + n.window[1]), share, plan.seed));

@@ -255,7 +255,7 @@ fn stages_without_steps_and_codecs_without_tuning() {
     let whole = job.codec.whole(&done.scene);
     assert!(seen.layers.iter().zip(&whole.layers).all(|(a, b)| a.params == b.params));
     assert!(job.codec.pages(&done.scene, Meta::default()).is_ok());
-    // Asked again, nothing begins again.
+    // A second call repeats nothing.
     let mut job = bed.job(no_meddler);
     job.refine.stages.iter_mut().for_each(|s| s.iterations = 0);
     let again = bed.run("none", job.refine, &AtomicBool::new(false), &mut |_| {}).unwrap();

@@ -28,8 +28,8 @@ const STAYS: [&str; 12] = [
     "motion=native4d strategy=mcmc sh_harmonics=1 batch_size=2",
     "motion=tracked strategy=adc",
     // Frame 1 from the second step on. Without what ties its poses to those of frame 0, of which they are copies at
-    // that step: there these losses are at their kinks, and a card's roundings alone decide which way they pull.
-    // `ties_pull_as_on_the_cpu` has them.
+    // that step: there these losses are at their kinks, and a GPU's rounding alone decides their direction.
+    // `ties_pull_as_on_the_cpu` tests them.
     "motion=tracked strategy=none tracked.first_share=0.001 rigid_neighbours=5 tracked.rigid=0 tracked.rot=0 tracked.iso=0",
 ];
 /// Largest relative difference of a table's gradient, as a vector: a splat at the α cut-off may be rendered by one side
@@ -103,8 +103,7 @@ fn gradients_of_the_whole_chain_equal_the_cpus() {
             let sums = stats.map(|s| s.chunks_exact(3).map(|r| [r[0], r[1], r[2]].map(f64::from)).collect::<Vec<_>>());
             for c in 0..3 {
                 let [a, b] = sums.each_ref().map(|s| s.iter().map(|r| r[c]).sum::<f64>());
-                // The CPU looks whether an ellipse meets bins, the GPU whether it meets tiles: a few are rendered by
-                // one side only.
+                // The CPU tests ellipses against bins, the GPU against tiles: a few are rendered by one side only.
                 assert!((a - b).abs() <= STATISTICS * b, "{line}: statistics {c}: {a} {b}");
             }
         }
@@ -254,7 +253,7 @@ impl Resident for Failing {
         cameras: Option<&ResidentCameras<'_>>,
         corrections: &[[f32; 2]],
     ) -> Result<()> {
-        // Want of room is no failure.
+        // Too little memory is not a failure.
         self.left[0] = self.left[0].checked_sub(1).ok_or_else(|| Error::new(ErrorKind::Unsupported, FULL))?;
         self.here()?.resident().expect("a GPU").keep(layers, cameras, corrections)
     }
@@ -302,7 +301,7 @@ fn a_failing_device_loses_only_steps_since_the_last_settle() {
             _ => trainer.step().unwrap().expect_err("it is gone"),
         };
         assert!(fault.1 == Blame::Device && fault.0.contains(GONE), "{}", fault.0);
-        // What a run does then: back to a checkpoint, and on with the CPU, of which it said enough.
+        // The run then returns to a checkpoint and continues on the CPU.
         crate::run::checkpoint::read(&start, &mut trainer, &Default::default()).unwrap();
         let (_, notices) = finish(&mut trainer, "on the CPU");
         assert!(notices.is_empty() && bytes(trainer.scene()) == expected, "{notices:?}");

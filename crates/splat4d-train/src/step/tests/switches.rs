@@ -125,7 +125,7 @@ fn clones_get_a_time_of_their_own() {
         bed.watch(&format!("retime_clones={retime} percent_dense=1"), |trainer, change| {
             let p = &trainer.scene().layers[0].params;
             if change.added > 0 && change.removed == 0 && seen == 0 {
-                // Clones stand behind those that were there; no step has moved them yet.
+                // Clones are behind the existing rows; no step has moved them yet.
                 let centers: Vec<f32> = (0..p.len()).map(|r| p[LIFE].get(r, 0)).collect();
                 let (old, new) = centers.split_at(before);
                 assert_eq!(new.len(), change.added);
@@ -143,7 +143,7 @@ fn clones_get_a_time_of_their_own() {
 #[test]
 fn crowds_are_thinned_and_the_rest_learns() {
     let bed = Bed::new();
-    // Losses over neighbours look at the cloud after every thinning.
+    // Losses over neighbours use the cloud after every thinning.
     let losses = "lambda_rigid=1 lambda_jerk=0.1 lambda_velocity=0.1";
     for line in [
         "crowding=merge motion=spacetime",

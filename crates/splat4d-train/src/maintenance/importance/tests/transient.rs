@@ -1,5 +1,5 @@
 //! Survival of transient objects: the orb of the bundled capture, which appears at frame 9, and its painted crate,
-//! which is gone from frame 18 on (docs/bundled-capture.md). Without fine-tuning.
+//! which vanishes at frame 18 (docs/bundled-capture.md). Without fine-tuning.
 
 use super::*;
 use crate::capture::{Capture, CaptureOptions, ImageStore};
