@@ -63,7 +63,7 @@ impl FromStr for Board {
     fn from_str(text: &str) -> Result<Self> {
         let wrong = |what: String| {
             Err(Error::input(format!("the board \"{text:.80}\" {what}")).remedy(format!(
-                "Write FAMILY:METRES, the length of a tag's dark square, and :floor or :wall if it lies flat or stands upright: \
+                "Write FAMILY:METRES, the length of a tag's dark square, and :floor or :wall if it is flat or upright: \
                  36h11:0.16:floor. Families are {}.",
                 FAMILIES.map(|f| f.name).join(", ")
             )))

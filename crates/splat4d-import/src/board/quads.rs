@@ -79,7 +79,7 @@ fn dark(picture: &Planes<f32>) -> Vec<bool> {
         }
         all
     };
-    // A tile without edges, such as one inside of a wide border, goes by what is around it until there is one.
+    // A tile without edges, such as one inside of a wide border, uses its neighbours until there is one.
     let mut limits: Vec<Option<f32>> = (0..across * down)
         .map(|t| {
             let [low, high] = wide(t);

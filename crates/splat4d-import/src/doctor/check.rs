@@ -44,7 +44,7 @@ pub(super) fn all(
         alone::alone(capture, camera, s, report);
     }
     take(capture, seen, report);
-    // Leaving out costs a view: only what no training mends, and only where enough are left.
+    // Leaving out loses a view: only for faults that training cannot correct, and only if enough are left.
     let gross = |f: &&Finding| f.grade == Grade::Bad && ["epipolar", "moved", "sharpness", "focus"].contains(&f.check);
     let mut out: Vec<String> = report.findings.iter().filter(gross).filter_map(|f| f.camera.clone()).collect();
     out.sort();
@@ -176,7 +176,7 @@ pub(super) fn memory(needed: u64, there: Option<u64>, report: &mut Report) {
             (mega(needed) as f64, "MB"),
             what,
             (
-                "Training that crawls, or ends without a word.",
+                "Training that is slow, or ends without a message.",
                 "Train with --downscale 2, with fewer Gaussians (--set densify.max_cap), or a long take in chunks (--memory-limit).",
             ),
         );

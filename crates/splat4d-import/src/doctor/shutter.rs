@@ -88,7 +88,7 @@ pub(super) fn shutters(pairs: &[Pair], seen: &[CameraObservations], interval: f6
                 let column = factor.solve(one);
                 let of = |pull: &Vec<(usize, f64)>| pull.iter().map(|(k, v)| v * column[*k]).sum::<f64>().powi(2);
                 let told: f64 = pulls.iter().map(of).sum();
-                // And what the prior draws towards nothing.
+                // And the prior, which pulls towards zero.
                 let drawn: f64 = (0..all).map(|k| prior(k) * column[k] * column[k]).sum();
                 *deviation = (told + drawn).sqrt();
             }

@@ -72,7 +72,7 @@ impl Given {
 }
 
 /// Images of a camera in which bars are searched for.
-const LOOKS: usize = 3;
+const SAMPLED: usize = 3;
 
 /// Known lenses of every camera's stored images: from the calibration, and from the user, which has priority. Sentences
 /// about calibrations that had to be corrected for them join the images' warnings.
@@ -110,11 +110,11 @@ pub(super) fn known(
 fn some(folder: &Path, pictures: &Pictures) -> Result<Vec<Planes<f32>>> {
     let count = pictures.shots.len();
     let look = |k: usize| {
-        let rgb = Rgb8::read(&folder.join(pictures.file((2 * k + 1) * count / (2 * LOOKS))))?;
+        let rgb = Rgb8::read(&folder.join(pictures.file((2 * k + 1) * count / (2 * SAMPLED))))?;
         let mut grey = Planes::new(1, rgb.height, rgb.width);
         let mean = |p: &[u8]| p.iter().map(|v| f32::from(*v)).sum::<f32>() / (3.0 * 255.0);
         grey.data.iter_mut().zip(rgb.data.chunks_exact(3)).for_each(|(v, p)| *v = mean(p));
         Ok(grey)
     };
-    (0..LOOKS).map(look).collect()
+    (0..SAMPLED).map(look).collect()
 }

@@ -375,7 +375,7 @@ fn agrees(solved: &poses::Solved, pictures: &[Pictures], report: &mut Report) ->
 }
 
 /// Removes the travel time of sound from clocks that sound alone determines, or reports why not.
-fn sound_goes(
+fn subtract_travel_time(
     solved: &mut poses::Solved,
     evidence: &[Evidence],
     told: &[Option<f64>],
@@ -482,7 +482,7 @@ fn finish(
         solved.take_points(&points);
         report.guesses.push("Points are the calibration's: too few were found in these images.".into());
     }
-    // What could not be placed is reported before what could not be measured.
+    // Unplaced cameras are reported before unmeasured ones.
     let metres = match world::settle(request, stored, origin, &mut solved, &mut report, progress) {
         Ok(metres) => metres,
         Err(e) => {
@@ -490,7 +490,7 @@ fn finish(
             return Err(e);
         }
     };
-    sound_goes(&mut solved, evidence, told, metres, pictures, &mut report);
+    subtract_travel_time(&mut solved, evidence, told, metres, pictures, &mut report);
     let mut placed = Vec::new();
     for (k, (camera, p)) in solved.cameras.iter().zip(pictures).enumerate() {
         let row = CameraReport::of(p, camera, solved.offsets.get(k).and_then(Option::as_ref));

@@ -79,7 +79,7 @@ pub(super) fn measured(
     progress: &mut Progress<'_>,
 ) -> Result<TagWorld> {
     let clock = stored.on(&solved.offsets);
-    // What each look is: a camera, a frame, and the time that it belongs to.
+    // Each sample: a camera, a frame, and its time.
     let looks = if solved.moving { walked(&clock, solved) } else { stood(&clock, solved) };
     let mut seen: Vec<(usize, TagView)> = Vec::new();
     const AT_ONCE: usize = 8;

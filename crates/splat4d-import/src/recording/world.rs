@@ -49,8 +49,9 @@ pub(super) fn settle(
         let turned = turn(solved, up, true);
         let at = mat_vec(&turned.rotation, origin);
         solved.place(&Sim3 { translation: at.map(|v| -v), ..Sim3::default() });
-        let stands = if request.board.is_some_and(|b| b.lies == Some(Lies::Floor)) { "lies" } else { "hangs" };
-        report.guesses.push(format!("The up direction (+z) and the origin are the board's, which {stands}."));
+        let place =
+            if request.board.is_some_and(|b| b.lies == Some(Lies::Floor)) { "on the floor" } else { "on the wall" };
+        report.guesses.push(format!("The up direction (+z) and the origin are those of the board {place}."));
     } else if let Origin::Calibrated { .. } = origin {
         match along_axis(solved.up) {
             Some((axis, name)) => {

@@ -385,7 +385,7 @@ impl Normal {
             right.iter_mut().zip(b).for_each(|(x, y)| *x -= y);
         }
         for k in 0..n {
-            // What is held, and what no camera sees.
+            // Fixed points, and those that no camera sees.
             if held[k] || self.cameras[k * n + k] == 0.0 {
                 (0..k).for_each(|j| a[k * n + j] = 0.0);
                 (k + 1..n).for_each(|i| a[i * n + k] = 0.0);
@@ -428,7 +428,7 @@ impl Gauge {
         if views > 0 {
             held[..POSE - 1].fill(true);
             let first = bundle.views[0].pose.inverse().translation;
-            // Where the first camera stands, as others see it: scaling moves them along this.
+            // The first camera's position relative to the others: scaling moves them along this.
             let apart = |v: usize| bundle.views[v].pose.apply(first);
             let size = |v: usize| apart(v).iter().map(|x| x * x).sum::<f64>();
             let far = (1..views).fold(0, |best, v| if size(v) > size(best) { v } else { best });

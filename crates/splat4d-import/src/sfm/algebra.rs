@@ -134,7 +134,7 @@ pub(crate) fn null_space(rows: &[[f64; 9]]) -> Vec<[f64; 9]> {
         v.iter_mut().zip(m).for_each(|(a, b)| *a -= along * b);
     };
     for k in 0..rows.len() {
-        // The longest of what is left comes first.
+        // The longest remaining one is first.
         let left = |v: &[f64; 9]| v[k..].iter().map(|x| x * x).sum::<f64>();
         let best = (k..rows.len()).fold(k, |b, i| if left(&turned[i]) > left(&turned[b]) { i } else { b });
         turned.swap(k, best);

@@ -211,7 +211,7 @@ mod tests {
         assert!(up[2] > 0.5, "{up:?}");
     }
 
-    /// A floor, two walls and things about, in a world that is turned.
+    /// A floor, two walls and objects, in a rotated world.
     fn room(turn: &Mat3, noise: f64) -> Vec<[f64; 3]> {
         let rng = Rng::new(4, "room", 0);
         let at = |k: usize| {

@@ -96,7 +96,7 @@ pub(crate) fn lag(
     if costs.len() < MATCHES {
         return Err(Refusal::Unrelated);
     }
-    let best = stands_out(&grid, &likelihoods(&costs, a.len(), grid.len()), costs.len().min(a.len()), interval)?;
+    let best = is_prominent(&grid, &likelihoods(&costs, a.len(), grid.len()), costs.len().min(a.len()), interval)?;
     let mut lag = grid[best];
     let mut matched = Vec::new();
     for _ in 0..ROUNDS {
@@ -173,7 +173,7 @@ fn likelihoods(costs: &[Costs], tracks: usize, lags: usize) -> Vec<f64> {
 }
 
 /// The place of the highest likelihood, if it is much higher than elsewhere.
-fn stands_out(grid: &[f64], heights: &[f64], tracks: usize, interval: f64) -> Result<usize, Refusal> {
+fn is_prominent(grid: &[f64], heights: &[f64], tracks: usize, interval: f64) -> Result<usize, Refusal> {
     let highest = |of: &mut dyn Iterator<Item = usize>| of.max_by(|&i, &j| heights[i].total_cmp(&heights[j]));
     let best = highest(&mut (0..grid.len())).expect("the grid is not empty");
     let usual = median(&mut heights.to_vec());

@@ -196,13 +196,13 @@ impl Graph<'_> {
     }
 
     /// The largest set of lags found that agree, in order: truncated least squares by graduated non-convexity, then
-    /// what was lost of the trusted ones is taken back where it leads to a camera that nothing else leads to.
+    /// rejected trusted lags are restored if they alone connect a camera.
     fn agree(&self, edges: &[usize], known: &[Option<f64>]) -> Vec<usize> {
         if edges.is_empty() {
             return Vec::new();
         }
         let at = |k: usize| edges.iter().position(|&e| e == k).expect("it is one of the edges");
-        // Here all lags of a kind weigh alike: an echo is sure of itself, too.
+        // Here all lags of a kind weigh alike: an echo has a small sigma, too.
         let fit = |weights: &[f64]| {
             let weight = |k: usize| weights[at(k)] * self.trust(k) / self.allowed(k).powi(2);
             let terms: Vec<Term> =

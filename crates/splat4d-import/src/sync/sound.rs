@@ -212,7 +212,7 @@ fn candidates(a: &SoundTrack, b: &SoundTrack, most: Option<f64>) -> Vec<f64> {
 
 /// The lag near a coarse one, by the waveforms of several windows.
 fn fine(a: &SoundTrack, b: &SoundTrack, coarse: f64) -> Result<SoundLag, Refusal> {
-    // Seconds of a's clock that both have, with room for the search.
+    // Common seconds on a's clock, with a margin for the search.
     let begin = (FINE_RANGE - coarse).max(0.0);
     let end = (b.length() - FINE_RANGE - coarse).min(a.length());
     let length = ((end - begin) / (AGREEING + 1) as f64).clamp(WINDOW[0], WINDOW[1]);

@@ -243,7 +243,7 @@ fn wrong_lags_are_left_out_and_named() {
 #[test]
 fn the_trusted_kind_wins_and_guesses_come_last() {
     let mut evidence = lags(&TRUTH[..3], Kind::Geometry);
-    // Echoes: sound is wrong about one pair, and the only one to know camera 3; motion has a guess at all.
+    // Echoes: sound is wrong for one pair, and the only evidence for camera 3; motion has a guess for all.
     evidence.push(Evidence { lag: evidence[0].lag + 0.2, kind: Kind::Sound, ..evidence[0].clone() });
     evidence.push(Evidence { cameras: [3, 0], lag: 4.0, sigma: 1e-3, drift: None, kind: Kind::Sound });
     evidence.push(Evidence { cameras: [0, 1], lag: 3.0, sigma: FRAME, drift: None, kind: Kind::Motion });

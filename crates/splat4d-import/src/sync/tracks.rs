@@ -15,7 +15,7 @@ const RADIUS: usize = 6;
 /// Steps of Newton's method at a level, and the one that is small enough, pixels.
 const STEPS: usize = 20;
 const SMALL_STEP: f64 = 0.01;
-/// A corner is followed there and back; it is lost where it returns farther than this from where it was, pixels.
+/// A corner is tracked forward and backward; it is lost where it returns farther than this from where it was, pixels.
 const ROUND_TRIP: f64 = 0.7;
 /// The least eigenvalue of a corner's gradient matrix (mean over its window, of values from 0 to 1): a step of a
 /// twentieth across the window.

@@ -123,7 +123,7 @@ mod tests {
 
     #[test]
     fn an_even_clock_has_no_finding() {
-        // Times in whole milliseconds, as Matroska has them.
+        // Times in whole milliseconds, as in Matroska.
         let even: Vec<f64> = (0..90).map(|i| (f64::from(i) / 29.97 * 1000.0).round() / 1000.0).collect();
         let clock = Clock::of(&even, &(1..90).map(|i| (i, 2.0)).collect::<Vec<_>>());
         assert_eq!((clock.variable, clock.still, clock.missing(), clock.doubled.len()), (false, false, 0, 0));
@@ -142,7 +142,7 @@ mod tests {
         let even = times(&(0..20).map(f64::from).collect::<Vec<_>>());
         let moving: Vec<(usize, f64)> = (1..20).map(|i| (i, if i % 5 == 0 { 0.1 } else { 3.0 })).collect();
         assert_eq!(Clock::of(&even, &moving).doubled, [5, 10, 15]);
-        // Every other frame twice; little that moves; nothing that does.
+        // Every other frame twice; little motion; no motion.
         let other: Vec<(usize, f64)> = (1..20).map(|i| (i, if i % 2 == 0 { 0.01 } else { 0.2 })).collect();
         assert_eq!(Clock::of(&even, &other).doubled, [2, 4, 6, 8, 10, 12, 14, 16, 18]);
         let little: Vec<(usize, f64)> = (1..20).map(|i| (i, 0.1 + 0.005 * i as f64)).collect();

@@ -76,7 +76,7 @@ impl Source for Video {
             input.extend(["-copyts".into(), "-start_at_zero".into(), "-ss".into(), format!("{seek:.6}")]);
         }
         if let Some(to) = selection.to {
-            // The program rounds this end to ticks of the file too; what it gives too much is left out below.
+            // The program rounds this end to ticks of the file too; surplus frames are left out below.
             input.extend(["-t".into(), format!("{:.6}", to - seek + END_FRAMES * self.interval())]);
         }
         let mut output = vec!["-map".into(), format!("0:{}", self.probe.picture), "-vf".into(), text];

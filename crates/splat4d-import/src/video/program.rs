@@ -135,10 +135,10 @@ impl Tools {
             while matches!(lines.read_until(b'\n', &mut line), Ok(1..)) {
                 let text = String::from_utf8_lossy(&line);
                 if let Some((which, time)) = stamp(&text, &mut units) {
-                    // The receiver may be gone.
+                    // The receiver may be dropped.
                     let _ = send.send((which, time));
                 } else if text.contains(MUXER) {
-                    // It frets over the times of raw images, which go nowhere.
+                    // It warns about the times of raw images, which are not used.
                 } else if text.contains("[error]") || text.contains("[fatal]") {
                     said.add(plain(&text, &name));
                 }

@@ -35,7 +35,7 @@ pub(crate) struct Begin {
 /// `NAME.png` for the whole recording, or a folder `NAME` with one for each frame of its video, in the order of names.
 ///
 /// Errors: a camera without masks, fewer masks than frames, masks of another shape, no space; of kind `Interrupted`
-/// where `stop` said so.
+/// where `stop` requested it.
 pub(crate) fn masks(
     folder: &Path,
     from: &Path,

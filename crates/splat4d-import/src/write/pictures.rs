@@ -327,7 +327,7 @@ fn clear(capture: &Path, folder: &Path, noted: bool) -> Result<()> {
     };
     let there: Vec<PathBuf> = entries.filter_map(|e| e.ok().map(|e| e.path())).filter(numbered).collect();
     let listed = written(capture);
-    // A folder that was filled before there was a list goes by its note; one of which anything is listed by the list.
+    // A folder from before lists existed is identified by its note, any other by the list.
     let inside = |file: &PathBuf| folder.strip_prefix(capture).is_ok_and(|own| file.starts_with(own));
     let noted = noted && !listed.iter().any(inside);
     let ours = |path: &PathBuf| noted || path.strip_prefix(capture).is_ok_and(|file| listed.contains(file));

@@ -95,7 +95,7 @@ fn derived_values_are_computed_again() {
     let names = contents(out.path());
     assert_eq!(names.keys().filter(|n| n.starts_with("images/cam_0") && n.ends_with("jpg")).count(), 9);
     assert!(names.contains_key("images/cam_0/mine.txt"), "files of others stay");
-    // An image that was lost comes back.
+    // A lost image is restored.
     std::fs::remove_file(out.path().join("images/cam_1/000001.jpg")).unwrap();
     store(out.path(), &clips(&sources, &half), usize::MAX).unwrap();
     assert_eq!(contents(out.path()), names);
