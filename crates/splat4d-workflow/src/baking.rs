@@ -153,7 +153,7 @@ fn options(scene: &Scene<f32>, baking: &Baking, views: &[View]) -> Options {
     if deadline.is_set() {
         let mut instant = Evaluation::default();
         let middle = Time(0.5 * (scene.clip[0] + scene.clip[1]));
-        // The first one makes room.
+        // The first one is a warm-up.
         scene.at(middle, &mut instant);
         let began = deadline.now();
         scene.at(middle, &mut instant);
@@ -364,7 +364,7 @@ pub fn bake_like(source: &Source, title: &str, baking: &Baking, console: &dyn Li
         let mut needs = None;
         let mut next = None;
         if let (Some(curve), Some((at, [pieces, error])), Some(like)) = (&curve, packed.at, &likeness) {
-            // What the file differs by beyond what its segments do is the rounding's, and stays.
+            // The difference beyond that of the segments is due to rounding, and stays.
             let scale = mse(like.psnr) / error.max(f64::MIN_POSITIVE);
             let wanted = curve.price_for(mse(LIKE + MARGIN) / scale);
             let each = bytes / packed.baked.report.primitives.max(1) as f64;

@@ -71,7 +71,7 @@ pub fn work(
     listen: &mut dyn FnMut(&Event),
 ) -> Result<Option<Outcome>> {
     let deadline = Deadline::of(options.clock.clone(), options.minutes);
-    // What goes wrong with it never costs a chunk, and is made good at the join.
+    // Its errors never fail a chunk, and are corrected at the join.
     let append = || {
         if let Err(e) = growing::append(run, chunked, &baking(chunked, &deadline), stop, console) {
             console.warn(&format!("the playback file does not grow: {e}"));

@@ -30,7 +30,7 @@ use std::sync::atomic::AtomicBool;
 
 /// Times that the guard (or the size) may request another round.
 const MOST_TRIES: usize = 3;
-/// The guard takes back this share of the pruning.
+/// The guard reduces the pruning by this share.
 const GENTLER: f64 = 0.5;
 
 /// Settings that the user requested; they are in [`ORDER`], so that an interrupted compression can read them.
@@ -632,12 +632,12 @@ fn say(told: &Compressed, size: [usize; 2], console: &dyn Listener) {
     console.say(&line("after", &told.after));
     if let Some(times) = told.smaller() {
         let faster = told.after.fps / fair.fps;
-        // What would have been shipped otherwise comes first: the plain file, and not the floats of the run.
+        // The alternative comes first: the plain file, and not the floats of the run.
         let plain = told.plain.as_ref().filter(|plain| plain.bytes > 0);
         let plain = plain.map_or_else(String::new, |plain| {
             format!("{:.1} times smaller than the plain playback file, ", plain.bytes as f64 / told.after.bytes as f64)
         });
-        // Floats are never shipped: their figure stands alone only where there is no plain file.
+        // Floats are never shipped: their figure is used only without a plain file.
         let smaller = match plain.is_empty() {
             true => format!("{times:.1} times smaller than 32-bit floats, "),
             false => plain,

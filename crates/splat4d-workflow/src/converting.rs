@@ -255,7 +255,7 @@ pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> R
     let still;
     let whole = match moment {
         Some(time) => {
-            still = one_moment(scene, time)?;
+            still = one_time(scene, time)?;
             console.say(&format!("{} of {} Gaussians at {time} s", grouped(still.len()), grouped(scene.len())));
             &still
         }
@@ -424,7 +424,7 @@ fn rotated(camera: Camera, r: &[[f64; 3]; 3]) -> Camera {
 }
 
 /// A scene that is static as `scene` is at `time`.
-fn one_moment(scene: &Scene<f32>, time: f64) -> Result<Scene<f32>> {
+fn one_time(scene: &Scene<f32>, time: f64) -> Result<Scene<f32>> {
     layers::moment(scene, Time(time)).map(|params| standing(scene, params))
 }
 

@@ -81,7 +81,7 @@ pub struct EditOptions {
 /// # }
 /// ```
 pub fn edit(options: &EditOptions, console: &dyn Listener) -> Result<()> {
-    // What cannot be written is better known before the work.
+    // Unwritable outputs are reported before the work.
     if let Some(output) = &options.output {
         converting::check_output(output)?;
     }

@@ -19,7 +19,7 @@ use splat4d::math::{Se3, quat, se3};
 use splat4d::render::{Backend, Image, RenderConfig, Shot};
 use splat4d::scene::{Camera, Intrinsics, Lens, Time};
 use splat4d::{Error, Result};
-use splat4d_serve::EditAnswer;
+use splat4d_serve::EditResponse;
 use std::path::{Component, Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -184,10 +184,10 @@ impl Editor {
     /// Does what a page requests.
     ///
     /// Errors: what is no query, and those of its work; nothing is changed then.
-    pub fn answer(&self, asked: Value) -> Result<EditAnswer> {
+    pub fn answer(&self, asked: Value) -> Result<EditResponse> {
         let ask: Ask = serde_json::from_value(asked)
             .map_err(|e| Error::input(format!("unknown request of the page: {e}")).remedy("Reload the page"))?;
-        let told = |told: Value| Ok(EditAnswer { told, scene: None });
+        let told = |told: Value| Ok(EditResponse { told, scene: None });
         match ask {
             Ask::Open { kept } => told(self.open(kept)),
             Ask::Show { steps, view, t } => {
@@ -206,7 +206,7 @@ impl Editor {
                 if newest {
                     self.lock().shown = steps;
                 }
-                Ok(EditAnswer { told: json!({ "stale": !newest }), scene: newest.then(|| bytes.into()) })
+                Ok(EditResponse { told: json!({ "stale": !newest }), scene: newest.then(|| bytes.into()) })
             }
             Ask::Save { steps } => self.save(steps).and_then(told),
             Ask::Select { steps, select, t } => {
@@ -248,7 +248,7 @@ impl Editor {
             "title": self.title, "file": name, "steps": state.listed, "layers": layers, "clip": scene.clip, "fps": scene.fps,
             // Another page, or this one before it was loaded again, has changed the scene that pages get.
             "stale": stale, "moving": scene.is_moving(), "gaussians": scene.len(),
-            // A playback file's Gaussians are pieces of time, which no node carries through all of it.
+            // A playback file's Gaussians are time segments, which no node carries through the whole clip.
             "drag": self.source.playback.is_none(), "floaters": self.source.run.is_some(),
         })
     }
@@ -309,7 +309,7 @@ impl Editor {
     }
 
     fn save(&self, steps: Vec<Step>) -> Result<Value> {
-        // What cannot be replayed is not written.
+        // Lists that cannot be replayed are not written.
         self.replayed(&steps)?;
         let edits = Edits { scene: Some(self.title.clone()), steps, ..Edits::default() };
         let mut state = self.lock();

@@ -73,7 +73,7 @@ pub fn steps(capture: &Capture, recipe: &Recipe, only_playback: bool) -> f64 {
     let motion = recipe.run.motion;
     let moves = capture.cameras.iter().any(|c| !c.fixed) && capture.timing != Timing::Moment;
     let straight = STRAIGHT.iter().any(|name| motion == *name) || motion == MotionName::AUTO.as_str() && !moves;
-    let samples = ((last - first) * capture.fps.max(bake::LOOKS)).max(0.0);
+    let samples = ((last - first) * capture.fps.max(bake::SAMPLE_RATE)).max(0.0);
     let bake = if straight { BAKE_STEPS } else { CUT_STEPS + SAMPLE_STEPS * samples };
     if only_playback {
         return bake + labels;
@@ -131,7 +131,7 @@ pub fn all(
                 amend(run, [("orbit_seconds".into(), json!(deadline.now() - started))])?;
             }
             Err(error) if error.kind() == ErrorKind::Interrupted => return Err(error),
-            // The scene and its scores stand without the film.
+            // The scene and its scores are valid without the film.
             Err(error) => console.warn(&format!("the orbit film was not written: {error}")),
         }
     }
@@ -165,7 +165,7 @@ impl Times {
         let views = run.views()?;
         let Some(view) = views.iter().find(|v| v.held).or(views.first()) else { return Ok(Self::default()) };
         let mut painter = Painter::new(scene, scene.background, false, false);
-        // The first one makes room.
+        // The first one is a warm-up.
         painter.draw(&view.camera, view.time);
         let began = deadline.now();
         painter.draw(&view.camera, view.time);

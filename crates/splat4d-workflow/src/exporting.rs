@@ -216,7 +216,7 @@ pub fn page(path: &Path, out: &Path, link: Option<&Path>, listener: &dyn Listene
             .at(link.display())
             .remedy("Use option `link` NAME.s4d."));
     }
-    // A playback file may be next to its page as it is.
+    // A playback file may be next to its page unchanged.
     let is_read = |link: &&Path| link.canonicalize().ok().is_some_and(|l| path.canonicalize().is_ok_and(|p| p == l));
     if let Some(link) = link.filter(|link| !is_read(link)) {
         keep(path, run.as_ref(), link, &[])?;

@@ -140,7 +140,7 @@ fn of_capture(path: &Path, options: &InspectOptions, console: &dyn Listener) -> 
     if let Some(found) = shipped::contents(path)? {
         return Ok(of_shipped(path, &found));
     }
-    // What is next to images is noted even where this recipe does not use it.
+    // Files next to images are listed even if this recipe does not use them.
     let all = recipe.clone().with(|r| (r.loss.depth, r.loss.flow, r.loss.tracks) = (1.0, 1.0, 1.0));
     let mut capture = open_capture(path, &all)?;
     let priors = priors(&capture);
@@ -220,7 +220,7 @@ fn of_capture(path: &Path, options: &InspectOptions, console: &dyn Listener) -> 
             Severity::Note => line(&mut text, "note", &sentence(finding)),
         }
     }
-    // One block: what was not found, not read, assumed or not checked; warnings come first.
+    // One block: content not found, not read, assumed or not checked; warnings first.
     for (name, aspect) in Aspect::ALL {
         let mut of: Vec<&Finding> = findings.iter().filter(|f| f.aspect == Some(aspect)).collect();
         of.sort_by_key(|f| std::cmp::Reverse(f.severity));
@@ -362,7 +362,7 @@ fn of_run(path: &Path) -> Result<Inspection> {
             let choices = if changed.is_empty() { "all defaults".to_owned() } else { changed.join(" ") };
             line(&mut text, "recipe", &format!("{}; {choices}", recipe.run.motion));
         }
-        // Its owner has taken the folder this very moment.
+        // Its owner has just taken the folder.
         Err(_) if run.recipe.is_none() && owner.is_some() => line(&mut text, "recipe", "not written yet"),
         Err(e) => return Err(e),
     }

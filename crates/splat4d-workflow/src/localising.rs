@@ -11,7 +11,7 @@ use splat4d::render::Antialias;
 use splat4d::scene::{Camera, Intrinsics, Planes};
 use splat4d::{Error, Result};
 use splat4d_train::capture::Rgb8;
-use splat4d_train::eval::localise::{self, Located, Question, SURE};
+use splat4d_train::eval::localise::{self, Located, Query, SURE};
 use std::path::{Path, PathBuf};
 
 /// Largest difference of the shapes (width over height) of an image and a start's.
@@ -60,13 +60,13 @@ pub fn localise(
     let starts = starts(scene, options.start.as_deref(), &source)?;
     let recipe = source.run.as_ref().and_then(|run| run.recipe().ok());
     let antialias = if recipe.is_some_and(|r| r.appearance.antialias) { Antialias::On } else { Antialias::Off };
-    let question = Question { antialias, lens: options.lens };
+    let query = Query { antialias, lens: options.lens };
     let (mut found, mut lost): (Vec<Value>, Vec<String>) = (Vec::new(), Vec::new());
     for path in images {
         let picture = read(path)?;
         let cameras = resized(&starts, &picture).map_err(|e| e.at(path.display()))?;
         let name = path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned());
-        let located = localise::localise(&source.scene, &picture, &cameras, question, &mut |done, all| {
+        let located = localise::localise(&source.scene, &picture, &cameras, query, &mut |done, all| {
             console.phase(&format!("localising {name}"), done, all);
         })?;
         console.clear();

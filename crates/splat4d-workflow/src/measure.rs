@@ -1,6 +1,6 @@
 //! How a scene plays on this machine's CPU: who is alive, how many bytes, frames per second rendered from the capture's
-//! own cameras over its clip. Compared variants are measured in turns, image by image, so that a machine that is busy
-//! for a while slows all of them.
+//! own cameras over its clip. Compared variants are measured alternately, image by image, so that a machine that is
+//! busy for a while slows all of them.
 
 use crate::draw::color_into;
 use crate::paths::View;
@@ -23,7 +23,7 @@ use std::time::Instant;
 /// Width and height of the images by default: the frame rates of docs/benchmarks.md are at this size.
 pub const SIZE: [usize; 2] = [800, 800];
 /// Images of a round: enough that every side of the scene and all parts of the clip take part.
-const LOOKS: usize = 24;
+const VIEWS: usize = 24;
 /// Rounds of which the best of every image counts, after a warm-up round.
 const ROUNDS: usize = 5;
 /// Times that the first image is rendered from bytes; the best counts.
@@ -115,8 +115,8 @@ pub fn measured_views_of(source: &Source, size: [usize; 2]) -> Result<Vec<Measur
     }
     let stage = source.stage(&views);
     let orbit =
-        |i: usize| View { camera: stage.orbit(i as f64 / LOOKS as f64), name: i.to_string(), time: 0.0, held: false };
-    Ok(measured_views(&(0..LOOKS).map(orbit).collect::<Vec<_>>(), source.scene.clip, size))
+        |i: usize| View { camera: stage.orbit(i as f64 / VIEWS as f64), name: i.to_string(), time: 0.0, held: false };
+    Ok(measured_views(&(0..VIEWS).map(orbit).collect::<Vec<_>>(), source.scene.clip, size))
 }
 
 /// Times in the middle of equal parts of the clip, each from another camera: images of this size with the camera's
@@ -128,10 +128,10 @@ pub fn measured_views(views: &[View], clip: [f64; 2], [width, height]: [usize; 2
     let look = |i: usize| {
         let camera = cameras[i * step % cameras.len()];
         let fov_y = 2.0 * (0.5 * camera.height as f64 / camera.intrinsics.fy).atan();
-        let time = clip[0] + (clip[1] - clip[0]) * (i as f64 + 0.5) / LOOKS as f64;
+        let time = clip[0] + (clip[1] - clip[0]) * (i as f64 + 0.5) / VIEWS as f64;
         MeasuredView { camera: Camera::with_fov_y(camera.cam_from_world, fov_y, width, height), time: Time(time) }
     };
-    (0..LOOKS).map(look).collect()
+    (0..VIEWS).map(look).collect()
 }
 
 /// From camera to camera: about the golden section of the rig, so that neighbours in time differ in viewpoint, and
@@ -148,7 +148,7 @@ fn stride(cameras: usize) -> usize {
     (first..).find(|s| gcd(*s, cameras) == 1).expect("a number above the cameras' is coprime to theirs")
 }
 
-/// Measures all subjects in turns, with all threads of the current pool; one [`Side`] each, without scores.
+/// Measures all subjects alternately, with all threads of the current pool; one [`Side`] each, without scores.
 /// Panics: no samples.
 ///
 /// Errors: those of the file.
@@ -237,7 +237,7 @@ impl<'a> Seat<'a> {
     fn side(mut self) -> Result<Side> {
         let counts = frames(self.player.meta().clip, self.player.meta().fps)
             .into_iter()
-            // The pages of a time come into memory with its image.
+            // The pages of a time are loaded with its image.
             .map(|t| self.player.at(t).map(|_| ()).map(|()| self.player.alive(t)))
             .collect::<Result<Vec<usize>>>()?;
         let rate = |k: usize| self.best.len() as f64 / self.best.iter().map(|b| b[k]).sum::<f64>().max(f64::EPSILON);

@@ -190,7 +190,7 @@ impl Work {
             self.horizon
         ));
         let (views, oracle) = (Views::new(self)?, self.oracle()?);
-        // Freeze and constant velocity are what all others are compared with, requested or not.
+        // All others are compared with freeze and constant velocity, requested or not.
         let mut models = vec![Model::Freeze, Model::Velocity];
         models.extend(self.order.models.iter().filter(|m| !models.contains(m)).copied().collect::<Vec<_>>());
         let mut forecasts: Vec<Forecast> = Vec::new();

@@ -227,7 +227,7 @@ impl Run {
     pub fn origin(&self) -> Origin {
         let opened = || {
             let (root, recipe) = (self.capture()?, self.recipe().ok()?);
-            // Also masks and maps that the recipe does not look at.
+            // Also masks and maps that the recipe does not use.
             Capture::open(&root, &capture_options(&recipe).ok()?).ok()
         };
         // A capture that can no longer be opened still has the images that the run was trained on.
@@ -353,7 +353,7 @@ pub fn views_of(capture: &Capture) -> Vec<View> {
             held: capture.split(i) == Split::Held,
         }
     };
-    // A run may use a part of the capture only: `train` and `held` say which.
+    // A run may use a part of the capture only: `train` and `held` name it.
     let mut used: Vec<usize> = capture.train.iter().chain(&capture.held).copied().collect();
     used.sort_unstable();
     used.into_iter().map(view).collect()

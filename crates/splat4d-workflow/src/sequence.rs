@@ -279,7 +279,7 @@ pub fn endings() -> Vec<&'static str> {
 
 /// The last number in the name of a file that may be a frame.
 fn number_in(name: &OsStr) -> Option<u64> {
-    // Digits and the ending are ASCII: what else there is does not matter.
+    // Digits and the ending are ASCII: the rest does not matter.
     let name = name.to_string_lossy();
     let (stem, ending) = name.split_at(name.rfind('.')?);
     if name.starts_with('.') || !endings().iter().any(|e| ending.eq_ignore_ascii_case(e)) {

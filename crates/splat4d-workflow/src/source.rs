@@ -113,7 +113,7 @@ impl Source {
                 warnings: o.warnings,
                 ..Self::own(o.scene)
             }),
-            None if looks_own(&bytes) => format::scene::read(&bytes).map(Self::own).map_err(|e| e.remedy(remedy())),
+            None if is_own_format(&bytes) => format::scene::read(&bytes).map(Self::own).map_err(|e| e.remedy(remedy())),
             None => Err(foreign::unread(&name, &bytes).unwrap_or_else(|| {
                 Error::input("unknown format: its first bytes match none that splat4d reads").remedy(remedy())
             })),
@@ -178,7 +178,7 @@ impl Source {
 }
 
 /// Whether a file may be safetensors: eight bytes of length, then JSON.
-fn looks_own(bytes: &[u8]) -> bool {
+fn is_own_format(bytes: &[u8]) -> bool {
     bytes.get(8) == Some(&b'{')
 }
 

@@ -147,7 +147,7 @@ pub fn shots(
         }
         Route::Test | Route::Train => {
             let held = *route == Route::Test;
-            // Views outside the asked range are left out; a frozen time shows each camera once.
+            // Views outside the requested range are left out; a frozen time shows each camera once.
             let mut seen: Vec<&str> = Vec::new();
             let mut out = Vec::new();
             for view in views.iter().filter(|v| v.held == held) {
