@@ -323,7 +323,7 @@ mod tests {
             let error = error_after(&model, 0.0, 0.11, h);
             assert!(error < 1e-4 * h as f64, "{error} after {h}");
         }
-        // Something that grows: fitted as it is, its rollout would reach e^50.
+        // A growing signal: fitted without a bound, its rollout would reach e^50.
         let point = |t: usize| [(0.05 * t as f64).exp(), 0.0, (0.3 * t as f64).sin()];
         let growing = Paths::of_points(&(0..50).map(|t| vec![point(t), point(t + 3)]).collect::<Vec<_>>());
         let out = Koopman::fit(&growing).rollout(&growing, 1000);

@@ -373,7 +373,7 @@ pub(crate) fn rollout_loss<N: Network, F: Real>(
             let d_a = d_state.v.clone();
             net.backward(p, tape, &d_a, &mut d_state, &mut d_hidden, d);
         }
-        // What was observed has no gradient, but what it left in memory came by the weights.
+        // Observations have no gradient, but the memory state depends on the weights.
         let (nothing, mut unused) = (vec![F::ZERO; 3 * rows], State::zeros(rows));
         for tape in warm.iter().rev() {
             net.backward(p, tape, &nothing, &mut unused, &mut d_hidden, d);

@@ -304,7 +304,7 @@ mod tests {
             assert!(far < 4.5 && low > -0.05, "{name}: as far as {far}, as low as {low}");
             assert!(name == "cloth" || moved > 0.1, "{name} moves: {moved}");
         }
-        // The pendulum comes back to where it was let go: no energy is lost.
+        // The pendulum returns to its start: no energy is lost.
         let world = World::new("pendulum").unwrap();
         let height = |t: usize| world.poses[t][1].0[1];
         let top = (100..FRAMES).map(height).fold(0.0, f64::max);

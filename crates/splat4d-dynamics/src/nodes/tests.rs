@@ -65,7 +65,7 @@ fn nodes_follow_moving_regions_of_short_lived_gaussians() {
                 assert!(norm(sub(way, truth)) < tolerance, "node {k} at {t}: {way:?}, {truth:?}");
             }
         }
-        // Nothing was asked of the scene after the last tick: what is there does not matter.
+        // The scene was not evaluated after the last tick: its content there does not matter.
         let shorter = observe(&scene, &ticks()[..10], 12).unwrap();
         assert_eq!(shorter.paths.len(), 10);
     }
