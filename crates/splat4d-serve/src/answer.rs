@@ -117,7 +117,7 @@ pub(crate) async fn answer(shared: &Arc<Shared>, request: &Parts, body: Incoming
 }
 
 async fn route(shared: &Arc<Shared>, request: &Parts) -> Response<Body> {
-    // The path is compared as it is: nothing is decoded, nothing is joined to a folder.
+    // The path is compared undecoded and never joined to a folder.
     let path = request.uri.path().strip_prefix('/').unwrap_or_default();
     match path {
         SCENE => scene(shared, request),

@@ -38,7 +38,7 @@ const LEAST_TOKEN: usize = 16;
 
 /// A program's response to a page that edits.
 #[derive(Clone, Debug, Default)]
-pub struct EditAnswer {
+pub struct EditResponse {
     /// Sent to the page.
     pub told: Value,
     /// The scene from now on, a `.s4d`; `told` gets its number as `version`.
@@ -46,7 +46,7 @@ pub struct EditAnswer {
 }
 
 /// Does what a page requests.
-type Answer = dyn Fn(Value) -> Result<EditAnswer> + Send + Sync;
+type Answer = dyn Fn(Value) -> Result<EditResponse> + Send + Sync;
 
 /// Permission for pages with a token to request edits from a program.
 #[derive(Clone)]
@@ -64,7 +64,7 @@ impl fmt::Debug for Editing {
 
 impl Editing {
     /// `answer` is called on a thread of its own, on two at a time. Panics: a token that could be guessed.
-    pub fn new(token: String, answer: impl Fn(Value) -> Result<EditAnswer> + Send + Sync + 'static) -> Self {
+    pub fn new(token: String, answer: impl Fn(Value) -> Result<EditResponse> + Send + Sync + 'static) -> Self {
         assert!(token.len() >= LEAST_TOKEN && token.bytes().all(|b| b.is_ascii_alphanumeric()), "a token is random");
         Self { token, answer: Arc::new(answer), places: Arc::new(Semaphore::new(AT_ONCE)) }
     }
@@ -124,7 +124,7 @@ pub(crate) async fn answer(scene: &Scene, editing: &Editing, request: &Parts, bo
     let work = editing.answer.clone();
     let spawned = std::thread::Builder::new().name("splat4d-edit".into()).spawn(move || {
         let _place = place;
-        // A page that has gone hears nothing.
+        // A disconnected page gets no response.
         let _ = sender.send(work(asked));
     });
     // A panic of the work ends its thread, and with it the channel.
@@ -132,7 +132,7 @@ pub(crate) async fn answer(scene: &Scene, editing: &Editing, request: &Parts, bo
     match done {
         None => text(StatusCode::INTERNAL_SERVER_ERROR, "the edit failed; the terminal of splat4d shows the reason"),
         Some(Err(error)) => refused(&error),
-        Some(Ok(EditAnswer { mut told, scene: fresh })) => {
+        Some(Ok(EditResponse { mut told, scene: fresh })) => {
             if let Some(bytes) = fresh {
                 told["version"] = json!(scene.set(bytes));
             }

@@ -172,7 +172,7 @@ impl Hub {
             let _held = held;
             let mut packet = format!("retry: {RETRY}\n\n");
             loop {
-                // Marked as seen before the log is read: what comes in between is searched for again, and never missed.
+                // Marked as seen before the log is read, so that events in between are found by the next search.
                 if *newest.borrow_and_update() == CLOSED {
                     return;
                 }

@@ -59,7 +59,7 @@ mod server;
 mod write_timeout;
 
 pub use assets::{Asset, asset, assets};
-pub use edit::{EditAnswer, Editing};
+pub use edit::{EditResponse, Editing};
 pub use events::News;
 pub use page::{Page, SceneIn};
 pub use photos::{Photo, PhotoQuery, Photos};

@@ -158,7 +158,7 @@ impl Version {
                         let read = tokio::task::spawn_blocking(move || read_at(&file, at, length)).await;
                         let chunk = read.unwrap_or_else(|e| Err(io::Error::other(e)));
                         let failed = chunk.is_err();
-                        // Waits while the client is slow; fails once it has gone.
+                        // Waits while the client is slow; fails after it disconnects.
                         if sender.send(chunk).await.is_err() || failed {
                             return;
                         }

@@ -178,7 +178,7 @@ impl Running {
         self.shared.hub.close();
         self.stop.send_replace(true);
         if let Some(thread) = self.thread.take() {
-            // A panic in there is a bug of ours, and no reason to end what the caller is doing.
+            // A panic there is our bug and must not end the caller's work.
             let _ = thread.join();
         }
     }
@@ -316,7 +316,7 @@ async fn serve(stream: TcpStream, shared: Arc<Shared>, slot: OwnedSemaphorePermi
     );
     let mut stop = pin!(stopped.changed());
     let mut stopping = false;
-    // Its errors are a client's: broken requests, or gone.
+    // Its errors are the client's: broken requests or disconnections.
     let _ = poll_fn(|cx| {
         if !stopping && stop.as_mut().poll(cx).is_ready() {
             stopping = true;

@@ -1,6 +1,6 @@
 //! The whole server on loopback: valid and invalid requests, and the responses.
 
-use crate::{Config, Content, EditAnswer, Editing, News, Photo, Photos, Running, Server};
+use crate::{Config, Content, EditResponse, Editing, News, Photo, Photos, Running, Server};
 use serde_json::{Value, json};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{Shutdown, TcpStream};
@@ -493,7 +493,7 @@ fn post(server: &Running, target: &str, headers: &[(&str, &str)], body: &[u8]) -
     for (name, value) in usual.iter().filter(|(n, _)| !given(n)).chain(headers).filter(|(_, v)| !v.is_empty()) {
         request += &format!("{name}: {value}\r\n");
     }
-    // A page that promised more than it sent has gone.
+    // A page that announced more than it sent is disconnected.
     let reply = raw(server, &[(request + "\r\n").as_bytes(), body].concat(), given("content-length"));
     let end = reply.windows(4).position(|w| w == b"\r\n\r\n").expect("an answer has a head");
     let head = String::from_utf8(reply[..end].to_vec()).unwrap();
@@ -512,7 +512,7 @@ fn editor(asked: &Arc<std::sync::Mutex<Vec<Value>>>) -> Running {
             return Err(splat4d::Error::input("there is nothing to do").remedy("Give a step"));
         }
         let scene = (value["do"] == "bake").then(|| vec![7; 10].into());
-        Ok(EditAnswer { told: json!({"heard": value}), scene })
+        Ok(EditResponse { told: json!({"heard": value}), scene })
     });
     start(Config { content: Content::Bytes(bytes(1000).into()), editing: Some(editing), ..Config::default() })
 }
@@ -604,7 +604,7 @@ fn a_run_is_controlled_by_the_rules_of_edits() {
     let heard = asked.clone();
     let control = Editing::new(TOKEN.into(), move |value| {
         heard.lock().unwrap().push(value);
-        Ok(EditAnswer { told: json!({"state": "paused"}), scene: None })
+        Ok(EditResponse { told: json!({"state": "paused"}), scene: None })
     });
     let server = start(Config { live: true, control: Some(control), ..Config::default() });
     let pause = br#"{"do": "pause"}"#;
