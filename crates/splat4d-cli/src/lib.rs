@@ -186,7 +186,7 @@ where
     let (globals, work) = match C::try_parse_from(words) {
         Ok(cli) => work(cli),
         Err(error) => {
-            // clap shows the words as they are: a file's name may hold an escape sequence.
+            // clap prints arguments unescaped: a file's name may contain an escape sequence.
             let text = error.to_string();
             if text.contains(|c| splat4d::text::acts(c) && c != '\n') {
                 console::eprint_line(text.trim_end());

@@ -3,7 +3,7 @@
 use crate::console::Console;
 use serde_json::{Value, json};
 use splat4d::{Error, Result};
-use splat4d_serve::{Config, EditAnswer, Editing, News, Running, Server};
+use splat4d_serve::{Config, EditResponse, Editing, News, Running, Server};
 use splat4d_train::capture::Capture;
 use splat4d_train::event::Event as Training;
 use splat4d_train::run::Stopwatch;
@@ -45,7 +45,7 @@ pub(crate) struct Place {
 
 impl Place {
     /// Whether any of it was printed.
-    pub(crate) fn is_told(&self) -> bool {
+    pub(crate) fn is_printed(&self) -> bool {
         self.port.is_some() || self.host.is_some() || self.no_open || self.player_folder.is_some()
     }
 }
@@ -155,7 +155,7 @@ impl Control {
     }
 
     /// Does what a page requests.
-    fn answer(&self, asked: &Value) -> Result<EditAnswer> {
+    fn answer(&self, asked: &Value) -> Result<EditResponse> {
         let state = match asked["do"].as_str() {
             Some("pause") => "pausing",
             Some("continue") => "training",
@@ -166,7 +166,7 @@ impl Control {
             _ => return Err(Error::input("unknown request of the page").remedy("Reload the page")),
         };
         self.paused.store(state == "pausing", Ordering::SeqCst);
-        Ok(EditAnswer { told: json!({ "state": state }), scene: None })
+        Ok(EditResponse { told: json!({ "state": state }), scene: None })
     }
 }
 

@@ -73,7 +73,7 @@ fn help_has_examples_and_completions_complete() {
         let own = splat4d(&[verb, "--help"]).run().ok();
         assert!(own.contains("Examples:") && own.contains(&format!("splat4d {verb}")), "{verb} --help teaches nothing");
     }
-    // Options of every verb stand under their own heading, behind the verb's.
+    // Common options have their own heading, after the verb's.
     let own = splat4d(&["predict", "--help"]).run().ok();
     let (of_verb, global) = own.split_once("Global options:").expect("a heading");
     assert!(of_verb.contains("--horizon") && !of_verb.contains("--threads") && global.contains("--threads"), "{own}");
@@ -184,7 +184,7 @@ fn a_capture_is_trained_evaluated_and_exported() {
     let cached = splat4d(&["eval", str(&run), "--baseline", "--no-film", "--json"]).run().ok();
     assert!(!cached.contains("\"started\""), "the baseline is trained once");
 
-    // eval of other views; what the capture does not have is refused.
+    // eval of other views; missing splits are refused.
     let lines = splat4d(&["eval", str(&run), "--split", "train", "--json"]).run().ok();
     let lines: Vec<Value> = lines.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
     let scores = lines.iter().find(|e| e["type"] == "results").unwrap();
@@ -378,7 +378,7 @@ fn a_page_embeds_or_links_its_scene() {
     let html = std::fs::read_to_string(&page).unwrap();
     assert!(html.contains("./a%20b.s4d") && !html.contains("id=\"splat4d-scene\">"));
     assert!(std::fs::read(&linked).unwrap().starts_with(b"\x89S4D"));
-    // A playback file is taken as it is.
+    // A playback file is used unchanged.
     let again = work.path().join("again.s4d");
     splat4d(&["export", str(&linked), "--html", "-o", str(&page), "--link", str(&again)]).run().ok();
     assert_eq!(std::fs::read(&linked).unwrap(), std::fs::read(&again).unwrap());

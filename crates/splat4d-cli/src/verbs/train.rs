@@ -171,7 +171,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let stop = interrupt::flag(SAVING);
     let control = Control::new(stop.clone());
     args.measure.check()?;
-    if !args.view && args.place.is_told() {
+    if !args.view && args.place.is_printed() {
         return Err(Error::input("--port, --host and --no-open need --view").remedy("Add --view.").into());
     }
     let watched = Watched::new(args.view.then_some(&args.place), &control, console);
@@ -227,7 +227,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
 /// The recipe file, then the quality, then the options, then every --set.
 fn recipe(args: &Args) -> anyhow::Result<Recipe> {
     let mut recipe = match &args.recipe {
-        // What the capture is, is seen better than guessed: the library's default is one model.
+        // The model is chosen by the capture; the library's default is one model.
         None => Recipe::default().with(|r| r.run.motion = MotionName::AUTO),
         Some(path) => {
             // An empty one, or one of the kernel that claims to be, would be the defaults without a word.
@@ -241,7 +241,7 @@ fn recipe(args: &Args) -> anyhow::Result<Recipe> {
     let typed = |name: &str| {
         args.set.iter().any(|a| a.split_once('=').is_some_and(|(key, _)| Recipe::key_of(key.trim()) == name))
     };
-    // Another length than the file's is gone through in its own way.
+    // A length other than the file's gets its own schedule.
     if (args.iterations.is_some() || typed("run.iterations")) && args.quality.is_none() {
         recipe = recipe.unresolved();
     }

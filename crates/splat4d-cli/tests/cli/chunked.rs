@@ -43,7 +43,7 @@ fn parts_by_number_and_one_command_make_the_same_scene_and_file() {
         ("1", ["done", "done", "done"]),
     ] {
         train(&capture, &parts, &[&format!("--chunk={part}")]).ok();
-        // It plays as far as it goes, and an older reader refuses it by its version.
+        // Its present part plays, and an older reader refuses it by its version.
         let bytes = std::fs::read(&film).unwrap();
         assert_eq!(bytes[8..12], [2, 0, 0, 0], "{part}");
         let told = splat4d(&["info", str(&film), "--json"]).run().ok();

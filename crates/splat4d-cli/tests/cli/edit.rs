@@ -56,7 +56,7 @@ fn a_list_and_options_make_a_new_file() {
     assert_eq!(std::fs::read(&both).unwrap(), first);
     says(of(&[&both, "--layer", "b/others", "-o", &name("b.stg.ply")]), &["40 Gaussians of 80"]);
     says(of(&[&birds, "--count", "all"]), &["40 of 40", "0.000 s", "1.000 s"]);
-    // Provenance goes along, and away.
+    // Provenance is copied, and removed on request.
     says(of(&[&birds, &edits, "--note", "birds that agreed", "-o", &file]), &["primitives"]);
     says(splat4d(&["info", &file]), &["made with", "merge, recolor", "birds that agreed"]);
     let kept = name("kept.s4d");
@@ -65,7 +65,7 @@ fn a_list_and_options_make_a_new_file() {
     assert_eq!((told.edits.len(), told.words.as_deref()), (2, Some("birds that agreed")));
     splat4d(&["convert", &file, &kept, "--no-provenance"]).run().ok();
     assert_eq!(playback::provenance(&std::fs::read(&kept).unwrap()).unwrap(), None);
-    // A playback file edited again keeps what it was, but for what was asked.
+    // A playback file edited again keeps its content, except for the requested change.
     says(of(&[&file, "--delete", "sphere(9,0,0, 1)", "-o", &kept]), &["delete"]);
     let told = playback::provenance(&std::fs::read(&kept).unwrap()).unwrap().unwrap();
     assert_eq!(told.edits.len(), 3);

@@ -30,7 +30,7 @@ fn count(folder: &Path) -> usize {
 fn force_never_removes_a_capture() {
     let work = tempfile::tempdir().unwrap();
     let capture = Capture::new(work.path()).write();
-    // As a Blender capture has them.
+    // As in a Blender capture.
     for name in ["train", "test", "val"] {
         std::fs::create_dir_all(capture.join(name)).unwrap();
         std::fs::copy(capture.join("images/cam0/0000.png"), capture.join(name).join("r_0.png")).unwrap();

@@ -305,7 +305,7 @@ fn colmap_runs_on_request_and_its_model_is_used() {
     ]) {
         assert!(words.iter().all(|w| line.contains(w)), "{line}");
     }
-    // The world is turned to where walls and floor lie: a camera seen from the first is where the model has it.
+    // The world is aligned with walls and floor: relative poses equal those of the model.
     let made = json_of(&take.join("capture.json"));
     let from_first = |cameras: &[Value], k: usize, unit: f64| -> [[f64; 4]; 3] {
         let number = |k: usize, i: usize, j: usize| cameras[k]["world_to_camera"][i][j].as_f64().unwrap();
@@ -350,7 +350,10 @@ fn unconfirmed_time_offsets_are_refused_and_can_be_given() {
     );
     assert!(refused.contains("--synchronous") && refused.contains("keep_offset"), "{refused}");
     assert!(!take.join("capture.json").exists());
-    assert!(take.join("import/report.json").is_file() && take.join("images/cam08").is_dir(), "results so far are kept");
+    assert!(
+        take.join("import/report.json").is_file() && take.join("images/cam08").is_dir(),
+        "existing results are kept"
+    );
     // The times of the files, on the user's word.
     import(&["--synchronous"]).ok();
     let report = json_of(&take.join("import/report.json"));
@@ -417,7 +420,7 @@ fn unsupported_inputs_are_refused_with_a_reason() {
     }
     let alone = refused(&far, &[]);
     assert!(alone.contains("20 degrees"), "{alone}");
-    // Given clocks so far apart that no time is shared.
+    // Given time offsets without a common time.
     let path = take.join("import.toml");
     let text = std::fs::read_to_string(&path).unwrap();
     let mut offsets = ["0.0", "100.0"].iter();
