@@ -43,7 +43,7 @@ pub(crate) fn write(py: Python<'_>, arrays: &Arrays<'_, '_>, folder: &Path) -> P
     if done.is_err() {
         for path in &written {
             let _ = std::fs::remove_file(path);
-            // Folders go when they are empty; those of the user are not.
+            // Folders are removed when empty; those of the user are not empty.
             path.ancestors().skip(1).take_while(|f| *f != folder).for_each(|f| drop(std::fs::remove_dir(f)));
         }
     }

@@ -6,7 +6,7 @@ use numpy::PyUntypedArrayMethods;
 use pyo3::prelude::*;
 use splat4d::scene::Planes;
 use splat4d_train::loss::Photometric;
-use splat4d_train::loss::image::{self, ImageTerm, Needs, PictureGrads, Shown};
+use splat4d_train::loss::image::{self, ImageTerm, LossGrads, Needs, Shown};
 use splat4d_train::loss::terms::StepInfo;
 use splat4d_train::run::OwnLoss;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -63,7 +63,7 @@ impl ImageTerm for RunRequest {
         Needs::default()
     }
 
-    fn eval(&mut self, info: &StepInfo, view: &image::View<'_>, shown: &Shown<'_>, d: &mut PictureGrads) -> f64 {
+    fn eval(&mut self, info: &StepInfo, view: &image::View<'_>, shown: &Shown<'_>, d: &mut LossGrads) -> f64 {
         let seen = View { time: view.t.0, frame: view.frame, camera: view.rig, iteration: info.iteration };
         let answer = Python::attach(|py| self.request(py, seen, shown.color, view.truth, d.color.add()));
         answer.unwrap_or_else(|error| {
@@ -84,7 +84,7 @@ impl RunRequest {
         truth: &Planes<f32>,
         d: &mut Planes<f32>,
     ) -> PyResult<f64> {
-        // Copies: Python may keep what it is given.
+        // Copies, because Python may keep its arguments.
         let answer = self.function.call1(py, (picture(py, shown.clone())?, picture(py, truth.clone())?, view))?;
         let wrong = "the loss did not return a value and a gradient";
         let remedy = "Return (float, array [h, w, 3])";

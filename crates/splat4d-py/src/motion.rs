@@ -377,7 +377,7 @@ impl Motion for PyMotion {
         }
         let answer = std::mem::take(tape.own.get_or_default::<Answer>());
         if answer.tape.is_none() {
-            return 0.0; // what it could not answer has no gradient; the error is on its way
+            return 0.0; // a failed query has no gradient; the error is raised later
         }
         Python::attach(|py| self.hand_back(py, q, &answer, d_out, d)).unwrap_or_else(|error| {
             self.hook.raised.raise(error);

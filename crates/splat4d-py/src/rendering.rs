@@ -186,7 +186,7 @@ impl Rendering {
                 let mut d_sh = sh_grads(&splats, &mut grads);
                 renderer.backward(&shot, &pixels, &mut d_sh, &mut d);
             }
-            // The same answers take another gradient when this is called again.
+            // Another call backpropagates another gradient through the same results.
             scene.at(self.time, seen);
             seen.activate(&mut grads);
             d.add_to(scene, self.time, seen, &mut grads);
