@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 const USAGE: &str = "\
 usage: fuzz [--minutes N | --seconds N] [--executions N] [--seed S] [--reader NAME]
   --minutes N      time for all readers together (default 2)
-  --executions N   at most so many inputs a reader
+  --executions N   at most this many inputs per reader
   --seed S         other inputs (default 1)
   --reader NAME    this reader alone";
 
@@ -91,7 +91,7 @@ fn child(options: &Options) -> Result<()> {
             }
             let begun = Instant::now();
             (reader.read)(&input);
-            // A process that had to wait for a processor is not slow: what took long is read again by the processor's
+            // A process that had to wait for a processor is not slow: slow inputs are read again by the processor's
             // clock.
             if begun.elapsed() >= SLOWEST {
                 let (begun, before) = (Instant::now(), processor_time());
