@@ -69,7 +69,7 @@ fn to_json(f: &Findings) -> Value {
 fn markdown(args: &Args, clean: &[Findings], noisy: &Findings) -> String {
     let last = args.frames - 1;
     let mut out = format!(
-        "# E01: scene flow lifted from optical flow\n\nA sphere moves along x, a cube turns about y, a wall stands still; \
+        "# E01: scene flow lifted from optical flow\n\nA sphere moves along x, a cube turns about y, a wall is static; \
          {} frames of exact flow. Lifted with the depth of one frame, motion along the viewing direction is missing; \
          positions are the sum of lifted flow. Errors are at frame {last}.\n\n\
          | sphere, units/frame | cube, °/frame | repeating frame 0, MSE | following flow, MSE | times better | \

@@ -71,7 +71,7 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
-    // What cannot work is reported before anything takes time.
+    // Impossible settings are reported before any work.
     let trials = args.runs.iter().map(|path| Trial::open(path, args)).collect::<anyhow::Result<Vec<_>>>()?;
     check_names(&trials)?;
     let file = args.output.join("e03.json");
@@ -81,7 +81,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     for trial in &trials {
         let grid = &trial.grid;
         let cells = grid.cells();
-        // A retrained run must not continue from what another scene has left.
+        // A retrained run must not continue from another scene's files.
         let work = args.output.join("work").join(format!("{}-{}", trial.name, trial.print));
         let others: Vec<_> = study.runs.iter().filter(|f| f.run != trial.path).cloned().collect();
         let progress = |cell: &Cell, Place { number, of, left }: Place| {
@@ -202,7 +202,7 @@ impl Trial {
         let subjects = [&self.scene, scene].map(|s| Subject { what: What::Scene(s), antialias });
         let sides =
             in_turns(&subjects, &self.measured_views, &mut |done, total| console.phase("playing", done, total))?;
-        // A folder that stays costs room, not truth.
+        // A remaining folder costs only disk space.
         let _ = std::fs::remove_dir_all(&folder);
         let [source, side] = <[Side; 2]>::try_from(sides).expect("two subjects give two sides");
         let [speed, raster_speed] = [side.fps / source.fps, side.raster_fps / source.raster_fps];

@@ -302,7 +302,7 @@ mod tests {
         let [none, once, twice] = [0, 1, 2].map(|i| f.smoothing[i]);
         assert!(once.step_rmse < none.step_rmse && twice.step_rmse < once.step_rmse, "{:?}", f.smoothing);
         assert!((twice.last_mse / none.last_mse - 1.0).abs() < 0.02, "integration telescopes: {:?}", f.smoothing);
-        // Noise alone is a random walk; looking at every frame has no walk at all.
+        // Noise alone is a random walk; using every frame has no random walk.
         assert!(f.both_depths_mse * 8.0 < f.lifted_mse);
         assert!(f.fitted_mse < f.both_depths_mse, "{} {}", f.fitted_mse, f.both_depths_mse);
         assert_eq!(run(&noisy), f, "the same seed, the same numbers");

@@ -36,7 +36,7 @@ Every cell is a run of its \
                         own (DIR/CAPTURE-MODEL), trained by `splat4d train` on images of half size, measured on \
                         the
 held-out views and played on the CPU at 800x800. A run that is there is not trained \
-                        again: the same command goes on where
+                        again: the same command continues where
 it was stopped. The table is printed and written to \
                         DIR/models.md, the numbers to DIR/models.json.";
 
@@ -183,7 +183,7 @@ fn train(capture: &Path, model: &str, folder: &Path, args: &Args, stop: &AtomicB
         return Ok(None);
     }
     let text = std::fs::read_to_string(&log).unwrap_or_default();
-    let error = text.lines().find_map(|l| l.strip_prefix("error: ")).unwrap_or("it ended without a word");
+    let error = text.lines().find_map(|l| l.strip_prefix("error: ")).unwrap_or("it ended without a message");
     Ok(Some(error.to_owned()))
 }
 

@@ -35,7 +35,7 @@ pub(crate) struct FolderContent {
     pub key: String,
     pub words: String,
     pub side: Side,
-    /// Frames a second end to end, over those of the source measured in turns with it.
+    /// Frames a second end to end, over those of the source measured alternately with it.
     pub speed: f64,
     /// The same of the blend stage alone.
     pub raster_speed: f64,

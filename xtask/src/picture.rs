@@ -48,8 +48,8 @@ pub(crate) fn cut_out(textures: [&Texture; 2], frame: &Frame, camera: &Camera, s
     out
 }
 
-/// Shades every sample, filters the samples to pixels and hands out each pixel's linear colour (nothing is black) and
-/// the share that moving objects cover, rows from the top.
+/// Shades every sample, filters the samples to pixels and returns each pixel's linear colour (nothing is black) and the
+/// share that moving objects cover, rows from the top.
 fn each_pixel(
     textures: [&Texture; 2],
     frame: &Frame,

@@ -102,7 +102,7 @@ pub(crate) fn tracked_vertices(frame: &Frame, views: &[(&Camera, &Visibility)]) 
     let mut out = Vec::with_capacity(TRACKS);
     for range in &frame.skinned {
         let candidates: Vec<usize> = range.clone().filter(seen).collect();
-        assert!(candidates.len() >= half, "a character shows {} vertices, {half} are wanted", candidates.len());
+        assert!(candidates.len() >= half, "a character shows {} vertices, {half} are needed", candidates.len());
         out.extend((0..half).map(|i| candidates[i * candidates.len() / half]));
     }
     out

@@ -224,7 +224,7 @@ pub(super) fn table(rows: &[Row]) -> String {
         let mut text = String::new();
         for (c, cell) in line.iter().enumerate() {
             let w = widths[c];
-            // Names and remarks stand left, numbers right.
+            // Names and remarks are left-aligned, numbers right-aligned.
             let _ = if c < 2 || c + 1 == columns { write!(text, "{cell:<w$}  ") } else { write!(text, "{cell:>w$}  ") };
         }
         let _ = writeln!(out, "{}", text.trim_end());

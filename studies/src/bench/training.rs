@@ -137,7 +137,7 @@ fn stage(scene: &Scene<f32>, extent: f64) -> Result<Stage> {
     let mut stages = recipe.program()?.stages(&plan);
     let mut stage = stages.swap_remove(0);
     (stage.iterations, stage.sh_interval, stage.half_size_steps) = (FOR_EVER, 0, 0);
-    // Programs speak of layer 0; here all layers learn.
+    // Programs refer to layer 0; here all layers learn.
     let of_first = std::mem::take(&mut stage.groups);
     for layer in 0..scene.layers.len() {
         stage.groups.extend(of_first.iter().map(|g| Group { layer, ..g.clone() }));

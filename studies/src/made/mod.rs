@@ -329,7 +329,7 @@ hand-held-60 36359dac295000bb
         let angle = dot(own.cam_from_world.rotation[2], told.cam_from_world.rotation[2]).acos().to_degrees();
         assert!((angle - 3.0).abs() < 1e-9 && norm(sub(own.center(), told.center())) < 1e-12);
         assert!(told.cam_from_world.orthogonality_error() < 1e-12 && !camera.held);
-        // What enters is in no image of the first half, and in all of the last.
+        // The entering object is in no image of the first half, and in all of the last.
         let enters = of("enters");
         let number = enters.world.things.len() - 1;
         let shown = |viewer: &Viewer, moment: usize| {

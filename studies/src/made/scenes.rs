@@ -8,7 +8,7 @@ const SIZE: [usize; 2] = [160, 120];
 const FOCAL: f64 = 140.0;
 /// Distance of the cameras from their target, scene units.
 const RADIUS: f64 = 4.0;
-/// Heights of neighbouring cameras, in turns.
+/// Heights of neighbouring cameras, alternately.
 const HEIGHTS: [f64; 2] = [1.1, 1.9];
 /// Target of rigs.
 const TARGET: V3 = [0.0, 0.7, -0.3];
@@ -20,7 +20,7 @@ const MOMENTS: usize = 10;
 const FEW_MOMENTS: usize = 5;
 /// Distance of a far background, in distances of the cameras.
 const FAR: f64 = 100.0;
-/// Gains of training cameras, in turns: their product is 1, so that the held-out cameras represent their mean.
+/// Gains of training cameras, alternately: their product is 1, so that the held-out cameras represent their mean.
 const GAINS: [f64; 4] = [0.65, 1.25, 1.0 / 0.65, 0.8];
 /// Turn of a pose that is wrong: 3°.
 const WRONG: f64 = 3.0 * std::f64::consts::PI / 180.0;
@@ -111,7 +111,7 @@ pub(crate) fn scene(name: &str) -> Option<Scene> {
         "wrong-pose" => {
             let mut scene = room();
             let camera = scene.viewers.iter_mut().filter(|v| !v.held).nth(WRONG_CAMERA);
-            camera.expect("the rig has so many training cameras").wrong = WRONG;
+            camera.expect("the rig has enough training cameras").wrong = WRONG;
             scene
         }
         "enters" => {
@@ -206,7 +206,7 @@ fn camera(eye: V3, target: V3) -> Pinhole {
     Pinhole { cam_from_world: Se3::look_at(eye, target, [0.0, 1.0, 0.0]), focal: FOCAL, size: SIZE }
 }
 
-/// Cameras on an arc before the scene, at two heights in turns.
+/// Cameras on an arc before the scene, at two alternating heights.
 fn arc(count: usize, half: f64, held: &[usize]) -> Vec<Viewer> {
     let viewer = |i: usize| {
         let (sin, cos) = sin_cos(half * (2.0 * i as f64 / (count - 1) as f64 - 1.0));
@@ -231,7 +231,7 @@ fn grid() -> Vec<Viewer> {
 fn hand_held(moments: usize) -> Scene {
     let pose = |i: usize| {
         let at = i as f64 / (moments - 1) as f64;
-        // Two sways sideways and three up and down, as a hand has them.
+        // Two sways sideways and three up and down, as of a hand-held camera.
         let turn = |times: f64| sin_cos(std::f64::consts::PI * ((times * at) % 2.0 - 1.0)).0;
         let eye = [1.2 * (2.0 * at - 1.0) + 0.25 * turn(4.0), 1.2 + 0.2 * turn(6.0), 2.6 + 0.2 * turn(2.0)];
         camera(eye, [0.3 * (2.0 * at - 1.0), 0.8 + 0.05 * turn(6.0), -1.0])

@@ -93,7 +93,7 @@ impl List {
     /// Reads the list of a file, or the one that belongs to the program.
     pub(crate) fn open(file: Option<&Path>) -> Result<Self> {
         let Some(path) = file else {
-            return Ok(Self::parse(DEFAULT).expect("the suite's own list is sound, as its test says"));
+            return Ok(Self::parse(DEFAULT).expect("the suite's own list is valid, as its test checks"));
         };
         Self::parse(&files::read_text(path)?).map_err(|e| e.at(path.display()))
     }

@@ -142,7 +142,7 @@ struct Order<'a> {
 }
 
 pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
-    // What cannot work is reported before anything takes time.
+    // Impossible settings are reported before any work.
     let list = List::open(args.list.as_deref())?;
     let entries = list.only(&args.only)?;
     let baseline = args.baseline.as_deref().map(Results::read).transpose()?;
@@ -214,7 +214,7 @@ fn orders<'a>(args: &Args, list: &List, entries: &[&'a Entry], console: &Console
             let mut recipe = recipe.clone();
             recipe.run.iterations *= more;
             if recipe.run.checkpoint_interval == 0 {
-                // A checkpoint is a look at the training views.
+                // Training views are evaluated at every checkpoint.
                 recipe.run.checkpoint_interval = (recipe.run.iterations / PROBES).max(1);
             }
             let told = [program.as_str(), &folder.display().to_string(), &recipe.flat_toml()].join("\n");
@@ -264,7 +264,7 @@ fn measure(order: &Order<'_>, args: &Args, stop: &AtomicBool, console: &Console)
         evaluating::playback(&run, console)?;
         found.playback_psnr = Run::open(&run)?.number("playback_psnr");
     }
-    // The scene stays, to look at; checkpoints are three times its size.
+    // The scene is kept for inspection; checkpoints are three times its size.
     checkpoint::list(&run).iter().try_for_each(std::fs::remove_file).map_err(|e| files::cannot_write(&run, e))?;
     Ok(found)
 }

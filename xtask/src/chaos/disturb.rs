@@ -61,7 +61,7 @@ pub(super) fn disturb(
             let ended = program.run(words, place, Some(kilobytes))?;
             check_said(&ended)?;
             ensure!(ended.code != Some(2), "a full disk is not the user's fault: {}", ended.said);
-            if ended.code == Some(0) { "it fitted".into() } else { "refused for want of space".into() }
+            if ended.code == Some(0) { "it fitted".into() } else { "refused for lack of space".into() }
         }
         Disturbance::TwoOwners => {
             let mut first = program.start(words, place, None)?;
@@ -103,7 +103,7 @@ pub(super) fn disturb(
             check_said(&ended)?;
             drop(guard);
             ensure!(ended.code != Some(2), "a read-only folder is not the user's fault: {}", ended.said);
-            if ended.code == Some(0) { "it was done before".into() } else { "refused for want of rights".into() }
+            if ended.code == Some(0) { "it was done before".into() } else { "refused for lack of rights".into() }
         }
     })
 }

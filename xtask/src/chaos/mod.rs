@@ -153,7 +153,7 @@ impl Bench<'_> {
         let undisturbed = &self.undisturbed[verb.name];
         let words = (verb.words)(self.setup, &place);
         let how = disturb::disturb(kind, &self.setup.program, &words, &place, undisturbed, random)?;
-        // Whatever came to pass, the same command ends as if nothing had, or has ended so already.
+        // After any disturbance the same command ends like an undisturbed one, or has already ended so.
         let last = self.setup.program.run(&words, &place, None)?;
         check_said(&last)?;
         let found = result(&place)?;

@@ -53,7 +53,7 @@ impl Program {
     /// Starts a call.
     pub(crate) fn start(&self, words: &[OsString], place: &Path, limit: Option<u64>) -> Result<Call> {
         let mut child = self.command(words, place, limit).spawn().context("the program cannot be started")?;
-        let mut pipe = child.stderr.take().expect("it was asked for");
+        let mut pipe = child.stderr.take().expect("it was requested");
         let said = std::thread::spawn(move || {
             let mut bytes = Vec::new();
             let _ = pipe.read_to_end(&mut bytes);
@@ -68,7 +68,7 @@ impl Program {
     }
 }
 
-/// A call under way.
+/// A running call.
 pub(crate) struct Call {
     child: Child,
     said: Option<std::thread::JoinHandle<String>>,
@@ -76,7 +76,7 @@ pub(crate) struct Call {
 }
 
 impl Call {
-    /// Waits so long, or until it ends. Returns whether it is still under way.
+    /// Waits so long, or until it ends. Returns whether it is still running.
     pub(crate) fn wait(&mut self, time: Duration) -> Result<bool> {
         let began = Instant::now();
         while began.elapsed() < time {

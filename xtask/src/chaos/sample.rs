@@ -25,7 +25,7 @@ pub(super) fn write(folder: &Path, frames: usize) -> Result<()> {
 fn camera(folder: &Path, number: usize, frames: usize) -> Result<Value> {
     let angle = APART * (number as f64 - 1.5);
     let (sin, cos) = angle.sin_cos();
-    // It is at (d sin, 0, -d cos), and looks at the origin; y points down.
+    // It is at (d sin, 0, -d cos), and points at the origin; y points down.
     let rotation = [[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]];
     for frame in 0..frames {
         let (mut color, mut label) = (Vec::new(), Vec::new());

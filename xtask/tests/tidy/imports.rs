@@ -179,7 +179,7 @@ const ORDER: [(&str, &[&str]); 9] = [
 
 /// Modules that a module must not import although they are before it: the design's first invariant.
 const NEVER: [(&str, &str, &[&str]); 1] = [
-    // The renderer knows no time: it sees splats, not the models and layers that make them.
+    // The renderer does not depend on time: it gets splats, not the models and layers that make them.
     ("crates/splat4d", "render", &["motion", "layers"]),
 ];
 
