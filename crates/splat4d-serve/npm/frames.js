@@ -169,9 +169,9 @@ export class Frames {
   /// Why pages are missing, the newest reason.
   #failure = null;
 
-  /// `source`: an address, File, Blob or ArrayBuffer. `onchange()` is called when pages came: what `at` returns changes
-  /// then. `onerror(error)`: a page could not be read, for example of a truncated file. `budget`: bytes of pages that
-  /// stay in memory.
+  /// `source`: an address, File, Blob or ArrayBuffer. `onchange()` is called when pages arrived: what `at` returns
+  /// changes then. `onerror(error)`: a page could not be read, for example of a truncated file. `budget`: bytes of
+  /// pages that stay in memory.
   constructor(source, { onchange = () => {}, onerror = () => {}, budget } = {}) {
     this.ready = SceneFile.open(source).then((file) => {
       if (this.#gone) return file.close();

@@ -20,10 +20,10 @@ const { ROW } = globalThis.splat4dSort;
 /// Rows of the words' texture to begin with.
 const FIRST_ROWS = 32;
 const AXES = { x: [1, 0, 0], y: [0, 1, 0], z: [0, 0, 1] };
-/// Stands for a clock that waits for pages: no other time can be rendered.
+/// Marks a clock that waits for pages: no other time can be rendered.
 const HOLD = () => null;
 
-// The image's rows go up here, so that `focal.y` is negative; `origin`: where the viewport begins.
+// The image's rows run upwards here, so that `focal.y` is negative; `origin`: where the viewport begins.
 const VERTEX =
   SPLAT.replace('#version 300 es\n', '') +
   `
@@ -176,7 +176,7 @@ export class Splat4D extends THREE.Mesh {
     return this.#schedule.shown?.time ?? this.#time;
   }
 
-  /// Plays by itself from now on, as often as it is rendered.
+  /// Plays from now on, as often as it is rendered.
   play() {
     if (this.#playing) return;
     const [first, last] = this.meta?.clip ?? [0, Infinity];
@@ -343,7 +343,7 @@ export class Splat4D extends THREE.Mesh {
     if (accepted) this.#onchange();
   }
 
-  /// Takes up the order that came last.
+  /// Applies the latest order.
   #turn() {
     const { order, count, generation } = this.#next,
       u = this.material.uniforms,

@@ -24,7 +24,7 @@ function colour(text) {
   return digits?.map(x => parseInt(x + (x.length === 1 ? x : ''), 16) / 255) ?? null;
 }
 
-/** 'x,y,z tx,ty,tz [fov]': where the camera is, what it looks at, degrees. */
+/** 'x,y,z tx,ty,tz [fov]': where the camera is, its target, degrees. */
 function place(text) {
   const n = (text ?? '').split(/[\s,]+/).filter(Boolean).map(Number);
   if (![6, 7].includes(n.length) || n.some(x => !isFinite(x))) return undefined;
@@ -56,7 +56,7 @@ export class Splat4D extends HTMLElement {
     for (const name of EVENTS) {
       player.addEventListener(name, e => this.dispatchEvent(new CustomEvent(name, { detail: e.detail })));
     }
-    // What is wrong with the file for good is an error for the page as well; what only takes another try is not.
+    // Permanent faults of the file are errors for the page as well; temporary ones are not.
     player.addEventListener('trouble', ({ detail: { error, lasting } }) => {
       const { what, where, remedy } = error;
       if (lasting) this.dispatchEvent(new CustomEvent('error', { detail: { error, what, where, remedy } }));
@@ -72,7 +72,7 @@ export class Splat4D extends HTMLElement {
     }
     if (this.hasAttribute('page')) {
       addEventListener('hashchange', this.#hash);
-      // While the page still asks what to show. A failure is reported when there is a scene to render.
+      // While the page has not chosen a scene. A failure is reported when there is a scene to render.
       player.prepare().catch(() => {});
     }
     this.#load();
@@ -115,7 +115,7 @@ export class Splat4D extends HTMLElement {
     set[name]?.();
   }
 
-  /** Several attributes set in one go open the scene once. */
+  /** Several attributes set together open the scene once. */
   #load() {
     if (this.#queued) return;
     this.#queued = true;

@@ -1,5 +1,5 @@
-// What Gaussians are part of (docs/format.md, "Labels"), shown as colours, or one label alone: pages are changed on
-// their way to the backend, which knows nothing of labels.
+// Labels of Gaussians (docs/format.md, "Labels") as colours, or one label alone: pages are changed on
+// their way to the backend, which does not handle labels.
 
 /// 32-bit words a Gaussian, Gaussians a block, f32 numbers of its header (docs/format.md).
 const WORDS = 8,
@@ -7,7 +7,7 @@ const WORDS = 8,
   HEADER = 24;
 /// The byte of a Gaussian without a label.
 const NONE = 255;
-/// Turn of the hue from one label to the next: the golden section, as `splat4d render --channel label` has it.
+/// Turn of the hue from one label to the next: the golden section, as in `splat4d render --channel label`.
 const GOLDEN = 0.618034;
 const GREY = 0x808080;
 

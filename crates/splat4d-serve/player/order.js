@@ -7,7 +7,7 @@ const { Sorter } = globalThis.splat4dSort;
 
 /// One order is on its way at a time. schedule.js decides which one is requested and when.
 export class Order {
-  /// Counts pages that came and went, and masks; an order carries the number it was computed with.
+  /// Counts added and dropped pages, and masks; an order carries the number it was computed with.
   generation = 0;
   /// Whether an order is on its way.
   busy = false;
@@ -94,7 +94,7 @@ export class Order {
     const array = this.#sorter.room(order);
     const { count, active } = this.#sorter.sort(sort, array);
     const ms = performance.now() - begin;
-    // Later, as a worker's result would come: the caller has finished its own work then.
+    // Later, like a worker's result: the caller has finished its own work then.
     setTimeout(() => this.#arrived({ order: array, count, active, ms, generation }), 0);
   }
 

@@ -7,7 +7,7 @@ async function config() {
   if (globalThis.SPLAT4D_CONFIG) return globalThis.SPLAT4D_CONFIG;
   const inline = document.getElementById('splat4d-config');
   if (inline) return JSON.parse(inline.textContent);
-  // A page opened from a disk has no server to ask.
+  // A page opened from a disk has no server.
   if (!location.protocol.startsWith('http')) return {};
   try {
     const answer = await fetch('./config.json');

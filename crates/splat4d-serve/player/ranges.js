@@ -44,7 +44,7 @@ export class Local {
   close() {}
 }
 
-/// A URL. `open` makes the first request and learns whether the server knows ranges.
+/// A URL. `open` makes the first request and detects whether the server supports ranges.
 export class Remote {
   bytesRead = 0;
   /// Length of the whole, bytes; Infinity where the server hides it (Content-Range is not shown across origins).
@@ -140,7 +140,7 @@ export class Remote {
     }
   }
 
-  /// Fetches jobs that lie behind one another, in one request; each is answered as soon as its bytes are there.
+  /// Fetches jobs that lie behind one another, in one request; each resolves as soon as its bytes arrived.
   async #fetch(run) {
     const stop = new AbortController();
     const leave = () => stop.abort();

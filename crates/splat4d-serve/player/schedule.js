@@ -73,7 +73,7 @@ export class Schedule {
     const { at, epoch, view } = wanted;
     let { time } = wanted;
     if (at) {
-      // One that has come is rendered first; where sorting takes longer than a frame, the next is computed meanwhile.
+      // A finished one is rendered first; where sorting takes longer than a frame, the next is computed meanwhile.
       if (this.fresh && !(this.current.took > this.#interval)) return false;
       // Never back: a latency that shrinks slows the clock down until they agree.
       this.#due = Math.max(this.#due + CATCH_UP * (now - this.#askedAt), now + this.latency);
@@ -103,8 +103,8 @@ export class Schedule {
     return true;
   }
 
-  /// An order came. Returns whether it is `current`, and rendered next. What the newest image was rendered from must be
-  /// kept until then: `want` may return to it.
+  /// An order arrived. Returns whether it is `current`, and rendered next. What the newest image was rendered from must
+  /// be kept until then: `want` may return to it.
   arrived(now) {
     const asked = this.#asked;
     if (asked.generation < this.#least || this.#skips(asked)) return false;
@@ -178,7 +178,7 @@ export class Follower {
     this.#now = now;
   }
 
-  /// The function that gives the clock's time at a later `performance.now()`; null where it stands still.
+  /// The function that gives the clock's time at a later `performance.now()`; null where it is stopped.
   at([first, last]) {
     if (!this.#rate) return null;
     return (ms) => {
@@ -190,7 +190,8 @@ export class Follower {
   }
 }
 
-/// A clock that was not set for so long stands still, s; after a longer gap it has jumped, s; so does a faster one.
+/// A clock that was not set for this long counts as stopped, s; after a longer gap it has jumped, s; so does a faster
+/// one.
 const STILL = 0.05,
   PAUSE = 1,
   RATE_MAX = 8;

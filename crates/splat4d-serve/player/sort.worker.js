@@ -156,7 +156,7 @@ class Sorter {
     if (page) page.mask = new KeyMask(mask);
   }
 
-  /// `order` where it has room for all, else a new one: whole rows of ROW numbers.
+  /// `order` if it is large enough, else a new one: whole rows of ROW numbers.
   room(order) {
     const rows = Math.ceil(this.total / ROW);
     return order?.length >= rows * ROW ? order : new Uint32Array(rows * ROW);
@@ -231,7 +231,7 @@ class Sorter {
       starts[key] = sum;
       sum += here;
     }
-    // Front to back equal depths go by number, so back to front they go backwards.
+    // Equal depths are ordered by number front to back, so reversed back to front.
     for (let i = n - 1; i >= 0; i--) out[starts[keys[i]]++] = ids[i];
     return { count: n, active };
   }

@@ -1,5 +1,5 @@
 // Keeps the right pages in a backend: first those of this time (most important tier first), then those just ahead;
-// above its budget it lets go of what is farthest in time, never of what this time needs.
+// above its budget it drops the pages farthest in time, never of what this time needs.
 
 import { isAbort } from './errors.js';
 import { painted } from './labels.js';
@@ -61,14 +61,14 @@ export class Stream {
   #over = false;
   #starts;
   #ends;
-  /// Pages of the coarsest tier of their span, and those of now that the budget has no room for.
+  /// Pages of the coarsest tier of their span, and those of now that exceed the budget.
   #coarse;
   #leftOut = new Set();
 
   /// `file`: SceneFile. `backend`: of PLAYER's interface; it owns the arrays it is given. `budget`: bytes of words.
-  /// `onchange()` after each page that came or went, `onerror(SceneError)` for a page that is given up for now,
+  /// `onchange()` after each page that was added or dropped, `onerror(SceneError)` for a page that is given up for now,
   /// `onleft(Gaussians)` when a time first does not fit into the budget. `show`: labels as `painted` needs it, null:
-  /// pages are shown as they are.
+  /// pages are shown unchanged.
   constructor(file, backend, { budget = defaultBudget(), onchange, onerror, onleft, show = null } = {}) {
     this.#show = show;
     this.#file = file;
@@ -92,7 +92,7 @@ export class Stream {
     return this.#bytes;
   }
 
-  /// Gaussians of this time that the budget has no room for: those of the last tiers.
+  /// Gaussians of this time that exceed the budget: those of the last tiers.
   left = 0;
 
   /// Pages on their way.
@@ -110,7 +110,7 @@ export class Stream {
       [this.#begun, this.#ended, this.#active] = [begun, ended, this.#file.activePages(t)];
     }
     const active = this.#active;
-    // What lies ahead is looked at again in coarse steps only.
+    // Later times are examined again in coarse steps only.
     const reach = playing ? Math.max(Math.abs(speed), 0.1) * AHEAD : BESIDE;
     const step = Math.floor((t / reach) * STEP);
     const last = this.#last;
@@ -135,7 +135,7 @@ export class Stream {
   }
 
   /// Whether an image of `time` would be whole: of every span the coarsest tier is resident, or it was given up, or the
-  /// budget has no room for it.
+  /// budget does not allow it.
   playable(time) {
     return this.#pagesOf(time).every(({ id }) => {
       if (!this.#coarse.has(id) || this.#resident.has(id) || this.#leftOut.has(id)) return true;
@@ -214,7 +214,7 @@ export class Stream {
     const { time, playing, speed } = this.#last;
     const far = (page) => {
       const gap = page.from > time ? page.from - time : Math.max(time - page.to, 0);
-      // While it plays, what has just passed is needed later than what comes.
+      // While it plays, past pages are needed later than coming ones.
       const passed = playing && (speed >= 0 ? page.to <= time : page.from > time);
       return passed ? gap + AHEAD : gap;
     };
@@ -314,7 +314,7 @@ export class Stream {
     return there;
   }
 
-  /// Answers `settled` where nothing of this time is on its way any more.
+  /// Resolves `settled` when nothing of this time is being loaded.
   #wake() {
     if (!this.#waiting.length) return;
     if (this.#now.some((page) => this.#flight.has(page.id) || this.#wants(page))) return;

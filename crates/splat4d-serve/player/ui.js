@@ -7,7 +7,7 @@ import { button, bytes, choice, clock, h, pick, retool, save, segments, shown, t
 import { clamp } from './camera.js';
 import { icon } from './icons.js';
 
-/** Quiet seconds after which the controls go: soon while something plays, later where nothing does. */
+/** Quiet seconds after which the controls hide: soon while something plays, later where nothing does. */
 const IDLE_PLAYING = 2.5;
 const IDLE_STILL = 8;
 /** Milliseconds that a short notice stays. */
@@ -68,7 +68,7 @@ export class Interface {
     this.bar = h('div', { class: 'card bar', role: 'toolbar', 'aria-label': 'Playback' }, this.scrub,
       h('div', { class: 'row' }, this.play, ...steps, this.timeLabel, h('div', { class: 'space' }),
         this.embed ? null : this.loopTool, this.embed ? null : this.speed, ...spare, this.xrTool, this.arTool, this.full));
-    // Without room, an element of a user's page keeps what plays.
+    // Without space, an element of a user's page keeps what plays.
     for (const item of [this.back, this.next, this.loopTool, this.speed, ...spare]) item.classList.add('spare');
     this.root.classList.toggle('page', this.page);
     this.panels = { cameras: cameraPanel(this), view: viewPanel(this) };
@@ -134,9 +134,9 @@ export class Interface {
       on(name, () => this.refresh());
     }
     on('scene', () => {
-      // The server knows more of the capture's cameras than the file.
+      // The server has more data of the capture's cameras than the file.
       if (this.capture?.cameras) p.meta.cameras = this.capture.cameras;
-      // What lies behind the scene, also where a poster leaves it free and before the first image.
+      // The background of the scene, also where a poster leaves it free and before the first image.
       const back = p.background ?? p.meta.background;
       this.stage.style.background = `rgb(${back.map(x => Math.round(255 * clamp(x, 0, 1)))})`;
     });
@@ -541,7 +541,7 @@ export class Interface {
   #turnKey(e, down) {
     const way = e.key.match(/^Arrow(Left|Right|Up|Down)$/)?.[1];
     if (!way) return false;
-    // Letting shift go first must not leave the turn on.
+    // Releasing shift first must not leave the turn on.
     if (down && !e.shiftKey) return false;
     return this.player.controls.key(`Turn${way}`, down);
   }

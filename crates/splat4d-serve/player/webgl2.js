@@ -142,7 +142,7 @@ export class WebGL2Backend {
     return this.#gl;
   }
 
-  /// Begins another scene: what was resident goes.
+  /// Begins another scene: resident pages are dropped.
   setScene(meta) {
     for (const id of [...this.#pages.keys()]) this.dropPage(id);
     this.#palettes.clear();
@@ -365,7 +365,7 @@ export class WebGL2Backend {
       rows = Math.ceil(count / ORDER_WIDTH);
     if (back.rows < rows) {
       gl.deleteTexture(back.texture);
-      // Room for all that is resident, so that it does not grow in small steps.
+      // Space for all resident pages, so that it does not grow in small steps.
       back.rows = Math.min(Math.max(order.length / ORDER_WIDTH, 2 * back.rows), this.#maxRows);
       back.texture = texture(gl, gl.R32UI, ORDER_WIDTH, back.rows);
     }
@@ -425,7 +425,7 @@ export class WebGL2Backend {
     return true;
   }
 
-  /// Takes up the order that came last.
+  /// Applies the latest order.
   #turn() {
     const { count, active, ms, generation } = this.#next;
     this.#front = 1 - this.#front;
@@ -517,7 +517,7 @@ export class WebGL2Backend {
     gl.disable(gl.BLEND);
   }
 
-  /// Writes the sums as an image; `turned`: its height where rows go from the bottom.
+  /// Writes the sums as an image; `turned`: its height where rows run from the bottom.
   #resolve(framebuffer, x, y, turned) {
     const gl = this.#gl,
       { program, at } = this.#show,
