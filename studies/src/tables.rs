@@ -15,7 +15,7 @@ pub(crate) fn markdown(findings: &Findings, grid: &Grid) -> String {
             out,
             "\n{} Gaussians, {} as 32-bit floats; fine-tuning takes {} steps. PSNR is that of the held-out views, \
              `moving` is that of dynamic regions. Frames a second are the CPU's, end to end (blending alone), times those of \
-             the source, which were measured in turns with them.\n",
+             the source, which were measured alternately with them.\n",
             grouped(source.side.gaussians),
             human_bytes(source.side.float_bytes),
             grouped(grid.steps)
