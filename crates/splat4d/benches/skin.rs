@@ -77,8 +77,8 @@ fn forward_and_backward(bencher: Bencher<'_, '_>, threads: usize) {
     });
 }
 
-/// What skinning must read and write once as copies: 11 numbers, 2 hyper coordinates and 8 candidates of every Gaussian
-/// in, 10 out, twice for the backward.
+/// Minimum memory traffic of skinning: 11 numbers, 2 hyper coordinates and 8 candidates of every Gaussian in, 10 out,
+/// twice for the backward.
 #[divan::bench(sample_count = SAMPLES)]
 fn ceiling_bytes(bencher: Bencher<'_, '_>) {
     const BYTES: usize = GAUSSIANS * (11 + 2 + 8 + 10) * 4 * 2;

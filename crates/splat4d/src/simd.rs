@@ -39,7 +39,7 @@ impl Simd {
         }
     }
 
-    /// What files and reports call it. NEON is what every 64-bit ARM machine has.
+    /// Its name in files and reports. Every 64-bit ARM machine has NEON.
     pub fn name(self) -> &'static str {
         match self {
             Simd::Scalar if cfg!(target_arch = "aarch64") => "neon",

@@ -27,7 +27,7 @@ pub(crate) const RANGES: &str = include_str!("gpu/ranges.wgsl");
 pub(crate) const RASTERIZE: &str = include_str!("gpu/rasterize.wgsl");
 /// Planes → 8 bits per channel. After `PROJECT`.
 pub(crate) const BYTES: &str = include_str!("gpu/bytes.wgsl");
-/// What both ways back of the blend share. After `PROJECT`.
+/// Shared code of both backward passes of the blend. After `PROJECT`.
 pub(crate) const BLEND_BACK: &str = include_str!("gpu/blend_back.wgsl");
 /// Sums over subgroups. After `BLEND_BACK`.
 pub(crate) const SUBGROUP_SUMS: &str = include_str!("gpu/subgroup_sums.wgsl");
@@ -53,7 +53,7 @@ pub(crate) const SLICE_ANSWER: &str = include_str!("gpu/slice_answer.wgsl");
 pub(crate) const SLICE_BACK: &str = include_str!("gpu/slice_back.wgsl");
 /// Losses on rows: `count_rows`, `row_losses`. After `LEARNT` and `NUMBERS`.
 pub(crate) const ROW_LOSSES: &str = include_str!("gpu/row_losses.wgsl");
-/// What holds the poses of a tracked frame: `turns_of`, `hold`. After `LEARNT`.
+/// Ties of the poses of a tracked frame: `turns_of`, `hold`. After `LEARNT`.
 pub(crate) const TIES: &str = include_str!("gpu/ties.wgsl");
 /// Noise on positions. After `LEARNT` and `NUMBERS`.
 pub(crate) const SHAKE: &str = include_str!("gpu/shake.wgsl");

@@ -32,12 +32,12 @@ const PROBED: usize = 400;
 /// Mean squared error of images by motion between time samples that is let pass: 46 dB, a quarter of what 40 dB allow.
 const BETWEEN: f64 = 2.5e-5;
 
-/// Where motion that is not straight is split.
+/// Criterion for splits of nonlinear motion.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Cut {
-    /// Where a segment misses by more than this many pixels.
+    /// If a segment misses by more than this many pixels.
     Tolerance(f64),
-    /// Where it lowers the mean squared error of images by more than this price of a segment ([`Curve`]).
+    /// If it lowers the mean squared error of images by more than this price of a segment ([`Curve`]).
     Price(f64),
 }
 

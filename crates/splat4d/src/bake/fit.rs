@@ -221,7 +221,7 @@ impl Fitter<'_> {
         self.or_tail(subject, samples, (life, opacity), miss)
     }
 
-    /// What was found, or one side of an envelope where a cross-fade makes that a better fit.
+    /// The found envelope, or one side of an envelope where a cross-fade makes that a better fit.
     fn or_tail(
         &self,
         subject: &Subject<'_>,

@@ -1,10 +1,10 @@
 //! Ranks primitives by the change of images without them, so that a part of a file looks like the whole.
 //!
-//! What a primitive covers states little: a large one behind a wall, or one of its neighbours' colour, is not missed.
-//! Renders of the baked scene at times spread over the clip measure what the removal of each primitive changes. A short
-//! lifespan lies between two renders or on one by chance; therefore the change is measured for each unit of squared
-//! opacity, and then weighed by the time for which the primitive is there. A static primitive and one that is there for
-//! a tenth of the clip then count by what they add to the mean squared error of all frames.
+//! The area of a primitive is a poor measure: a large one behind a wall, or one of its neighbours' colour, is not
+//! missed. Renders of the baked scene at times spread over the clip measure what the removal of each primitive changes.
+//! A short lifespan lies between two renders or on one by chance; therefore the change is measured for each unit of
+//! squared opacity, and then weighed by the time for which the primitive is there. A static primitive and one that is
+//! there for a tenth of the clip then count by what they add to the mean squared error of all frames.
 
 use super::Options;
 use crate::format::playback::{Node, Primitive, as_layers};
@@ -28,7 +28,7 @@ const UNSEEN: f64 = 0.02;
 /// step with time.
 const GOLDEN: f64 = 0.618_033_988_749_894_9;
 
-/// What was measured for one primitive.
+/// Measurements of one primitive.
 #[derive(Clone, Copy, Default)]
 struct ImageChange {
     /// Change of the image, mean squared error, and squared opacity, over the renders at whose time it is there.

@@ -25,7 +25,7 @@ pub(super) struct Row {
     pub seen: [f64; 2],
     /// First and last frame that was examined.
     pub frames: Span,
-    /// Where its samples begin.
+    /// Offset of its samples.
     offset: usize,
 }
 

@@ -52,7 +52,7 @@ struct GaussianSums {
     still: [f64; 2],
 }
 
-/// What was measured, by layer and row.
+/// The measurements, by layer and row.
 #[derive(Debug)]
 pub(super) struct Weights {
     seen: Vec<Vec<GaussianSums>>,

@@ -1,4 +1,4 @@
-//! What the steps do to a scene.
+//! Effects of the steps on a scene.
 
 use super::clock::{retime, seen_in, window};
 use super::limits::{Size, check_clip, check_room};

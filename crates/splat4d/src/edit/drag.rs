@@ -34,7 +34,7 @@ pub(super) fn usual_nodes() -> usize {
     NODES
 }
 
-/// What is pulled.
+/// The pulled point.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DragHandle {
@@ -47,7 +47,7 @@ pub struct DragHandle {
     pub keys: Vec<DragKey>,
 }
 
-/// Where a handle is, from where it would be.
+/// Displacement of a handle.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DragKey {
@@ -175,7 +175,7 @@ impl Held {
         Ok(Self { pinned, pulled })
     }
 
-    /// What becomes of nodes at `rest` whose handles are displaced.
+    /// Positions of nodes at `rest` after the handles are displaced.
     fn offsets(&self, elastic: &Elastic, rest: &[[f64; 3]], by: &[[f64; 3]]) -> Result<Vec<NodeOffset>> {
         let mut handles: Vec<Handle> = Vec::new();
         let mut hold = |node: usize, by: [f64; 3]| {
@@ -209,7 +209,7 @@ fn unmoved(rest: &[[f64; 3]]) -> Vec<NodeOffset> {
 pub struct Dragging {
     scene: Scene<f32>,
     elastic: Elastic,
-    /// Where the nodes are meant, and where they are at the time that is shown.
+    /// Defining positions of the nodes, and those at the shown time.
     places: Vec<[f64; 3]>,
     nodes: Vec<[f64; 3]>,
     /// Of the layers that bend: their place, and which nodes pull their rows.
@@ -264,12 +264,12 @@ impl Dragging {
         Ok(out)
     }
 
-    /// Where the nodes are meant: they define what handles and pins take.
+    /// Defining positions of the nodes: they determine what handles and pins take.
     pub fn places(&self) -> &[[f64; 3]] {
         &self.places
     }
 
-    /// Where the nodes are before anything is pulled.
+    /// Positions of the nodes before any pull.
     pub fn nodes(&self) -> &[[f64; 3]] {
         &self.nodes
     }

@@ -112,7 +112,7 @@ pub enum Step {
     },
     /// Deletes all others.
     Crop {
-        /// What stays.
+        /// The selection to keep.
         select: String,
     },
     /// They are not seen for from ≤ t < to.
@@ -156,7 +156,7 @@ pub enum Step {
     Move {
         /// What.
         select: String,
-        /// Where to, at all times.
+        /// The transform, at all times.
         #[serde(default)]
         to: Option<Place>,
         /// Or at key times.
@@ -213,14 +213,14 @@ pub enum Step {
     },
     /// Control nodes are pulled by handles over time; everything between follows as rigidly as possible.
     Drag {
-        /// What is bent.
+        /// The selection to deform.
         select: String,
         /// Second at which the places below are meant.
         at: f64,
         /// Nodes; 0: those that the model has.
         #[serde(default = "drag::usual_nodes")]
         nodes: usize,
-        /// What is pulled, and where to.
+        /// The pulled points and their targets.
         handles: Vec<DragHandle>,
         /// Spheres [x, y, z, radius] whose nodes stay.
         #[serde(default)]
@@ -281,7 +281,7 @@ pub struct Mask {
     pub white: Vec<bool>,
 }
 
-/// What edits name and a scene does not hold. The methods of the trait itself have nothing: they return errors.
+/// Data that edits name and a scene does not contain. The methods of the trait itself have nothing: they return errors.
 pub trait Context {
     /// The camera of that name.
     fn camera(&self, name: &str) -> Result<Camera> {
@@ -313,8 +313,8 @@ pub trait Context {
         Err(missing("training view", "Give the run folder of a capture that is still there"))
     }
 
-    /// Where nodes that are at `start` at `times[first]` are at all `times`, `[times][nodes]`: carried by the Gaussians
-    /// `among`.
+    /// Positions at all `times` of nodes that are at `start` at `times[first]`, `[times][nodes]`: carried by the
+    /// Gaussians `among`.
     fn follow(
         &self,
         scene: &Scene<f32>,
@@ -329,7 +329,7 @@ fn missing(what: &str, remedy: &str) -> Error {
     Error::input(format!("there is no {what}")).remedy(remedy.to_owned())
 }
 
-/// What a step did.
+/// Effect of a step.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Done {
     /// The step's name.

@@ -51,11 +51,11 @@ pub enum Expr {
     Mask(String, String),
     /// On the subject of the capture's masks.
     Subject,
-    /// What holds at that second.
+    /// The inner selection at that second.
     At(f64, Box<Expr>),
-    /// What holds at any time of a Gaussian's lifespan.
+    /// The inner selection at any time of a Gaussian's lifespan.
     Ever(Box<Expr>),
-    /// What holds at all of them.
+    /// The inner selection at all of them.
     Always(Box<Expr>),
     /// These and all within a distance of one of them, scene units.
     Grow(Box<Expr>, f64),
@@ -70,7 +70,7 @@ pub enum Expr {
 /// A polygon on an image, and the depth behind it that counts.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Lasso {
-    /// Where the image was seen from, scene units.
+    /// Position of the image's camera, scene units.
     pub eye: [f64; 3],
     /// World from camera, wxyz of any length but zero; camera axes are OpenCV's.
     pub turn: [f64; 4],

@@ -27,12 +27,12 @@ const HALF: f64 = 0.5;
 /// Standard deviations of the nearest Gaussian (all three axes together) within which it carries a place.
 const REACH: f64 = 4.0;
 
-/// Where a point is at the time of its query.
+/// Position of a point at the time of its query.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Place {
     /// There, scene units.
     World([f64; 3]),
-    /// What this pixel position shows.
+    /// The surface at this pixel position.
     Pixel(Box<Camera>, [f64; 2]),
 }
 
@@ -45,7 +45,7 @@ pub struct Query {
     pub place: Place,
 }
 
-/// Where points are at some times.
+/// Positions of points at some times.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Followed {
     /// Seconds.
@@ -126,7 +126,7 @@ pub fn follow(scene: &Scene<f32>, queries: &[Query], times: &[f64]) -> Followed 
     out
 }
 
-/// What a camera sees of points at one time.
+/// Points seen by a camera at one time.
 pub fn sights(scene: &Scene<f32>, camera: &Camera, t: Time, points: &[Option<[f64; 3]>]) -> Vec<Option<PointView>> {
     let mut seen = ActiveGaussians::default();
     seen.look(scene, t.0);
@@ -294,7 +294,7 @@ impl ActiveGaussians {
         unreachable!("splats are those of the tapes")
     }
 
-    /// Where a Gaussian is; `None`: it is not alive.
+    /// Position of a Gaussian; `None`: it is not alive.
     fn mean(&self, member: Member) -> Option<[f64; 3]> {
         let tape = self.evaluation.tape(member.layer);
         let j = match tape.rows() {

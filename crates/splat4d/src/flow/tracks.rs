@@ -17,7 +17,7 @@ pub struct Member {
     pub row: u32,
 }
 
-/// Where some Gaussians are at some times.
+/// Positions of some Gaussians at some times.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Tracks {
     /// Seconds.
@@ -62,7 +62,8 @@ impl Tracks {
         &self.points[member * self.times.len()..(member + 1) * self.times.len()]
     }
 
-    /// With `offset` added in f64. As JSON: `{"version": 1, "times": [s], "tracks": [{"layer": name, "gaussian": row, "points": [[x, y, z] or null]}]}`.
+    /// With `offset` added in f64. As JSON:
+    /// `{"version": 1, "times": [s], "tracks": [{"layer": name, "gaussian": row, "points": [[x, y, z] or null]}]}`.
     pub fn to_json<F: Real>(&self, scene: &Scene<F>, offset: [f64; 3]) -> String {
         let mut out = format!("{{\"version\":1,\"times\":{:?},\"tracks\":[", self.times);
         for (i, m) in self.members.iter().enumerate() {

@@ -90,12 +90,12 @@ pub struct PlyInfo {
     pub mended: Mended,
     /// Whether base colours are RGB (`red green blue`), not coefficients.
     pub rgb: bool,
-    /// What was subtracted from positions in double precision that are far from the origin, or what the file states
+    /// The offset subtracted from positions in double precision that are far from the origin, or stated by the file
     /// was.
     pub offset: [f64; 3],
     /// Whether the numbers were quantised (PlayCanvas' compressed layout).
     pub compressed: bool,
-    /// What was assumed or is not read, in sentences without a full stop.
+    /// Assumptions and unread content, in sentences without a full stop.
     pub assumed: Vec<String>,
     /// The header's comments.
     pub comments: Vec<String>,
@@ -135,17 +135,17 @@ pub fn still(params: Params) -> Scene<f32> {
 }
 
 impl Dialect {
-    /// What a file is by its content. `None`: none of these, or of one without a mark.
+    /// The kind of a file by its content. `None`: none of these, or of one without a mark.
     pub(crate) fn of(bytes: &[u8]) -> Option<Self> {
         DIALECTS.iter().rev().find(|d| d.mark.is_some_and(|mark| mark(bytes))).copied()
     }
 
-    /// What a file is by its content; by the ending of its name where the content does not decide.
+    /// The kind of a file by its content; by the ending of its name where the content does not decide.
     pub fn of_file(name: &str, bytes: &[u8]) -> Option<Self> {
         Self::of(bytes).or_else(|| Self::by_ending(name).filter(|d| d.mark.is_none()))
     }
 
-    /// What a file with this name should be.
+    /// The kind of a file by its name.
     pub fn by_ending(name: &str) -> Option<Self> {
         let name = name.to_ascii_lowercase();
         DIALECTS.iter().filter(|d| name.ends_with(d.ending)).max_by_key(|d| d.ending.len()).copied()
@@ -161,7 +161,7 @@ impl Dialect {
         (self.read)(bytes).map(|opened| self.finish(opened))
     }
 
-    /// What [`open`](Self::open) does after reading: sets the up direction and repairs values at the edge. For files
+    /// The part of [`open`](Self::open) after reading: sets the up direction and repairs values at the edge. For files
     /// that are read with others next to them ([`gltf::read_text`](super::gltf::read_text)).
     pub fn finish(&self, mut opened: Opened) -> Opened {
         opened.scene.up = opened.up.unwrap_or(self.up);

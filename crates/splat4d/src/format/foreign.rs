@@ -6,9 +6,9 @@ use crate::{Error, ErrorKind};
 struct Foreign {
     /// Whether bytes are such a file.
     is: fn(&[u8]) -> bool,
-    /// What the file is.
+    /// The kind of file.
     what: &'static str,
-    /// What to do in its place.
+    /// The remedy.
     remedy: &'static str,
 }
 
@@ -97,7 +97,7 @@ const FOREIGN: [Foreign; 15] = [
 
 /// How packed files begin: 7z, RAR, Zstandard, xz, bzip2. (.spz begins as gzip does.)
 const PACKED: [&[u8]; 5] = [b"7z\xbc\xaf\x27\x1c", b"Rar!\x1a\x07", b"\x28\xb5\x2f\xfd", b"\xfd7zXZ\0", b"BZh"];
-/// What to do with a mesh.
+/// Remedy for a mesh.
 const MESH: &str = "A mesh holds no Gaussians. Its points can start a training: give them to a capture as .ply.";
 
 /// Endings of formats without a mark.

@@ -18,7 +18,7 @@ pub(super) const SHORTEST: f64 = 0.02;
 /// Length that is assumed where no number of frames is stated, seconds.
 const UNKNOWN_CLIP: f64 = 1.0;
 
-/// What a Gaussian has in addition to 3DGS, a row each.
+/// Columns in addition to 3DGS, one row per Gaussian.
 pub(super) struct Moves {
     pub(super) times: Vec<f32>,
     pub(super) log_durations: Vec<f32>,

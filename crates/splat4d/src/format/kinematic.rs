@@ -22,7 +22,7 @@ const NARROWEST: f64 = 1e-7;
 /// Assumed length of a file without a clock of its own: one second.
 const UNKNOWN_CLIP: f64 = 1.0;
 
-/// Where the file's 0 and 1 are on the scene clock.
+/// The file's 0 and 1 on the scene clock.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Clock {
     /// First and last second of the clip.

@@ -39,7 +39,7 @@ pub fn metadata(scene: &Scene<f32>) -> Value {
     about(scene, scene.layers.iter().map(Stated::of).collect())
 }
 
-/// What a file's metadata states of a layer.
+/// A layer in a file's metadata.
 struct Stated {
     json: Value,
     framed: bool,

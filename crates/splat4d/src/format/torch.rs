@@ -19,7 +19,7 @@ const MOST_PICKLE: usize = 64 << 20;
 /// Most axes of a tensor that is believed.
 const MOST_AXES: usize = 16;
 
-/// What a pickle may call. All of them make plain data.
+/// Functions that a pickle may call. All of them make plain data.
 const CALLABLES: [&str; 4] = [
     "torch._utils _rebuild_tensor_v2",
     "torch._utils _rebuild_parameter",
@@ -467,7 +467,7 @@ impl<'a> Machine<'a> {
         Ok(Value::Storage { kind, key: self.words(key)?.to_owned(), numbers })
     }
 
-    /// What a callable of [`CALLABLES`] makes; anything else is not made.
+    /// The result of a callable of [`CALLABLES`]; anything else is refused.
     fn call(&self, callable: Id, arguments: Id) -> Result<Value> {
         let Value::Global(name) = &self.objects[callable] else { return Ok(Value::Opaque) };
         let arguments = self.items(arguments);

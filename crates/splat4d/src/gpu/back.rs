@@ -48,7 +48,7 @@ pub(super) struct Layout {
     all: u64,
 }
 
-/// What a submission of the backward pass leaves to the CPU.
+/// Results of a submission of the backward pass for the CPU.
 pub(super) struct Came {
     /// Gradient to the background, by tile.
     pub sums: Vec<f32>,
@@ -58,14 +58,14 @@ pub(super) struct Came {
     pub camera: [f64; CAMERA],
     /// Splats, visible ones, pairs.
     pub counts: Vec<u32>,
-    /// What the tiles add to the loss.
+    /// Contributions of the tiles to the loss.
     pub partials: Vec<f32>,
     /// Milliseconds of the wait, and of the stages.
     pub wait: f64,
     pub stages: [f64; STAGES],
 }
 
-/// Where a backward pass ends.
+/// End of a backward pass.
 #[derive(Clone, Copy)]
 pub(super) enum End {
     /// At sums of records, to which another band adds.

@@ -40,7 +40,7 @@ pub(super) mod count {
     pub(crate) const SPLATS: usize = 0;
     pub(crate) const VISIBLE: usize = 1;
     pub(crate) const PAIRS: usize = 2;
-    /// Where steps on tables that stay have stopped (scan.wgsl, record.wgsl), and the pairs that were needed.
+    /// Position at which resident steps stopped (scan.wgsl, record.wgsl), and the pairs that were needed.
     pub(crate) const STOP: usize = 3;
     pub(crate) const ALL: usize = 5;
 }
@@ -301,7 +301,7 @@ impl Frame<'_> {
     }
 }
 
-/// What the backward pass of a frame runs over.
+/// Range of a frame's backward pass.
 #[derive(Clone, Copy)]
 pub(super) struct Back<'a> {
     /// The frame before.

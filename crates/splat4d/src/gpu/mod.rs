@@ -462,7 +462,7 @@ impl Backend<f32> for GpuRenderer {
     }
 }
 
-/// What a submission does in addition to rendering a band.
+/// Work of a submission in addition to rendering a band.
 #[derive(Clone, Copy, Debug, Default)]
 struct Way {
     /// Of the backward pass, flags and place of the sums in `Blend`.

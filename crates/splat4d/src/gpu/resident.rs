@@ -180,7 +180,7 @@ impl Tables {
         self.upload.bytes() + own + self.pages.iter().map(ResidentBuffers::bytes).sum::<u64>()
     }
 
-    /// What a step of this many views leaves in the status.
+    /// Status record of a step of this many views.
     fn status(&self, views: usize) -> Status {
         let bad = STEP_WORDS + VIEW_WORDS * views;
         let alive = bad + self.layers * KEPT;

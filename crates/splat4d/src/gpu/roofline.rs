@@ -1,4 +1,4 @@
-//! What a GPU could do at best, measured: the numbers that the speed of a stage is a share of.
+//! Measured upper bounds of a GPU's throughput, for the lower bounds of stage times.
 
 use super::buffers::Grown;
 use super::kernels::{Kernel, Kind};

@@ -37,7 +37,7 @@ impl Default for Tuning {
     }
 }
 
-/// What a sweep tries. More splats a batch or a round need more than the 16 KiB of workgroup memory that every device
+/// Values of a sweep. More splats a batch or a round need more than the 16 KiB of workgroup memory that every device
 /// has.
 const ROW_THREADS: [usize; 2] = [64, 128];
 const ROUNDS: [usize; 3] = [2, 4, 16];
@@ -67,7 +67,7 @@ impl Tuning {
         out
     }
 
-    /// What is not as by default, `name=value`.
+    /// Deviations from the default, `name=value`.
     pub fn changes(&self) -> Option<String> {
         let numbers = |t: &Self| {
             [

@@ -74,7 +74,7 @@ pub struct Gaussians {
 const ROWS: usize = 1024;
 
 impl Gaussians {
-    /// What `seen` holds after [`Scene::at`], all layers together. Colours: [`Gaussians::sh`].
+    /// The content of `seen` after [`Scene::at`], all layers together. Colours: [`Gaussians::sh`].
     pub fn of(scene: &Scene<f32>, seen: &Evaluation) -> Self {
         let rows = seen.tapes().map(|t| t.out().rows()).sum();
         let mut all = Self {

@@ -1,4 +1,4 @@
-//! Where one set of cameras is in the world of another, and how far they are apart there.
+//! Alignment of one set of cameras with another, and their distances after it.
 
 use super::mat3::procrustes;
 use super::se3::{dot, mat_mul, mat_vec, norm, sub, transpose};

@@ -44,7 +44,7 @@ pub struct Handle {
 /// The result of a drag.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Dragged {
-    /// Where every node is now.
+    /// Current positions of the nodes.
     pub positions: Vec<[f64; 3]>,
     /// How every node has turned (rows).
     pub rotations: Vec<[[f64; 3]; 3]>,

@@ -151,7 +151,7 @@ fn capabilities(inner: Capabilities, change: &Change) -> Capabilities {
 pub(crate) struct Edited<F: Real = f32> {
     inner: Arc<dyn Motion<F>>,
     change: Change,
-    /// Where a drag has its numbers.
+    /// Location of a drag's numbers.
     drag: Option<drag::Keys>,
 }
 

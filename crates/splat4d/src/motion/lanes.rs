@@ -211,7 +211,7 @@ impl<F: Real, W: Work<F, N>, const N: usize> Kernel for Fill<'_, F, W, N> {
     }
 }
 
-/// Where at least one row in this many of a run of rows takes part, whole blocks are worked on, idle lanes included.
+/// If at least one row in this many of a run of rows takes part, whole blocks are worked on, idle lanes included.
 const DENSE: usize = 4;
 
 struct Scatter<'a, F, W, const N: usize> {

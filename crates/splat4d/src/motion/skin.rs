@@ -151,8 +151,8 @@ impl Skin {
     /// Makes or claims the tables in `p`: nodes at farthest points of the Gaussians, as wide as they are apart, all
     /// bound.
     ///
-    /// Where the layer has fewer Gaussians than `spec.nodes`, there are as many nodes as Gaussians. Errors: numbers of
-    /// the spec out of range, loaded arrays of the wrong shape.
+    /// If the layer has fewer Gaussians than `spec.nodes`, there are as many nodes as Gaussians. Errors: numbers of the
+    /// spec out of range, loaded arrays of the wrong shape.
     pub(crate) fn new<F: Real>(spec: SkinSpec, seed: u64, p: &mut Params<F>) -> Result<Self> {
         spec.check()?;
         let rows = p.len();

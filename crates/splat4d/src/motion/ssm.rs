@@ -220,7 +220,7 @@ impl Field {
         Ok(Self { spec: spec.clone(), net, embeddings, context })
     }
 
-    /// Where t is among the ticks.
+    /// Position of t among the ticks.
     fn knots<F: Real>(&self, t: Time) -> Knots<F> {
         let [first, last] = self.spec.clip;
         let per_second = (self.spec.ticks - 1) as f64 / (last - first);

@@ -111,7 +111,7 @@ pub trait Backend<F: Real = f32>: Send {
         Ok(None)
     }
 
-    /// Where whole steps are taken on the device, on tables that stay there; none: it has no such way.
+    /// The interface for whole steps on tables that stay on the device; none: unsupported.
     fn resident(&mut self) -> Option<&mut dyn Resident> {
         None
     }

@@ -72,7 +72,7 @@ pub struct ResidentLayer<'a> {
     pub tables: [ResidentTable<'a>; KEPT],
     /// Sum of |dL/dmean2d|, number of views that rendered it, largest radius: three columns.
     pub stats: &'a [f32],
-    /// What the poses of a [`Moves::Posed`] layer are held by.
+    /// Ties of the poses of a [`Moves::Posed`] layer.
     pub ties: Option<&'a ResidentTies>,
 }
 
@@ -148,7 +148,7 @@ pub struct ResidentCameras<'a> {
     pub held: &'a [usize],
 }
 
-/// What one table learns by.
+/// Learning rule of one table.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ResidentRule {
     /// A rate a column; 0: frozen.

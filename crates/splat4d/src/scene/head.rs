@@ -22,7 +22,7 @@ pub const HEAD_IN: &str = "head.in";
 /// Name of the table of W₂, 3 x `HIDDEN`, row-major, one column.
 pub const HEAD_OUT: &str = "head.out";
 
-/// Where the weights of a head are: two `Fixed` tables in the parameters of a layer.
+/// Location of a head's weights: two `Fixed` tables in the parameters of a layer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct HeadKeys {
     /// W₁

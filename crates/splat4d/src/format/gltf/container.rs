@@ -21,7 +21,7 @@ const CHUNK: usize = 8;
 const ALIGN: usize = 4;
 /// Beginning of the data URI of a buffer, up to its media type.
 const DATA: &str = "data:";
-/// What is before the bytes of a data URI.
+/// Prefix of a data URI.
 const BASE64: &str = ";base64,";
 /// Media type of buffers (glTF 2.0, 3.6.1.1).
 const MEDIA: &str = "data:application/octet-stream;base64,";

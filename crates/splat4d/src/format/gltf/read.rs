@@ -232,7 +232,7 @@ fn warnings_once(warnings: &mut Warnings, text: Option<String>) {
     warnings.append(one);
 }
 
-/// Where a node is in the one above. Errors: axes of different scale, mirrors.
+/// Placement of a node in its parent. Errors: axes of different scale, mirrors.
 fn placement(node: &Value) -> Result<Sim3> {
     let numbers = |key: &str, count: usize| -> Option<Vec<f64>> {
         let list = node[key].as_array().filter(|l| l.len() == count)?;

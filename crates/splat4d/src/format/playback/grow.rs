@@ -149,7 +149,7 @@ pub fn finish(source: &mut (impl Read + Seek), meta: Meta, poster: Option<&[u8]>
     Ok(index.file_len)
 }
 
-/// What the first image needs: the first tier of its pages, what colours them, the rest of them; then time continues.
+/// Sections of the first image: the first tier of its pages, what colours them, the rest of them; then time continues.
 /// Palettes come before the first page that names them, masks behind their page, labels behind everything. Equal ones
 /// are ordered by their bytes, so that the order of additions does not change the file.
 fn order(index: &Index) -> Vec<usize> {

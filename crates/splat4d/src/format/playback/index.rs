@@ -34,7 +34,7 @@ pub enum Kind {
     Palette,
     /// Which Gaussians of a page are rendered when.
     Masks,
-    /// What the Gaussians of a page are part of.
+    /// Labels of the Gaussians of a page.
     Labels,
     /// Feature channels of the Gaussians of a page.
     Features,

@@ -63,7 +63,7 @@ pub(super) fn of(vertex: &Element) -> Result<Columns> {
     Ok(Columns { geometry: columns, sh, rgb: rgb.is_some(), thickness, filter: vertex.find(FILTER) })
 }
 
-/// What was assumed of the columns, and what `extra` properties change though they are not read.
+/// Assumptions about the columns, and effects of `extra` properties that are not read.
 pub(super) fn assumptions(rgb: bool, thickness: Thickness, filtered: bool, extra: &[String]) -> Vec<String> {
     let mut out = Vec::new();
     let mut say = |when: bool, what: &str| out.extend(when.then(|| what.to_owned()));

@@ -109,7 +109,7 @@ pub(super) struct Header {
     pub(super) encoding: Encoding,
     pub(super) comments: Vec<String>,
     pub(super) elements: Vec<Element>,
-    /// Where the body begins.
+    /// Offset of the body.
     pub(super) body: usize,
 }
 

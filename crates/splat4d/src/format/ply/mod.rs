@@ -154,8 +154,8 @@ fn open(bytes: &[u8]) -> Result<Opened> {
     Ok(opened)
 }
 
-/// What follows the rows of the last element, if it is not only space: rows that the header does not count, or bytes
-/// that a copy in text mode added. `rows` are those of the last element.
+/// Data after the rows of the last element, if it is not only space: rows that the header does not count, or bytes that
+/// a copy in text mode added. `rows` are those of the last element.
 fn surplus(header: &Header, rows: &Rows<'_>) -> Option<String> {
     let element = header.elements.last().filter(|e| e.name == "vertex" || e.name == "sh")?;
     let after = rows.after();

@@ -31,7 +31,7 @@ pub const STG: Dialect = Dialect {
 
 /// Numbers of a row as [`names`] lists them.
 const WIDTH: usize = 32;
-/// Where groups begin in a row.
+/// Offsets of groups in a row.
 const TRBF: usize = 3;
 const MOTION: usize = 8;
 const COLOR: usize = 17;

@@ -31,7 +31,7 @@ const MOST_TAIL: u64 = 1 << 20;
 /// one is granted up to the plain length.
 const WINDOW: u64 = 8 << 20;
 
-/// What a file holds.
+/// Content of a file.
 pub(super) struct Opened<'a> {
     pub(super) header: Header,
     pub(super) streams: Streams<'a>,

@@ -93,7 +93,7 @@ fn write_archive(scene: &Scene<f32>, options: &WriteOptions, out: &mut dyn Write
     Ok(warnings)
 }
 
-/// What to do with a layer that is not text.
+/// Error for a layer that is not text.
 fn binary() -> Error {
     Error::new(ErrorKind::Unsupported, "the layer is binary (.usdc), which is not read").remedy(
         "Convert it to text with `usdcat IN.usdc -o OUT.usda`, or in Python: Usd.Stage.Open('IN.usdc').Export('OUT.usda').",

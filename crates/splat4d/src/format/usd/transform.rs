@@ -1,4 +1,4 @@
-//! Where the transforms of a prim and its parents place it.
+//! Placement of a prim by its transforms and those of its parents.
 
 use super::lexer::Value;
 use super::stage::{Prim, Stage};

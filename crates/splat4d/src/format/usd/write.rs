@@ -130,7 +130,7 @@ fn opacity(p: &Params, row: usize) -> f32 {
     if logit <= HIDDEN { 0.0 } else { 1.0 / (1.0 + (-logit).exp()) }
 }
 
-/// What changes over the clip, and its box.
+/// Attributes that change over the clip, and its box.
 struct Survey {
     varies: [bool; ARRAYS.len()],
     extent: [[f32; 3]; 2],

@@ -17,7 +17,7 @@ const FRAMES: usize = 3;
 /// The step that the frames belong to, for the capacity for pairs.
 const VIEW: u32 = 1;
 
-/// What is filmed.
+/// Content of a film.
 struct Film<'a> {
     alpha_min: f64,
     background: [f32; 3],

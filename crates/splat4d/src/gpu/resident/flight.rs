@@ -21,7 +21,7 @@ use std::collections::VecDeque;
 /// Steps that are in flight at most: enough that a hiccup of the CPU of some steps' length is not seen, few enough that
 /// what they hold (an image each, where images are not kept) is little.
 pub(in crate::gpu) const AHEAD: usize = 8;
-/// What stops steps because a number is none (record.wgsl).
+/// Flag that stops steps because of a non-finite number (record.wgsl).
 const NOT_FINITE: u32 = u32::MAX;
 
 /// A view of a step that was begun.

@@ -16,7 +16,7 @@ const REACH: usize = 4;
 /// Below this 1 − cos θ, θ/sin θ is taken from its series, whose next term is then below 1e-12.
 const SMALL_TURN: f64 = 1e-6;
 
-/// Where keys are in time.
+/// Times of keys.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Timeline {
     curve: Curve,

@@ -128,7 +128,7 @@ impl<'a, F: Real> Pulls<'a, F> {
         Self { nodes: (0..spec.nodes).map(node).collect(), table: &p[keys.pulls] }
     }
 
-    /// Where Gaussian `id` moves; none if it is not dragged.
+    /// Displacement of Gaussian `id`; none if it is not dragged.
     #[inline(always)]
     pub(super) fn of(&self, id: usize) -> Option<Affine<F>> {
         let count = self.table.width() / 2;

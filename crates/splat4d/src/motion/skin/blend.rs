@@ -18,9 +18,9 @@ use rayon::prelude::*;
 
 /// Numbers of a rigid motion.
 const FRAME: usize = 16;
-/// Where c begins.
+/// Offset of c.
 const SHIFT: usize = 9;
-/// Where the quaternion begins.
+/// Offset of the quaternion.
 const TURN: usize = 12;
 
 /// A rigid motion.
