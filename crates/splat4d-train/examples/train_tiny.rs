@@ -24,7 +24,7 @@ const CAMERAS: usize = 8;
 const TIMES: usize = 6;
 const FPS: f64 = 10.0;
 
-/// What a trainer needs of a capture; `splat4d_train::capture` reads real ones.
+/// Data of a capture for the trainer; `splat4d_train::capture` reads real ones.
 struct Made {
     cameras: Vec<Camera>,
     /// [time][camera]

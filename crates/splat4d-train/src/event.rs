@@ -34,7 +34,7 @@ pub enum Event {
     },
     /// Training begins.
     Started {
-        /// Where the run is written.
+        /// Folder of the run.
         #[serde(serialize_with = "crate::path_text::lossy")]
         run: PathBuf,
         /// First iteration (not 0 after a resume).
@@ -46,7 +46,7 @@ pub enum Event {
         /// Estimated peak memory of training, bytes.
         memory_estimate: u64,
     },
-    /// What a run will take, from steps that were timed before it.
+    /// Estimated time of a run, from steps timed before it.
     Predicted {
         /// Its steps.
         iterations: usize,
@@ -107,7 +107,7 @@ pub enum Event {
     Counted {
         /// Gaussians at most.
         gaussians: usize,
-        /// What of the capture it follows from.
+        /// The reason from the capture.
         why: String,
     },
     /// A checkpoint is on disk.
@@ -152,7 +152,7 @@ pub enum Event {
         gaussians: usize,
         /// Peak resident memory of the process, bytes; 0 where the system does not report it.
         peak_memory: u64,
-        /// What would improve the result, if the run ended too early or with too few Gaussians.
+        /// Advice to improve the result, if the run ended too early or with too few Gaussians.
         advice: Option<String>,
     },
 }

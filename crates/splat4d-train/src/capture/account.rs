@@ -1,4 +1,4 @@
-//! What a reader did not find, did not read, assumed or could not check: `info` prints it in one block.
+//! Content that a reader did not find, did not read, assumed or could not check: `info` prints it in one block.
 
 /// How bad a [`Finding`](super::Finding) is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -9,7 +9,7 @@ pub enum Severity {
     Warning,
 }
 
-/// What a `Remark` is about.
+/// Kind of a `Remark`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Aspect {
     /// Files or lines that the capture names and that are not there.

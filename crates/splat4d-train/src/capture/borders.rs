@@ -28,7 +28,7 @@ const PIXELS: usize = 30_000_000;
 const FEWEST: usize = 6;
 /// Lenses that are examined, those with the most images first: it bounds the time.
 const LENSES: usize = 8;
-/// What counts as black, of 255: JPEG's ringing reaches 30 next to bright content.
+/// Largest value that counts as black, of 255: JPEG's ringing reaches 30 next to bright content.
 const BLACK: u8 = 40;
 /// Pixels beyond a border that interpolation and JPEG have mixed with it.
 const MIXED: usize = 2;
@@ -141,7 +141,7 @@ fn recorded(views: &[Frame]) -> Option<Vec<u8>> {
     border(&bright, width, height)
 }
 
-/// Where an image is not black; `None`: it cannot be read or is transparent in places, so that its colours there mean
+/// Non-black pixels of an image; `None`: it cannot be read or is transparent in places, so that its colours there mean
 /// nothing.
 fn not_black(frame: &Frame) -> Option<Vec<bool>> {
     let raster = picture::decode_as(&frame.image, Some(&panorama::stored(&frame.source)), frame.upright).ok()?;
@@ -154,7 +154,7 @@ fn not_black(frame: &Frame) -> Option<Vec<bool>> {
     Some((0..pixels).map(|p| (0..colours).any(|c| raster.get(p, c) > least)).collect())
 }
 
-/// What is recorded, 1 or 0, of images of one size that are `bright` in places; `None`: no border is found.
+/// Recorded pixels, 1 or 0, of images of one size that are `bright` in places; `None`: no border is found.
 fn border(bright: &[Vec<bool>], width: usize, height: usize) -> Option<Vec<u8>> {
     let mut black = vec![true; width * height];
     for image in bright {

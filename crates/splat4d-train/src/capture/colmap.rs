@@ -35,7 +35,7 @@ pub(super) const COLMAP: &str = "colmap";
 pub(super) const WORKSPACES: [&str; 4] = ["undistorted/sparse", "dense/sparse", "dense/0/sparse", "distorted/sparse"];
 /// A model's points as .ply: 3DGS writes it next to the others, and other programs in place of them.
 const POINTS: &str = "points3D.ply";
-/// Where a model may be next to poses of another layout: COLMAP's habit and Nerfstudio's.
+/// Folders of a model next to poses of another layout: COLMAP's habit and Nerfstudio's.
 const BESIDE: [&str; 2] = [SPARSE, NESTED];
 /// Names of folders between a capture's folder and a model's files, in addition to numbers.
 const MODEL_FOLDERS: [&str; 6] = [SPARSE, MULTIVIEW, COLMAP, "distorted", "undistorted", "dense"];

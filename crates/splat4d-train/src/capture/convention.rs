@@ -1,5 +1,5 @@
-//! What the numbers of a pose mean: direction, camera axes, order of rows and of quaternions; and poses that are
-//! written in another convention than their layout states (`capture.poses`).
+//! Conventions of poses: direction, camera axes, order of rows and of quaternions; and poses that are written in
+//! another convention than their layout states (`capture.poses`).
 
 use crate::settings::Value;
 use splat4d::math::se3::transpose;
@@ -74,13 +74,13 @@ impl Convention {
         Ok(Self { opengl: poses.opengl.unwrap_or(self.opengl), ..self }.read(pose))
     }
 
-    /// What a pose that was read as this convention would be, had it been written as `poses` specify.
+    /// A pose that was read as this convention, reinterpreted as written in `poses`.
     /// Errors: quaternions in a layout that has none.
     pub(crate) fn reread(self, cam_from_world: &Se3, poses: Poses) -> Result<Se3> {
         self.read_as(self.write(cam_from_world), poses)
     }
 
-    /// What is read of a pose that is written as `poses` specify, while this convention is stated.
+    /// The pose read under this convention from one written as `poses` specify.
     #[cfg(test)]
     pub(crate) fn misread(self, truth: &Se3, poses: Poses) -> Se3 {
         let mut raw = Self { opengl: poses.opengl.unwrap_or(self.opengl), ..self }.write(truth);
@@ -130,7 +130,7 @@ fn flip_columns(pose: &mut Se3) {
     }
 }
 
-/// What the poses of a file are written as, where it is not what the layout states.
+/// Convention of a file's poses, if it is not that of the layout.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Poses {
     /// Whether the camera's axes are OpenGL's; `None`: as stated.
@@ -148,7 +148,7 @@ impl Poses {
     pub const STATED: Self = Self { opengl: None, inverse: false, transposed: false, xyzw: false };
     const WORDS: [&str; 5] = ["opencv", "opengl", "inverse", "transposed", "xyzw"];
 
-    /// What the poses turn out to be, in words; relative to what `stated` states.
+    /// The convention found for the poses, as text; relative to what `stated` states.
     pub(crate) fn in_words(self, stated: Convention) -> String {
         let mut parts: Vec<&str> = Vec::new();
         match self.opengl {

@@ -19,7 +19,7 @@ const NOWHERE: f32 = 1e9;
 /// mean over an edge is the depth of neither side (docs of scene flow: bilinear samples within 5 %).
 const ONE_SURFACE: f32 = 0.05;
 
-/// What the numbers of a depth map are.
+/// Kinds of depth maps.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum DepthKind {
     /// z along the camera's axis, scene units.

@@ -17,7 +17,7 @@ const ANGLE: f64 = 0.02;
 /// Spread of cameras in one place, of their distance from the origin: rounding.
 const ONE_PLACE: f64 = 1e-9;
 
-/// What an image's path is called in both descriptions: without its ending and without folders that name no camera.
+/// Common form of an image's path in both descriptions: without its ending and without folders that name no camera.
 pub(super) fn key(path: &Path) -> String {
     let plain = path.with_extension("");
     let parts = plain.iter().filter_map(|part| part.to_str()).filter(|part| !rig::is_plain(part));

@@ -58,7 +58,7 @@ struct Shot {
     depth: Option<DepthFile>,
 }
 
-/// What an export states in addition to its shots.
+/// Data of an export next to its shots.
 struct Said {
     kind: CaptureKind,
     /// Convention of its poses.

@@ -46,7 +46,7 @@ impl Depth {
         DepthTruth { values: &self.values, kind: self.kind }
     }
 
-    /// Where four pixels show one surface.
+    /// Largest ratio of depths of four pixels on one surface.
     fn halve(&mut self) {
         let map = &mut self.values;
         map.data = depth::reduce(&map.data, map.width, map.height, 2);

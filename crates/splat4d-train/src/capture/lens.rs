@@ -49,7 +49,7 @@ impl Distortion {
         matches!(self.lens, Lens::Pinhole)
     }
 
-    /// Where the ray (x, y, 1) lands on the normalised sensor; `None` beyond the fold.
+    /// Projection of the ray (x, y, 1) to the normalised sensor; `None` beyond the fold.
     pub fn distort(&self, [x, y]: [f64; 2]) -> Option<[f64; 2]> {
         let r = x.hypot(y);
         match self.lens {

@@ -19,7 +19,7 @@ use unicode_normalization::UnicodeNormalization;
 
 pub(super) use twins::Twins;
 
-/// What names of folders have in which other programs keep masks, whatever white means there.
+/// Parts of names of folders in which other programs keep masks, with either polarity.
 const MASK_WORDS: [&str; 3] = ["mask", "matte", "segment"];
 
 /// Folders that usually contain images, below that of the capture.
@@ -143,7 +143,7 @@ impl Lookup {
         })
     }
 
-    /// Where names relative to the capture's folder lead.
+    /// Files of names relative to the capture's folder.
     pub(super) fn bases(&self) -> Vec<PathBuf> {
         let mut bases = self.folders();
         // The capture's own folder has priority: names may hold that of the images.
@@ -485,7 +485,7 @@ mod tests {
         (dir, lookup)
     }
 
-    /// What `name` leads to, relative to the folder, and the remark about it.
+    /// File of `name`, relative to the folder, and the remark about it.
     fn find(files: &[&str], name: &str) -> (Option<String>, String) {
         let (dir, lookup) = lookup(files);
         let found = lookup.image(&lookup.bases(), name).unwrap();

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 
 /// Folders of masks, in any letter case.
 const FOLDERS: [&str; 2] = ["masks", "mask"];
-/// What names of masks have in addition to those of their images.
+/// Suffixes of mask names.
 const SUFFIXES: [&str; 4] = ["_mask", "-mask", ".mask", "_seg"];
 const PREFIXES: [&str; 2] = ["mask_", "mask-"];
 /// Search depth in folders of masks.

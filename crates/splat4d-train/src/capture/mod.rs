@@ -241,7 +241,7 @@ pub struct Capture {
     pub validation: Vec<usize>,
     /// Indices of the frames after the observed part, of every camera; see `observe`.
     pub future: Vec<usize>,
-    /// Where the times are from.
+    /// Source of the times.
     pub timing: Timing,
     /// Frames per second.
     pub fps: f64,
@@ -249,8 +249,8 @@ pub struct Capture {
     pub points: Option<PointCloud>,
     /// The background of transparent pixels, sRGB from 0 to 1; `None`: the images have no alpha.
     pub background: Option<[f32; 3]>,
-    /// What was subtracted from the world coordinates of poses and points, because f32 resolves them badly; zero near
-    /// the origin ([`splat4d::scene::offset`]).
+    /// Offset subtracted from the world coordinates of poses and points, because f32 resolves them badly; zero near the
+    /// origin ([`splat4d::scene::offset`]).
     pub offset: [f64; 3],
     /// Upwards in the world (unit); estimated from the cameras where the data set states none.
     pub up: [f64; 3],
@@ -258,17 +258,17 @@ pub struct Capture {
     pub labels: Vec<String>,
     /// The k of [`CaptureOptions::downscale`].
     pub downscale: usize,
-    /// What the layout states that poses are.
+    /// Pose convention of the layout.
     pub convention: Convention,
-    /// What they were read as instead.
+    /// Convention that was used instead.
     pub poses: Poses,
-    /// What its lenses recorded: black borders, or none.
+    /// Recorded area of its lenses: black borders, or none.
     pub lenses: Lenses,
-    /// What was not found, not read or assumed.
+    /// Content not found, not read or assumed.
     pub account: Vec<Remark>,
     /// The reader's warnings, a sentence or two each.
     pub warnings: Vec<String>,
-    /// What the reader chose or assumed that is no cause for worry, a sentence or two each.
+    /// Harmless choices and assumptions of the reader, a sentence or two each.
     pub notes: Vec<String>,
 }
 
@@ -298,7 +298,7 @@ struct RawCapture {
     warnings: Vec<String>,
     notes: Vec<String>,
     account: Account,
-    /// What the layout states that poses are.
+    /// Pose convention of the layout.
     convention: Convention,
 }
 

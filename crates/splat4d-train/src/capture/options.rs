@@ -94,7 +94,7 @@ choices! {
 }
 
 choices! {
-    /// Whose pixels poses and intrinsics describe where images have an EXIF orientation.
+    /// Pixels (stored or upright) that poses describe if images have an EXIF orientation.
     pub enum Exif {
         /// By the layout, else by the images' sizes.
         Auto = "auto",
@@ -106,7 +106,7 @@ choices! {
 }
 
 choices! {
-    /// What becomes of black borders of images.
+    /// Treatment of black borders of images.
     pub enum Borders {
         /// They are found, and neither trained nor scored.
         Auto = "auto",
@@ -116,7 +116,7 @@ choices! {
 }
 
 choices! {
-    /// What the times of a capture count.
+    /// Unit of a capture's times.
     pub enum Times {
         /// As their range, steps and the images' names show.
         Auto = "auto",
@@ -130,7 +130,7 @@ choices! {
 }
 
 choices! {
-    /// What becomes of images without a pose of their own, whose camera has another image with one.
+    /// Treatment of images without a pose of their own, whose camera has another image with one.
     pub enum Unregistered {
         /// They share that pose where names show a fixed rig (`cam00/0001.png`), else they are left out.
         Auto = "auto",
@@ -142,7 +142,7 @@ choices! {
 }
 
 choices! {
-    /// Where the optical flow of images is from.
+    /// Source of optical flow.
     pub enum FlowSource {
         /// The capture's files; where it brings none there is none.
         Files = "files",
@@ -152,7 +152,7 @@ choices! {
 }
 
 settings! {
-    /// What is read of the capture, and how.
+    /// Options of reading a capture.
     pub struct CaptureSettings {
         /// Images are reduced by this factor (mean of k×k boxes).
         downscale: usize = 1 => at_least(1);
@@ -221,13 +221,13 @@ pub struct CaptureOptions {
     pub images: Option<String>,
     /// Convention of the poses if it is not that of the layout.
     pub poses: Poses,
-    /// Whose pixels poses and intrinsics describe.
+    /// Pixels (stored or upright) that poses describe.
     pub exif: Exif,
-    /// What becomes of black borders.
+    /// Treatment of black borders.
     pub borders: Borders,
-    /// What times count.
+    /// Unit of times.
     pub times: Times,
-    /// What becomes of images without a pose of their own.
+    /// Treatment of images without a pose of their own.
     pub unregistered: Unregistered,
     /// Share of the images that may be missing.
     pub max_missing: f64,

@@ -79,11 +79,11 @@ fn is_jpeg(bytes: &[u8]) -> bool {
 /// Bytes at the start of a file that identify its format.
 const HEAD: usize = 64;
 
-/// What to do with images of other formats.
+/// Remedy for images of other formats.
 const CONVERT: &str = "Convert the images to JPEG or PNG under the same names (for instance with ffmpeg or ImageMagick): \
                        another ending is found.";
 
-/// What a file is instead of an image that can be read, by its first bytes, and what to do. `None`: that is not known.
+/// Kind of an unreadable file by its first bytes, and a remedy. `None`: that is not known.
 fn foreign(head: &[u8]) -> Option<(&'static str, &'static str)> {
     let format = match head {
         [] => return Some(("the file is empty (0 bytes)", "Copy or extract it again, or delete it.")),

@@ -90,7 +90,7 @@ impl PointCloud {
         self.times.push(time);
     }
 
-    /// What was left out of the file, for a warning.
+    /// Points left out of the file, for a warning.
     pub(crate) fn loss(&self) -> Option<String> {
         let all = self.points.len() + self.left_out;
         (self.left_out > 0).then(|| {

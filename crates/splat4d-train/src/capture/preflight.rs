@@ -10,7 +10,7 @@ use splat4d::math::se3::{dot, norm, normalize, sub};
 pub struct Finding {
     /// How bad it is.
     pub severity: Severity,
-    /// What of reading the capture it is about; `None`: of something else.
+    /// Related remark of reading the capture; `None`: of something else.
     pub aspect: Option<Aspect>,
     /// The finding, a sentence.
     pub what: String,

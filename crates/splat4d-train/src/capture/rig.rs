@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 /// Endings of images that can be decoded.
 pub(super) const IMAGE_ENDINGS: &[&str] = &["png", "jpg", "jpeg", "webp"];
 
-/// What macOS puts next to every file on foreign disks, under its name after this.
+/// Prefix of the files that macOS adds on foreign disks.
 const APPLE_DOUBLE: &str = "._";
 
 /// Sorted names of the files and folders directly in `folder`; empty where it cannot be read.

@@ -5,7 +5,7 @@ use super::{Sequence, rig};
 use splat4d::math::Se3;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Where a capture's times are from.
+/// Source of a capture's times.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Timing {
@@ -17,7 +17,7 @@ pub enum Timing {
     Moment,
 }
 
-/// Who took every image, and when.
+/// Camera and time of every image.
 pub(super) struct FrameOrder {
     /// Camera names.
     pub cameras: Vec<String>,
@@ -25,7 +25,7 @@ pub(super) struct FrameOrder {
     pub frames: Vec<(usize, usize, f64)>,
     /// Whether the data set distinguishes cameras; else one entry may represent many.
     pub named: bool,
-    /// Where the times are from.
+    /// Source of the times.
     pub timing: Timing,
 }
 
@@ -35,7 +35,7 @@ const FILM_WORDS: [&str; 12] =
     ["", "frame", "frames", "image", "img", "out", "output", "video", "thumb", "rgb", "color", "f"];
 /// The one that telephones and cameras write for photos.
 const PHOTO_WORD: &str = "IMG";
-/// What Nerfstudio renames every image to, photos and frames alike: a word and five digits. It states nothing of time.
+/// Nerfstudio's name of every image, photos and frames alike: a word and five digits. It states nothing of time.
 const RENAMED: (&str, usize) = ("frame_", 5);
 /// Words before the number in the names of a rig's cameras.
 const CAMERA_WORDS: [&str; 2] = ["cam", "camera"];

@@ -61,9 +61,9 @@ impl Lists {
         Ok(out)
     }
 
-    /// What becomes of images with these names; `None`: one is left out. Images that no list names train where only
-    /// test images are listed, are held out where only training images are, and are left out where both are. A listed
-    /// name that fits no image is a warning. Errors: no name of the training images does.
+    /// Split of images with these names; `None`: one is left out. Images that no list names train where only test
+    /// images are listed, are held out where only training images are, and are left out where both are. A listed name
+    /// that fits no image is a warning. Errors: no name of the training images does.
     pub(super) fn settle(&self, names: &[&str], account: &mut Account) -> Result<Vec<Option<Split>>> {
         let Self { train, test, validation } = self;
         if [train, test, validation].iter().all(|l| l.is_empty()) {

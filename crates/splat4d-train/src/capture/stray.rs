@@ -24,8 +24,8 @@ const HEAD: u64 = 1 << 16;
 /// Folders that are searched for a capture.
 const MOST_FOLDERS: usize = 100;
 
-/// What to do with a folder that is not a capture, which the user called `named`, by what it holds. `None`: it holds
-/// nothing that is known.
+/// Remedy for a folder that is not a capture, which the user called `named`, by what it holds. `None`: it holds nothing
+/// that is known.
 pub(super) fn advice(root: &Path, named: &Path, is_capture: &dyn Fn(&Path) -> bool) -> Option<String> {
     let names = rig::file_names(root);
     let folders = || names.iter().map(|n| root.join(n)).filter(|p| p.is_dir()).take(MOST_FOLDERS);
@@ -70,7 +70,7 @@ pub(super) fn advice(root: &Path, named: &Path, is_capture: &dyn Fn(&Path) -> bo
     images.then(|| format!("It holds images, but no camera poses: {reconstruct}."))
 }
 
-/// What to do with scenes that are no captures: outputs of trainings and files of Gaussians. `None`: there are none.
+/// Remedy for scenes given as captures: outputs of trainings and files of Gaussians. `None`: there are none.
 fn scenes(root: &Path, names: &[String]) -> Option<String> {
     let checkpoints = root.join(CHECKPOINTS);
     let newest = rig::file_names(&checkpoints).into_iter().rfind(|n| ends(Path::new(n), &["ckpt"]));

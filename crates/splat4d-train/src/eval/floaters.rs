@@ -43,7 +43,7 @@ const SHARE: f64 = 0.5;
 /// are found, and of the rest less than 3 in a thousand; at 0.005 four times as many of the rest.
 const MATTERS: f64 = 0.005;
 
-/// What images show about one Gaussian.
+/// Evidence of the images about one Gaussian.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Support {
     /// Training cameras whose images it changes.
@@ -72,7 +72,7 @@ impl Support {
     }
 }
 
-/// What images show about a scene.
+/// Evidence of the images about a scene.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Judged {
     /// By layer and Gaussian.

@@ -55,7 +55,7 @@ pub struct Query {
     pub lens: bool,
 }
 
-/// Where an image was taken, as far as the scene determines it.
+/// Estimated pose and time of an image.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Located {
     /// From where, with the image's size.
@@ -91,7 +91,7 @@ struct Candidate {
     start: usize,
 }
 
-/// What all steps share.
+/// Data of all steps.
 struct Search<'a> {
     scene: &'a Scene<f32>,
     backend: Box<dyn Backend>,

@@ -136,7 +136,7 @@ fn viewing_cameras(capture: &Capture) -> Vec<(usize, &Camera)> {
     if held.is_empty() { of(&capture.train) } else { held }
 }
 
-/// Who is truly seen.
+/// True visibility.
 struct Visible {
     frames: usize,
     points: usize,

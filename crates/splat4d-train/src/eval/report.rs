@@ -4,7 +4,7 @@ use super::ColourMatrix;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
 
-/// What the names of our own entries begin with, as 3DGS does; the steps follow.
+/// Prefix of our own entries, as 3DGS does; the steps follow.
 pub(super) const METHOD: &str = "ours_";
 
 /// A number, or why there is none.
@@ -163,7 +163,7 @@ fn add_notes(to: &mut Map<String, Value>, notes: Map<String, Value>) {
     }
 }
 
-/// What figures hold for, next to the steps of training: without it they do not compare.
+/// Conditions of the figures next to the training steps; only equal ones compare.
 #[derive(Clone, Debug, Default, PartialEq, serde::Serialize)]
 pub struct Conditions {
     /// `test`, `val` or `train`.
@@ -172,7 +172,7 @@ pub struct Conditions {
     pub background: Option<[f32; 3]>,
     /// Instructions of the kernels: `scalar`, `avx2`, `avx512` or `neon`. Levels round differently.
     pub simd: &'static str,
-    /// What rendered.
+    /// The renderer.
     pub device: String,
 }
 
@@ -181,7 +181,7 @@ pub struct Conditions {
 pub struct Report {
     /// Steps of training; the method is called `ours_{iteration}`, as 3DGS does.
     pub iteration: u64,
-    /// What the figures hold for.
+    /// Conditions of the figures.
     pub conditions: Conditions,
     /// The views that were requested: those held out, by default.
     pub test: Split,

@@ -102,7 +102,7 @@ pub struct EvalOptions {
     pub place: Option<String>,
     /// How held-out views are aligned, to be measured a second time (`PSNR-aligned`); `None`: not.
     pub align: Option<Align>,
-    /// What renders; the metrics are the CPU's.
+    /// The renderer; the metrics are the CPU's.
     pub device: Device,
 }
 

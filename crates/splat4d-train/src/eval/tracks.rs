@@ -15,7 +15,7 @@ use splat4d::math::median;
 use splat4d::math::se3::{norm, sub};
 use splat4d::scene::Time;
 
-/// Where a capture keeps the truth.
+/// Path of the truth in a capture.
 pub const FILE: &str = "truth/tracks.npy";
 /// Gaussians that carry a point: one alone may be a floater.
 const CARRIERS: usize = 4;
@@ -67,7 +67,7 @@ pub(super) struct Truth {
 }
 
 impl Truth {
-    /// What a capture brings along; `None`: nothing.
+    /// True tracks of a capture; `None`: nothing.
     pub(super) fn of(capture: &Capture) -> Result<Option<Self>> {
         let path = capture.root.join(FILE);
         if !path.is_file() {

@@ -153,7 +153,7 @@ fn grown(mask: &[bool], width: usize) -> Vec<bool> {
     (0..mask.len()).map(any).collect()
 }
 
-/// What one camera shows at a time, by pixels.
+/// One camera's silhouette at a time, by pixels.
 struct Silhouette<'a> {
     camera: &'a Camera,
     inside: &'a (dyn Fn(usize) -> bool + Sync),

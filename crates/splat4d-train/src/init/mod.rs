@@ -119,7 +119,7 @@ settings! {
 /// in the same steps, at an eighth more time (studies/records/2026-11-27-real-size.md).
 pub(crate) const COUNT: usize = 10_000;
 
-/// Where the first Gaussians are.
+/// Source of the first Gaussians.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Source {
     /// The capture's points and those of its depth maps; without maps, where points are few or leave out a part of what
@@ -366,7 +366,7 @@ mod tests {
     use splat4d::layers::Evaluation;
     use splat4d::scene::{Rows, Space, Time};
 
-    /// What is far is as wide as its neighbours are apart, as seen from the cameras, and not a speck.
+    /// Far Gaussians are as wide as the distance to their neighbours, seen from the cameras.
     #[test]
     fn first_sizes_are_bounded_by_the_distance_from_the_cameras() {
         let plan = TrainContext { extent: 2.0, center: [0.0, 0.0, -1.0], ..TrainContext::default() };

@@ -137,7 +137,7 @@ mod tests {
             Self { cameras: (0..3).map(camera).collect(), blobs: (0..160).map(blob).collect(), brings }
         }
 
-        /// Where a pixel's ray meets the wall in frame i.
+        /// Intersection of a pixel's ray with the wall in frame i.
         fn hit(&self, i: usize, x: usize, y: usize) -> ([f64; 3], f64) {
             let (camera, at) = (&self.cameras[i], [x as f64 + 0.5, y as f64 + 0.5]);
             let z = VELOCITY[2] * FRAME * i as f64;

@@ -106,7 +106,7 @@ impl<F: Real> Graph<F> {
         self.edges
     }
 
-    /// Where each edge leads, with its length at rest and its weight.
+    /// Target of each edge, with its length at rest and its weight.
     pub(crate) fn all(&self) -> impl Iterator<Item = (u32, F, F)> + '_ {
         (0..self.near.len()).map(|e| (self.near[e], self.d0[e], self.weights[e]))
     }

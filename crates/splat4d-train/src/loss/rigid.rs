@@ -19,7 +19,7 @@ use splat4d::math::{Real, quat};
 /// Keeps the root's derivative finite where an edge is exactly as it was (Luiten et al. 2024).
 const UNDER_ROOT: f64 = 1e-20;
 
-/// Where points are and how they are turned at a time.
+/// Positions and rotations of points at a time.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Poses<'a, F> {
     /// Positions, scene units.

@@ -7,7 +7,7 @@ use splat4d::math::Real;
 use splat4d::render::{ResidentTies, RowWeights};
 use splat4d::scene::{Grads, Space, Table, Time};
 
-/// Where in training a loss is queried.
+/// Stage and step of a loss.
 #[derive(Clone, Debug)]
 pub struct StepInfo {
     /// Steps taken before this one.

@@ -165,7 +165,7 @@ impl std::ops::AddAssign for Change {
 /// Inputs of an operation next to the learner.
 #[derive(Clone, Copy)]
 pub struct Context<'a> {
-    /// Where in the stage.
+    /// Position in the stage.
     pub at: At,
     /// Steps of the run that were done before this one: it addresses the random numbers.
     pub iteration: usize,

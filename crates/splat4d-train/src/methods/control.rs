@@ -25,7 +25,7 @@ const MOST_KEYS: usize = 512;
 const LEVELS: (usize, usize) = (4, 6);
 
 choices! {
-    /// What drives control nodes.
+    /// Trajectories of control nodes.
     pub enum Trajectory {
         /// Cubic B-splines on SE(3).
         Spline = "spline",

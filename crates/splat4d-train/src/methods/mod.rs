@@ -144,7 +144,7 @@ impl Rate {
     }
 }
 
-/// What is left of the rates at the end of a stage that settles.
+/// Remaining share of the rates at the end of a settling stage.
 const SETTLED: f64 = 0.1;
 
 /// A group of this layer is one of every layer that has its columns.

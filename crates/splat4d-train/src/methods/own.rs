@@ -12,7 +12,7 @@ use std::sync::{Arc, PoisonError, RwLock};
 /// A motion model of a caller's own, and how its tables are learnt.
 #[derive(Clone)]
 pub struct OwnMotion {
-    /// What recipes and files call it.
+    /// Its name in recipes and files.
     pub name: String,
     /// Makes the model, and in the parameters its tables (or claims the loaded ones). Its spec is `Spec::Custom(name)`.
     pub make: MakeMotion,

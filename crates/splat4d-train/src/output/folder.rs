@@ -26,7 +26,7 @@ const MARKERS: [&str; 4] = ["recipe.toml", "run.json", "scene.safetensors", "che
 /// File of a finished run.
 const FINISHED: &str = "scene.safetensors";
 
-/// What of a folder must not be there already.
+/// Content that a folder must not have.
 #[derive(Clone, Copy)]
 pub enum Mixes<'a> {
     /// Anything.
@@ -45,13 +45,13 @@ pub enum Mixes<'a> {
 pub struct Request<'a> {
     /// The command, for the record of the owner.
     pub command: &'a str,
-    /// What is read.
+    /// Inputs.
     pub inputs: &'a [Input<'a>],
     /// All that the result depends on, as text: the same text continues an unfinished command.
     pub asked: &'a str,
     /// Whether what splat4d wrote there before is to be replaced.
     pub force: bool,
-    /// What must not be there.
+    /// Content that must be absent.
     pub mixes: Mixes<'a>,
 }
 
@@ -60,7 +60,7 @@ pub struct Request<'a> {
 pub enum FolderContent {
     /// Nothing: it begins.
     Nothing,
-    /// What the same command left when it ended early.
+    /// Output of the same command that ended early.
     Unfinished,
 }
 
@@ -77,7 +77,7 @@ pub struct OutputFolder {
     owner: Option<Owner>,
 }
 
-/// What is to be done with a folder.
+/// Decision about a folder.
 enum Plan {
     Begin,
     Continue,
@@ -276,7 +276,7 @@ impl Drop for OutputFolder {
     }
 }
 
-/// What is to be done with a folder for a request. Errors: nothing can be.
+/// Decides about a folder for a request. Errors: nothing can be.
 fn plan(folder: &Path, request: &Request<'_>) -> Result<Plan> {
     let unreadable = |e| Error::io("cannot be read", e).at(folder.display());
     let mut there: Vec<OsString> = Vec::new();

@@ -86,12 +86,12 @@ pub(super) fn folders(folder: &Path) -> Vec<PathBuf> {
     std::iter::once(folder.to_owned()).chain(listed.iter().filter(|p| is_folder(p)).map(|p| folder.join(p))).collect()
 }
 
-/// What commands wrote into a folder, by its list: paths below it, folders with a slash at their end.
+/// Files that commands wrote into a folder, by its list: paths below it, folders with a slash at their end.
 pub fn written(folder: &Path) -> BTreeSet<PathBuf> {
     read_of(folder)
 }
 
-/// What a folder's list names.
+/// Entries of a folder's list.
 pub(super) fn read_of(folder: &Path) -> BTreeSet<PathBuf> {
     read(&folder.join(STATE).join(FILE))
 }

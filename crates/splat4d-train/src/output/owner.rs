@@ -1,4 +1,4 @@
-//! Who writes into a folder: a lock of the operating system, and a record of the owner with a heartbeat.
+//! Owner of a folder: a lock of the operating system, and a record of the owner with a heartbeat.
 //!
 //! On one machine the lock decides: the system releases it when its process ends, however that happens, so that neither
 //! a reused process number nor a clock that was set plays a part. A lock that is free although the record names another
@@ -191,7 +191,7 @@ impl Owner {
         }
     }
 
-    /// Who has the folder now, without a trace in it; the inner `None`: an owner whose record cannot be read.
+    /// Present owner of the folder, read without changing it; the inner `None`: an owner whose record cannot be read.
     pub fn holder(folder: &Path) -> Option<Option<Standing>> {
         let (record, lock) = (folder.join(STATE).join(RECORD), folder.join(STATE).join(LOCK));
         check_plain(&lock).ok()?;

@@ -69,7 +69,7 @@ pub fn check_file(output: &Path, inputs: &[Input<'_>]) -> Result<()> {
     Ok(())
 }
 
-/// What the file system calls a file or folder.
+/// Identity of a file or folder in the file system.
 #[cfg(unix)]
 type Id = (u64, u64);
 #[cfg(not(unix))]

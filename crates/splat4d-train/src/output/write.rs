@@ -45,7 +45,7 @@ impl Staged {
         Ok(Self { temporary: Some(temporary), target })
     }
 
-    /// Where to write now.
+    /// Current target of the write.
     pub fn path(&self) -> &Path {
         self.temporary.as_deref().unwrap_or(&self.target)
     }

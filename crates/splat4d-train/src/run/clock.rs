@@ -15,7 +15,7 @@ impl Stopwatch {
         Self::of(move || start.elapsed().as_secs_f64())
     }
 
-    /// What a function states; it never decreases.
+    /// Time returned by a function; it never decreases.
     pub fn of(seconds: impl Fn() -> f64 + Send + Sync + 'static) -> Self {
         Self(Arc::new(seconds))
     }

@@ -1,4 +1,4 @@
-//! What a run is of, in a few digits: a checkpoint is only continued with the same capture and the same recipe.
+//! Fingerprint of a run: a checkpoint is only continued with the same capture and the same recipe.
 
 use super::checkpoint::Identity;
 use crate::capture::Capture;

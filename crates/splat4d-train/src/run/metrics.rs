@@ -67,7 +67,7 @@ impl Metrics {
         self.rows.push(Row { iteration: i, begun: Some(begun), cells: Vec::new() });
     }
 
-    /// What a step measured.
+    /// Measurements of a step.
     pub(super) fn measured(&mut self, m: &Measured) {
         if let Some(row) = self.rows.iter_mut().rev().find(|row| row.iteration == m.iteration)
             && let Some([before, after]) = row.begun.take()

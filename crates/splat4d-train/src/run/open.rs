@@ -246,7 +246,7 @@ impl OpenCapture {
         Ok(Scene { offset: self.capture.offset, ..scene })
     }
 
-    /// Where the first Gaussians of a plan are.
+    /// Source of the first Gaussians of a plan.
     pub(super) fn seeds(&self, recipe: &Recipe, plan: &TrainContext) -> Result<Seeds> {
         let program = recipe.program()?;
         let moving = program.capabilities(plan).moves && plan.times > 1;
@@ -264,7 +264,7 @@ impl OpenCapture {
         }
     }
 
-    /// What is to be learnt of cameras, where the recipe needs it.
+    /// Corrections of cameras to learn, if enabled in the recipe.
     fn corrections(&self, recipe: &Recipe, plan: &TrainContext) -> Option<Corrections> {
         let settings = learnable(recipe);
         if !settings.poses && !settings.focal && !settings.times {

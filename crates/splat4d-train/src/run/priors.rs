@@ -1,5 +1,5 @@
-//! What files contain about a capture next to its images, held against these: before training what can be checked at
-//! once, after it what the scene made of them.
+//! Checks of priors (depth, flow) against the images: before training what can be checked at once, after it what the
+//! scene made of them.
 
 use super::open::{OpenCapture, training_frames};
 use crate::capture::frames::{Depth, Frames, Picture};
@@ -57,7 +57,7 @@ pub(super) fn before(opened: &OpenCapture, recipe: &Recipe) -> Result<Vec<String
     Ok(warnings)
 }
 
-/// What is to be reported of metric maps that show surfaces behind points that were seen before them.
+/// Report about metric maps with surfaces behind points that were seen in front of them.
 fn points_before(opened: &OpenCapture) -> Result<Option<String>> {
     let looked = ratios(opened)?;
     let told = |(i, ratios): &(usize, Vec<f64>)| {

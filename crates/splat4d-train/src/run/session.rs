@@ -30,7 +30,7 @@ use std::time::{Duration, Instant as Clock};
 /// Options of a run in addition to its recipe.
 #[derive(Clone, Debug, Default)]
 pub struct TrainOptions {
-    /// What renders. It is no part of the recipe: a run may be resumed on another device, whose last bits are others.
+    /// The renderer. It is not part of the recipe: a run may be resumed on another device, with other last bits.
     pub device: Device,
     /// Keep all from the clock's zero to the end of what follows training to so long: iterations are fitted to it, and
     /// fitted again during the run.

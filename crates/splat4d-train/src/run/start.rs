@@ -159,7 +159,7 @@ pub fn resume(run: &Path, stop: &AtomicBool, listen: &mut dyn FnMut(&Event)) -> 
     resume_with(run, &TrainOptions::default(), stop, listen)
 }
 
-/// What training with all defaults would take.
+/// Estimated cost of training with all defaults.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Forecast {
     /// The motion model that would be learnt.

@@ -17,7 +17,7 @@ use splat4d::render::{Backend, Image, RenderGrads, Shot, Target};
 use splat4d::scene::{Grads, Rows, Space, Table, Time};
 use std::time::{Duration, Instant as Clock};
 
-/// Where a step's time went.
+/// Times of a step's parts.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Timings {
     /// `prepare` and `at`.
@@ -45,7 +45,7 @@ pub struct StepReport {
     pub d_cameras: Vec<[f64; 6]>,
     /// dL/d logarithm of every view's focal lengths.
     pub d_focals: Vec<f64>,
-    /// Where the time went.
+    /// Times of the parts.
     pub timings: Timings,
 }
 
@@ -63,7 +63,7 @@ pub(crate) struct Step<'a, F: Real> {
     pub scene: &'a Scene<F>,
     /// The views to compare it with.
     pub views: &'a [View<'a, F>],
-    /// Where in training.
+    /// Stage and step.
     pub info: &'a StepInfo,
     /// Highest degree of spherical harmonics rendered.
     pub sh_degree: usize,

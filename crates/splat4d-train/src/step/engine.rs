@@ -24,7 +24,7 @@ pub struct StepPlan<'a> {
     pub loss: &'a mut TrainLoss,
     /// Images and their truth.
     pub views: &'a [View<'a, f32>],
-    /// Where in training.
+    /// Stage and step.
     pub info: &'a StepInfo,
     /// Steps of the stage that were taken before.
     pub stage_step: usize,
@@ -38,7 +38,7 @@ pub struct StepPlan<'a> {
     pub min_opacity: f64,
 }
 
-/// What a step measured.
+/// Measurements of a step.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Measured {
     /// Number of the step, from 1.
@@ -73,7 +73,7 @@ pub struct Stepped {
     pub notices: Vec<String>,
 }
 
-/// What a step was spoilt by.
+/// Cause of an invalid step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Blame {
     /// A number that is not finite: smaller steps may help.
@@ -143,11 +143,11 @@ pub(super) fn rates_of(scene: &Scene<f32>, plan: &StepPlan<'_>, all: &mut Rates)
 /// Share of a stage after which exposures are frozen: before it they learn at a constant rate, since a rate that falls
 /// from the start leaves them short in runs of a few dozen images a camera (docs/suite.md).
 const EXPOSURE_RESTS: f64 = 0.7;
-/// What is left of their rate at the end: Adam moves a camera's colours by up to the rate a step whatever the gradient,
-/// and at the full rate images end a thousandth off.
+/// Remaining share of their rate at the end: Adam moves a camera's colours by up to the rate a step whatever the
+/// gradient, and at the full rate images end a thousandth off.
 const EXPOSURE_END: f64 = 0.01;
 
-/// What is left of the exposures' rate at a place in the stage.
+/// Remaining share of the exposures' rate at a point of the stage.
 fn rests(progress: f64) -> f64 {
     EXPOSURE_END.powf(((progress - EXPOSURE_RESTS) / (1.0 - EXPOSURE_RESTS)).max(0.0))
 }
@@ -209,7 +209,7 @@ impl<'a> CpuEngine<'a> {
         }
     }
 
-    /// What renders.
+    /// The renderer.
     pub(super) fn backend(&mut self) -> &mut (dyn Backend<f32> + 'a) {
         self.backend.as_mut()
     }

@@ -21,7 +21,7 @@ use splat4d::scene::{Key, LIFE, LifeKind};
 use std::collections::VecDeque;
 use std::time::Instant as Clock;
 
-/// Who has the newest numbers.
+/// Owner of the newest numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Newest {
     /// The learner: what a device keeps is stale.

@@ -66,7 +66,7 @@ pub struct Position {
 pub(crate) struct TrainedOn {
     /// It in words, its driver too.
     pub(crate) name: String,
-    /// What was taken and why, in a line.
+    /// The choice and its reason, in one line.
     pub(crate) why: String,
     /// Whether it is not the one that was queried for.
     pub(crate) missed: bool,
@@ -84,7 +84,7 @@ pub struct Trainer<'a> {
     pub loss: TrainLoss,
     /// Settings that hold for all stages.
     pub settings: Settings,
-    /// What renders.
+    /// The renderer.
     pub(crate) device: TrainedOn,
     /// The pace through the schedule; none: a step is one of the schedule.
     pace: Option<Pace>,

@@ -360,8 +360,8 @@ impl Corrections {
         }
     }
 
-    /// What was learnt, a row for every camera (or image of a moving one), as plain data. `name` returns of a frame:
-    /// its camera's name, and its number where that camera moves.
+    /// The learnt values, one row per camera (or image of a moving one), as plain data. `name` returns of a frame: its
+    /// camera's name, and its number where that camera moves.
     pub(crate) fn report(&self, name: &dyn Fn(usize) -> (String, Option<usize>)) -> Value {
         let row = |(row, (_, frame)): (usize, &(Se3, usize))| {
             let (camera, index) = name(*frame);

@@ -1,6 +1,5 @@
-//! Where every pixel of one image is in the next: least squares of the differences of small patches that overlap,
-//! coarse to
-//! fine (Kroeger et al. 2016, "Fast Optical Flow using Dense Inverse Search", without the variational step).
+//! Dense optical flow from one image to the next: least squares of the differences of small patches that overlap,
+//! coarse to fine (Kroeger et al. 2016, "Fast Optical Flow using Dense Inverse Search", without the variational step).
 
 use super::raster::{blurred, every_second, sample};
 use rayon::prelude::*;

@@ -238,7 +238,7 @@ impl<'a> Reference<'a> {
         self.step * k as f64
     }
 
-    /// Where a window is in depth; `None` where neighbours do not agree on it, or as well elsewhere.
+    /// Depth of a window; `None` where neighbours do not agree on it, or as well elsewhere.
     fn find(&self, window: &Window) -> Option<Patch> {
         let flat = |inverse: f64| Patch { inverse, tilt: [0.0; 2] };
         let scores: Vec<f32> = (0..self.depths).map(|k| self.alike(window, flat(self.inverse(k)))).collect();

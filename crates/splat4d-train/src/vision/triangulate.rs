@@ -58,7 +58,7 @@ impl Transfer {
 pub struct PixelObservation<'a> {
     /// By which camera (pinhole).
     pub camera: &'a Camera,
-    /// Where in its image.
+    /// Position in its image.
     pub pixel: [f64; 2],
 }
 

@@ -26,7 +26,7 @@ const MOVED_BLUR: f64 = 1.0;
 
 /// An image to search for points in.
 pub(crate) struct View {
-    /// Where it was taken from; its size is the image's.
+    /// Its camera; its size is the image's.
     pub camera: Camera,
     /// Colours as bytes, pixel by pixel.
     pub colors: Vec<[u8; 3]>,
@@ -108,7 +108,7 @@ impl Rigs {
         }
     }
 
-    /// What differs from `still` in the frames nearest to time t, and their time; nothing where cameras move or times
+    /// Differences from `still` in the frames nearest to time t, and their time; nothing where cameras move or times
     /// are few.
     pub(crate) fn moving(&self, frames: &dyn Frames, still: &[View], t: f64) -> Result<Option<(Vec<View>, f64)>> {
         let Self::Fixed(rigs) = self else { return Ok(None) };

@@ -28,7 +28,7 @@ const FLAT: f64 = 0.7;
 /// By how much colours of points fit another focal length better, where that is right.
 const COLOURS: f64 = 0.1;
 
-/// What the factors by which focal lengths are tried give, by steps.
+/// Results for the tried factors of focal lengths, by steps.
 struct Tried(Vec<f64>);
 
 impl Tried {

@@ -35,7 +35,7 @@ pub(super) struct Mark {
     pub(super) ray: [f64; 2],
 }
 
-/// What a mask or alpha shows of an image.
+/// Foreground of an image by mask or alpha.
 pub(super) struct Shown {
     /// [height · width] of the small image, from 0 to 1.
     pub(super) weights: Vec<f32>,
@@ -238,7 +238,7 @@ impl SmallImage {
     }
 }
 
-/// Where a point is seen in the image file; `None`: behind the camera or outside.
+/// Position of a point in the image file; `None`: behind the camera or outside.
 pub(super) fn pixel_of(camera: &Camera, lens: &Distortion, pose: &Se3, point: [f64; 3]) -> Option<[f64; 2]> {
     let [x, y, z] = pose.apply(point);
     if z <= 0.0 {

@@ -41,12 +41,12 @@ struct Measure {
     foreground: Option<f64>,
 }
 
-/// What [`Capture::check_poses`] found.
+/// Result of [`Capture::check_poses`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PoseCheck {
     /// The convention that the poses are probably written in; `None`: as they were read, or undetermined.
     pub written_as: Option<Poses>,
-    /// What was found, or why nothing could be.
+    /// The finding, or the reason for none.
     pub finding: Finding,
     /// Further findings from images: single poses, focal lengths and masks.
     pub more: Vec<Finding>,
@@ -253,7 +253,7 @@ fn other_unit(ratio: f64, by: &str, file: &DepthFile) -> String {
     )
 }
 
-/// What masks and alpha show about themselves: white counts.
+/// Polarity of masks and alpha: white counts.
 fn check_masks(images: &[SmallImage], poses: &[Se3]) -> Option<Finding> {
     let percent = |x: f64| 100.0 * x;
     let (severity, aspect, what, remedy) = match silhouettes::masks(images, poses) {

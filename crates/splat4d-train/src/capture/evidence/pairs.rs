@@ -38,7 +38,7 @@ impl Match {
     }
 }
 
-/// What matches show about one convention.
+/// Evidence of matches for one convention.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Measure {
     pub(super) matches: usize,

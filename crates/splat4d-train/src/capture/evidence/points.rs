@@ -38,7 +38,7 @@ const ONE_COLOUR: f64 = 0.02;
 /// Colours that are compared at least.
 const ENOUGH: usize = 60;
 
-/// What points show about one convention.
+/// Evidence of points for one convention.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Measure {
     /// Points that were sampled.
@@ -206,7 +206,7 @@ fn by_points(capture: &Capture) -> Option<f64> {
     (quarter(3) <= STEADY * quarter(1)).then(|| quarter(2))
 }
 
-/// What a stored number of depth may have to be multiplied by: powers of two and ten over this range.
+/// Candidate factors of stored depths: powers of two and ten over this range.
 const FACTORS: [f64; 2] = [1e-5, 1e5];
 /// Pixels of a map that another map is compared with, along each side.
 const GRID: usize = 24;

@@ -31,7 +31,7 @@ pub(super) fn measure(images: &[SmallImage], poses: &[Se3]) -> Option<f64> {
     at_one_place(images, poses, |look| look.foreground).map(|(share, _)| share)
 }
 
-/// What masks show about themselves: white counts.
+/// Polarity of masks: white counts.
 pub(super) enum Masks {
     /// There are none, or foregrounds are at one place.
     Fine,

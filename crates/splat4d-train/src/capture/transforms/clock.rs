@@ -35,7 +35,7 @@ pub(super) struct Rate {
     pub stated: bool,
 }
 
-/// What times count, the seconds of one, and why it is not sure.
+/// Unit of times, its seconds, and the reason for doubt.
 struct Reading {
     times: Times,
     scale: f64,
@@ -92,7 +92,7 @@ fn is_frame(step: f64, fps: f64) -> bool {
     (step * fps - 1.0).abs() <= NEAR_STEP
 }
 
-/// What the times count.
+/// Unit of the times.
 fn read(
     entries: &[Entry],
     (times, instants, of_camera): (&[f64], &[f64], &[usize]),

@@ -36,7 +36,7 @@ pub(super) struct Entry {
 pub(super) struct File<'a> {
     /// Its folder, and how its files are found.
     pub lookup: &'a Lookup,
-    /// Where images are searched for.
+    /// Lookup of images.
     pub bases: &'a [PathBuf],
     /// The whole file.
     pub top: &'a Node<'a>,

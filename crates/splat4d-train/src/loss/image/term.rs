@@ -39,7 +39,7 @@ pub struct View<'a, F = f32> {
     pub depth: Option<DepthTruth<'a, F>>,
     /// Its optical flow, where known.
     pub flow: Option<FlowTruth<'a, F>>,
-    /// Where tracked points are at another time: flow that is known in their pixels alone.
+    /// Positions of tracked points at another time: flow that is known in their pixels alone.
     pub tracks: Option<FlowTruth<'a, F>>,
     /// The frame's number in the capture, for messages and for devices that keep its image.
     pub frame: usize,

@@ -100,7 +100,7 @@ impl Weighing {
         }
     }
 
-    /// Where the score is one of all views together: the importance of every row of a layer.
+    /// If the score is one of all views together: the importance of every row of a layer.
     pub(super) fn whole(&self, layer: usize) -> Option<Vec<f64>> {
         Some(self.blocks.get(layer)?.iter().map(root_of_determinant).collect())
     }

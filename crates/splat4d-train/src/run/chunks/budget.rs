@@ -1,5 +1,5 @@
-//! What a take in chunks costs before it is begun, and the plan that stays within a memory limit and a time: shorter
-//! chunks of fewer Gaussians, and the steps of a chunk. [`Pacing`] keeps the parts to that time while they are trained.
+//! Estimated cost of a take in chunks, and the plan that stays within a memory limit and a time: shorter chunks of
+//! fewer Gaussians, and the steps of a chunk. [`Pacing`] keeps the parts to that time while they are trained.
 
 use super::shared::STEPS;
 use super::{ChunkPlan, beginning, check, chosen};

@@ -47,7 +47,7 @@ pub struct Joined {
 /// their midst.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Seams {
-    /// Where they overlap.
+    /// Their overlap.
     pub across: f64,
     /// In the middle of chunks.
     pub inside: f64,
@@ -158,7 +158,7 @@ impl Chunked {
         Ok(whole)
     }
 
-    /// What all chunks share; none: nothing is static. Errors: the file cannot be read.
+    /// The shared part of all chunks; none: nothing is static. Errors: the file cannot be read.
     pub fn still(&self) -> Result<Option<Layer<f32>>> {
         Ok(shared::read(&self.folder(Part::Shared))?.still)
     }

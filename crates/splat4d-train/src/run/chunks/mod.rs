@@ -54,7 +54,7 @@ const TURNS: Duration = Duration::from_millis(200);
 const PLAN: &str = "plan.json";
 /// File of a finished run.
 const SCENE: &str = "scene.safetensors";
-/// What made runs of chunks.
+/// Version of the code that made runs of chunks.
 pub(super) const MADE_BY: &str = "train --chunk";
 
 /// A part of the work on a capture.
@@ -84,7 +84,7 @@ pub struct Chunked {
     source: PathBuf,
     recipe: Recipe,
     plan: ChunkPlan,
-    /// What the lenses of the capture recorded, from the part that was opened first: it is the same for all.
+    /// Recorded areas of the capture's lenses, from the part that was opened first: it is the same for all.
     lenses: Lenses,
     /// Limits this worker to its minutes.
     pacing: Option<Pacing>,
@@ -275,7 +275,7 @@ impl Chunked {
         }
     }
 
-    /// What a finished part is known by: its name and a fingerprint of its file. Errors: the file cannot be read.
+    /// Identity of a finished part: its name and a fingerprint of its file. Errors: the file cannot be read.
     pub fn print(&self, part: Part) -> Result<String> {
         let file = if part == Part::Shared { shared::FILE } else { SCENE };
         let bytes = shared::read_file(&self.folder(part).join(file))?;

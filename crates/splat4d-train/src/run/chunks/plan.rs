@@ -1,4 +1,4 @@
-//! Where a capture is cut: evenly, moved to where least moves.
+//! Boundaries of chunks: evenly spaced, moved to times of least motion.
 
 use super::{FRAMES, WHOLE};
 use crate::capture::{Capture, ImageStore};

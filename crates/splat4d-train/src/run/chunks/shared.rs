@@ -1,4 +1,4 @@
-//! What chunks share: the layer of the static background all the time, and the cameras' exposures.
+//! Shared parts of chunks: the layer of the static background and the cameras' exposures.
 //!
 //! Temporal medians of every fixed camera over parts of the capture are a capture of their own, on which a still scene
 //! is trained as any other run is. Of its Gaussians those stay that most cameras see where next to nothing ever
@@ -51,7 +51,7 @@ pub(super) const STEPS: usize = 4;
 /// A Gaussian stays where it is static in at least this share of the cameras that see it.
 const AGREED: f64 = 0.5;
 
-/// What a finished part states.
+/// Record of a finished part.
 pub(super) struct Shared {
     /// The static background, as it was learnt; none: nothing does.
     pub still: Option<Layer<f32>>,
