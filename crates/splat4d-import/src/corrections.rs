@@ -256,7 +256,7 @@ impl Corrections {
         write_atomically(&folder.join(FILE), format!("{HEAD}{body}").as_bytes())
     }
 
-    /// What the user gives of all cameras' offsets.
+    /// Offsets of all cameras given by the user.
     pub fn given_offsets(&self) -> Vec<Option<f64>> {
         self.cameras.iter().map(Camera::given_offset).collect()
     }

@@ -19,7 +19,7 @@ const SIDE: usize = 1080;
 /// Folder of the notes that `write::pictures` keeps of what it stored.
 const NOTES: &str = "import";
 
-/// What was extracted.
+/// The extracted frames.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Extracted {
     /// Cameras.
@@ -28,7 +28,7 @@ pub struct Extracted {
     pub frames: usize,
     /// Pixels across and down.
     pub size: [usize; 2],
-    /// What was odd, a sentence or two each.
+    /// Remarks, a sentence or two each.
     pub warnings: Vec<String>,
 }
 
@@ -152,7 +152,7 @@ fn frames_of(info: &Info) -> Option<usize> {
     info.frames.or_else(|| Some((info.duration? * info.average_rate.or(info.nominal_rate)?).round() as usize))
 }
 
-/// What such a capture holds before its frames are extracted.
+/// Content of such a capture before extraction.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Contents {
     /// Names of the cameras, and frames of each, where its file states them.
@@ -165,7 +165,7 @@ pub struct Contents {
     pub rate: Option<f64>,
     /// Seconds of the longest, where files state them.
     pub seconds: Option<f64>,
-    /// What is odd, a sentence or two each; those that spoil the result first.
+    /// Remarks, a sentence or two each; those that spoil the result first.
     pub warnings: Vec<String>,
 }
 
@@ -176,7 +176,7 @@ fn is_extracted(root: &Path, video: &Path) -> bool {
     note.is_some_and(|n| n["complete"] == true)
 }
 
-/// What such a capture holds; `None`: it is no such capture, or all frames are extracted. Errors: as [`extract`], but
+/// Content of such a capture; `None`: it is no such capture, or all frames are extracted. Errors: as [`extract`], but
 /// of space.
 pub fn contents(root: &Path) -> Result<Option<Contents>> {
     let videos = videos(root);

@@ -28,7 +28,7 @@ pub struct Family {
     codes: &'static str,
 }
 
-/// What is known. Least distances of two patterns, turned or not: 11, 3, 6, 11 bits.
+/// Supported families. Least distances of two patterns, turned or not: 11, 3, 6, 11 bits.
 const FAMILIES: [Family; 4] = [
     Family { name: "36h11", side: 6, wrong: 2, codes: include_str!("36h11.txt") },
     Family { name: "4x4", side: 4, wrong: 0, codes: include_str!("4x4.txt") },
@@ -177,7 +177,7 @@ impl Family {
     }
 }
 
-/// What takes the unit square to four corners: a homography.
+/// Homography from the unit square to four corners.
 struct Square {
     h: [f64; 8],
 }

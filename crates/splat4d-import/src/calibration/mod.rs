@@ -73,7 +73,7 @@ struct Text {
     tree: Tree,
 }
 
-/// What a file states about a camera; two files may each state a part.
+/// A camera in a file; two files may each state a part.
 #[derive(Clone, Debug, Default)]
 struct Part {
     names: Vec<String>,
@@ -82,7 +82,7 @@ struct Part {
     pose: Option<Se3>,
 }
 
-/// What a file states.
+/// Content of a file.
 #[derive(Default)]
 struct Said {
     parts: Vec<Part>,

@@ -48,7 +48,7 @@ fn find<'a>(tree: &'a Tree, keys: &[&str]) -> Option<(&'a str, &'a Tree)> {
     keys.iter().find_map(of).map(|(k, v)| (k.as_str(), v))
 }
 
-/// Where a program has not calibrated yet, it writes nothing, null or an empty list.
+/// Uncalibrated cameras are missing, null or an empty list.
 fn is_empty(tree: &Tree) -> bool {
     match tree {
         Tree::Word(word) => word.is_empty() || word == "null" || word == "~",

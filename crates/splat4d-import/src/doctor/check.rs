@@ -86,7 +86,7 @@ fn gather(report: &mut Report, cameras: usize) {
     }
 }
 
-/// What the whole rig states.
+/// Findings of the whole rig.
 fn take(capture: &Capture, seen: &[CameraObservations], report: &mut Report) {
     let fixed: Vec<usize> =
         (0..seen.len()).filter(|&c| capture.cameras[c].fixed && !seen[c].stands.is_empty()).collect();
@@ -142,7 +142,7 @@ fn take(capture: &Capture, seen: &[CameraObservations], report: &mut Report) {
     volume_of(&own, target, report);
 }
 
-/// What three cameras see of dynamic regions about a place.
+/// Share of dynamic regions around a point that three cameras see.
 pub(super) fn volume_of(seen: &[&CameraObservations], target: [f64; 3], report: &mut Report) {
     report.seen_by_three = volume::seen_by_three(seen, target);
     let Some(share) = report.seen_by_three else {

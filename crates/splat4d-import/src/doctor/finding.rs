@@ -1,4 +1,4 @@
-//! What checks share: thresholds, grades, and the report that they write findings to.
+//! Shared parts of checks: thresholds, grades, and the report that they write findings to.
 
 use super::{Finding, Grade, Report};
 use splat4d::scene::Camera;

@@ -1,4 +1,4 @@
-//! What is examined of a camera: a few images over the recording, and some in a row.
+//! Examined images of a camera: a few images over the recording, and some in a row.
 
 use super::Options;
 use crate::Result;
@@ -31,7 +31,7 @@ pub(super) struct Stand {
     pub(super) picture: Rgb8,
 }
 
-/// What was seen of a camera.
+/// Measurements of a camera.
 #[derive(Default)]
 pub(super) struct CameraObservations {
     pub(super) stands: Vec<Stand>,

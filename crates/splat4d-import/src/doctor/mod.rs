@@ -57,7 +57,7 @@ pub struct Finding {
     pub alike: Vec<Finding>,
 }
 
-/// What was measured of a camera, and an image of it.
+/// Measurements of a camera, and an image of it.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct CameraReport {
     /// Its name.
@@ -115,7 +115,7 @@ pub struct PairReport {
     pub sharper: f64,
 }
 
-/// What training with all defaults takes.
+/// Cost of training with all defaults.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Training {
     /// The motion model that suits.
@@ -137,7 +137,7 @@ pub struct Report {
     pub pairs: Vec<PairReport>,
     /// Part of the space in which something moves that three cameras see.
     pub seen_by_three: Option<f64>,
-    /// What training takes with all defaults.
+    /// Cost of training with all defaults.
     pub training: Option<Training>,
     /// Cameras that should be left out.
     pub leave_out: Vec<String>,

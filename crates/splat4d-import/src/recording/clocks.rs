@@ -74,7 +74,7 @@ fn heard(
     Ok(pairs.par_iter().map(of).collect())
 }
 
-/// What motion states.
+/// Evidence of motion.
 pub(super) struct Guessed {
     /// Lags that are guessed.
     pub evidence: Vec<Evidence>,
@@ -227,7 +227,7 @@ pub(super) fn shared(
     Ok(known.iter().map(cut).collect())
 }
 
-/// What was measured and not believed, a line each.
+/// Rejected measurements, a line each.
 pub(super) fn refusals(names: &[&str], evidence: &[Evidence], clock: &Solution) -> Vec<String> {
     let line = |r: &graph::Refused| {
         let e = &evidence[r.evidence];

@@ -29,8 +29,7 @@ struct Step {
     options: &'static [(&'static str, &'static str)],
 }
 
-/// What was measured to work best on the bundled capture and a hall (methods of wide baselines: affine shapes, domain
-/// sizes).
+/// Options that worked best on the bundled capture and a hall (methods of wide baselines: affine shapes, domain sizes).
 const STEPS: [Step; 3] = [
     Step {
         name: "feature_extractor",

@@ -10,7 +10,7 @@ use splat4d::scene::Planes;
 use splat4d_train::capture::{PointCloud, Rgb8};
 use std::path::Path;
 
-/// What was given of all cameras, in their order.
+/// Given values of all cameras, in their order.
 pub(super) struct Given {
     cameras: Vec<Calibrated>,
     /// Pixels across and down of the videos.

@@ -107,7 +107,7 @@ fn recordings(files: Vec<PathBuf>) -> Vec<Input> {
     out
 }
 
-/// What is in a folder, by name; nothing hidden.
+/// Entries of a folder, by name, without hidden ones.
 fn entries(folder: &Path) -> Result<Vec<PathBuf>> {
     let read = std::fs::read_dir(folder).map_err(|e| Error::io("the folder cannot be read", e).at(folder.display()))?;
     let hidden = |p: &PathBuf| p.file_name().is_some_and(|n| n.to_string_lossy().starts_with('.'));

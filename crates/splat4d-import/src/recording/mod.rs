@@ -46,7 +46,7 @@ pub enum Rig {
     Moving,
 }
 
-/// What is to be imported, and how.
+/// Inputs and options of an import.
 #[derive(Clone, Debug)]
 pub struct Request {
     /// Videos, folders of images, and folders of those.

@@ -22,7 +22,7 @@ const RESTED: f64 = 0.05;
 const MOVING_POINTS: usize = 20;
 /// The standard deviation of a clock that they agree on, frames: half of a hall's 31 clocks were 0.04 off.
 const BY_GEOMETRY: f64 = 0.06;
-/// Where sound determines a clock, geometry contradicts it from this many frames on.
+/// Difference in frames from which geometry contradicts a clock from sound.
 const CONTRADICTS: f64 = 1.0;
 /// Of points that are static training starts; where there are fewer, of all.
 const ENOUGH_STILL: usize = 200;
@@ -42,7 +42,7 @@ pub(super) struct Stand {
     pub error: f64,
 }
 
-/// What was found.
+/// The result.
 pub(super) struct Solved {
     /// In the order of the stored cameras; why not, where one could not be placed.
     pub cameras: Vec<Result<Stand, String>>,
@@ -149,7 +149,7 @@ impl Note {
     }
 }
 
-/// What was solved before of the same images, clocks and lenses, else what `solve` finds now.
+/// The stored solution for the same images, clocks and lenses, else that of `solve`.
 pub(super) fn once(
     cache: &Cache,
     stored: &Stored<'_>,

@@ -1,4 +1,4 @@
-//! What was found, and how sure it is.
+//! Results and their accuracy.
 
 use super::poses::Stand;
 use super::spacing::Gap;
@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 /// The file in the capture's folder.
 const FILE: &str = "import/report.json";
 
-/// What an import found.
+/// Result of an import.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Report {
     /// The capture's file.
@@ -24,7 +24,7 @@ pub struct Report {
     pub gaps: Vec<Gap>,
     /// Points that cameras agree on.
     pub points: usize,
-    /// What had to be assumed, a sentence each.
+    /// Assumptions, a sentence each.
     pub guesses: Vec<String>,
     /// Pairs of cameras whose lag was measured and contradicts the rest.
     pub refused: Vec<String>,
@@ -34,7 +34,7 @@ pub struct Report {
     pub still: bool,
 }
 
-/// What an import found of a camera.
+/// Result for a camera.
 #[derive(Clone, Debug, Serialize)]
 pub struct CameraReport {
     /// Its name.
@@ -63,7 +63,7 @@ pub struct CameraReport {
     pub focal: Option<f64>,
     /// Distance of its content from the position by the calibration, pixels; none: no calibration, or too few matches.
     pub calibration: Option<f64>,
-    /// What was odd about its file.
+    /// Remarks about its file.
     pub warnings: Vec<String>,
 }
 

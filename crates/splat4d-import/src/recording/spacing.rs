@@ -17,7 +17,7 @@ pub struct Gap {
 }
 
 impl Gap {
-    /// What to do about it; none: they are near enough.
+    /// Advice; none: they are near enough.
     pub(crate) fn advice(&self) -> Option<String> {
         let more = (self.degrees / FAR).ceil() as usize - 1;
         let [a, b] = &self.cameras;

@@ -18,7 +18,7 @@ pub(super) struct Stored<'a> {
     pub offsets: Vec<Option<Offset>>,
     /// Lenses, and places, that were given.
     pub known: &'a [Option<Known>],
-    /// What of images counts; empty: all of it.
+    /// Masks of images; empty: none.
     pub masks: &'a [Masks],
 }
 
@@ -37,7 +37,7 @@ impl<'a> Stored<'a> {
         Self { offsets: offsets.to_vec(), ..*self }
     }
 
-    /// What was given of a camera.
+    /// Given values of a camera.
     pub(super) fn known(&self, camera: usize) -> Option<Known> {
         self.known.get(camera).copied().flatten()
     }

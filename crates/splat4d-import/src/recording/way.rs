@@ -17,7 +17,7 @@ const OUTLIER: f64 = 2.0;
 /// A clock of geometry is sure to this many seconds at least.
 const SURE: f64 = 1e-3;
 
-/// What was corrected.
+/// The correction.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Corrected {
     /// How many clocks.
@@ -126,7 +126,7 @@ fn looked_at(places: &[Option<([f64; 3], [f64; 3])>]) -> Option<([f64; 3], f64)>
 /// Positions of sounds.
 struct Source<'a> {
     places: &'a [Option<([f64; 3], [f64; 3])>],
-    /// What is believed before anything was heard, and its standard deviation.
+    /// Prior position of a sound, and its standard deviation.
     middle: [f64; 3],
     spread: f64,
 }

@@ -15,7 +15,7 @@ const ALONG_AXIS: f64 = 0.966;
 /// Degrees between the up direction of floor and walls and that of the cameras from which on it is reported.
 const TOLD: f64 = 1.0;
 
-/// Where the world is from.
+/// Source of the world's axes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Origin {
     /// A calibration, whose axes and lengths stay; whether these are metres.
@@ -118,7 +118,7 @@ fn place(solved: &Solved, stored: &Stored<'_>, name: &str) -> Option<[f64; 3]> {
     stand.poses.iter().flatten().next().map(|p: &Se3| p.inverse().translation)
 }
 
-/// What makes the distance of two cameras this many metres.
+/// Scale that gives two cameras this distance in metres.
 fn apart(solved: &Solved, stored: &Stored<'_>, pair: &[String; 2], metres: f64) -> Result<f64> {
     let other = |what: String| Error::input(what).remedy("Give the distance of two other cameras.");
     let (Some(a), Some(b)) = (place(solved, stored, &pair[0]), place(solved, stored, &pair[1])) else {

@@ -52,7 +52,7 @@ pub(crate) struct Bundle {
     pub sightings: Vec<Sighting>,
 }
 
-/// What is adjusted in addition to points.
+/// Parameters in addition to points.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Free {
     /// Poses.
@@ -70,7 +70,7 @@ pub(crate) struct Free {
 /// Standard deviations of what is known beforehand; infinite: nothing is.
 #[derive(Clone, Debug)]
 pub(crate) struct Priors {
-    /// Where each lens is expected.
+    /// Prior of each lens.
     pub lenses: Vec<Lens>,
     /// Of log f.
     pub focal: f64,
@@ -98,11 +98,11 @@ impl Priors {
 pub(crate) struct Settings {
     /// Distance beyond which a sighting hardly counts (Cauchy's loss), pixels; infinite: plain squares.
     pub scale: f64,
-    /// What is adjusted.
+    /// The parameters.
     pub free: Free,
     /// Lenses that are known exactly and stay, whatever is free; none where it is empty.
     pub exact: Vec<bool>,
-    /// What is known beforehand.
+    /// The priors.
     pub priors: Priors,
     /// Evaluations, at most.
     pub steps: usize,

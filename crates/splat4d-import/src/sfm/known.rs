@@ -175,7 +175,7 @@ mod tests {
         Known { intrinsics: Intrinsics { fx: 500.0, fy: 510.0, cx: 330.0, cy: 228.0 }, lens, pose }
     }
 
-    /// Where the bent camera sees a place of its own axes.
+    /// Projection of a point in the distorted camera's axes.
     fn seen(k: &Known, p: [f64; 3]) -> [f64; 2] {
         let [x, y] = Distortion::new(k.lens).distort([p[0] / p[2], p[1] / p[2]]).unwrap();
         [k.intrinsics.fx * x + k.intrinsics.cx, k.intrinsics.fy * y + k.intrinsics.cy]

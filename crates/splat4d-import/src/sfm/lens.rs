@@ -43,7 +43,7 @@ impl Lens {
         Self { focal, k1: 0.0, center: [0.5 * width as f64, 0.5 * height as f64] }
     }
 
-    /// Where a place in the camera's axes is seen; nothing at or behind the camera.
+    /// Projection of a point in camera axes; none at or behind the camera.
     pub(crate) fn project(&self, p: [f64; 3]) -> Option<[f64; 2]> {
         if p[2] <= 0.0 || p[2].is_nan() {
             return None;
@@ -94,7 +94,7 @@ impl Lens {
         [bent[0] * r / radius, bent[1] * r / radius, 1.0]
     }
 
-    /// Where a pinhole camera of the same focal length would see what is seen at a pixel.
+    /// Undistorted position of a pixel, for a pinhole camera of the same focal length.
     pub(crate) fn straight(&self, pixel: [f64; 2]) -> [f64; 2] {
         let ray = self.ray(pixel);
         [self.focal * ray[0] + self.center[0], self.focal * ray[1] + self.center[1]]

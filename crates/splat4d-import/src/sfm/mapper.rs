@@ -81,7 +81,7 @@ const GUIDED_WITHIN: f64 = 0.5;
 const ALIKE: f64 = 0.06;
 const FAMILY_FROM: usize = 4;
 const FAMILY: f64 = 0.003;
-/// Where images contradict that, lenses differ by this share: of phones of several models, some per cent.
+/// Difference of lenses that images contradict, as a share: of phones of several models, some per cent.
 const STRANGERS: f64 = 0.05;
 /// Twice the loss of treating lenses as equal, of the variance of a sighting and for each lens: more contradicts it.
 /// Were sightings' errors independent, 1 would be usual (Wilks 1938).
@@ -123,7 +123,7 @@ pub(crate) struct Map<'a> {
     strangers: bool,
 }
 
-/// What all starts share.
+/// Shared data of all starts.
 pub(crate) struct Ground<'a> {
     pub sights: &'a [CameraView],
     pub tracks: &'a [Track],

@@ -40,7 +40,7 @@ pub struct Options {
     pub walking: Option<usize>,
 }
 
-/// Where an image was taken from: a fixed camera's, or one frame's of a moving one.
+/// Pose of an image: a fixed camera's, or one frame's of a moving one.
 #[derive(Clone, Debug)]
 pub struct Taken {
     /// The camera.
@@ -49,7 +49,7 @@ pub struct Taken {
     pub frame: Option<usize>,
     /// Its name in messages.
     pub name: String,
-    /// Where it is; why not, where it could not be found.
+    /// Its pose, or the reason for none.
     pub placed: Result<Placed, String>,
 }
 
@@ -90,7 +90,7 @@ pub struct Point {
 pub struct Solution {
     /// One for each camera, or for each frame that was chosen of moving ones.
     pub taken: Vec<Taken>,
-    /// What they see.
+    /// Their points.
     pub points: Vec<Point>,
     /// Upwards in the world, guessed: what most cameras hold upwards (unit).
     pub up: [f64; 3],

@@ -107,7 +107,7 @@ impl Eye<'_> {
         )
     }
 
-    /// Where a point that moves is seen, and how fast.
+    /// Image position and velocity of a moving point.
     pub(super) fn moving(&self, x: [f64; 3], speed: [f64; 3]) -> Option<([f64; 2], [f64; 2])> {
         Some((self.pixel(x)?, self.slopes(x)?.map(|row| dot(row, speed))))
     }
@@ -118,7 +118,7 @@ impl Eye<'_> {
 pub(super) struct ImagePoint<'a> {
     /// The image.
     pub shown: Option<&'a Shown>,
-    /// Where in it.
+    /// Position in it.
     pub place: [f64; 2],
     /// From where.
     pub eye: Eye<'a>,
@@ -280,7 +280,7 @@ mod tests {
     use splat4d::math::Rng;
     use splat4d_train::vision::raster::{blurred, sample};
 
-    /// What a camera sees of a textured wall z = 0, brightened.
+    /// A camera's image of a textured wall z = 0, brightened.
     fn wall(eye: Eye<'_>, texture: &Planes<f32>, gain: f32) -> Shown {
         let (width, height) = (160, 120);
         let mut grey = Planes::<f32>::new(1, height, width);

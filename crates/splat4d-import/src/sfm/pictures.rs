@@ -1,4 +1,4 @@
-//! What cameras see, as features: of the static background on the median image, of what moves at times that all share.
+//! Features of cameras: of the static background on the median image, of what moves at times that all share.
 
 use super::lens::Known;
 use super::overlay::Shown;
@@ -36,7 +36,7 @@ pub trait Pictures: Sync {
     fn known(&self, _camera: usize) -> Option<Known> {
         None
     }
-    /// What of a camera's frame counts: one channel, above one half; all of it where there is none.
+    /// Mask of a camera's frame: one channel, above one half; all of it where there is none.
     fn mask(&self, _camera: usize, _frame: usize) -> Result<Option<Planes<f32>>> {
         Ok(None)
     }
@@ -80,7 +80,7 @@ pub struct CameraView {
     pub frame: f64,
     /// In the order of times.
     pub features: Vec<Feature>,
-    /// What each time's features are from, by the time's number; none of a lens that is known, whose features were
+    /// Source of each time's features, by the time's number; none of a lens that is known, whose features were
     /// straightened.
     pub shown: Vec<Option<Shown>>,
 }
@@ -147,7 +147,7 @@ fn bytes(picture: &Planes<f32>) -> Vec<u8> {
     picture.data.iter().map(|v| (v * 255.0).round().clamp(0.0, 255.0) as u8).collect()
 }
 
-/// What of an image counts.
+/// Mask of an image.
 struct Mask {
     mask: Planes<f32>,
     size: [usize; 2],
@@ -326,7 +326,7 @@ struct Window {
 }
 
 impl Window {
-    /// What holds all requested pixels and enough about them for features and velocities; `None`: there are none.
+    /// Box around all requested pixels, with a margin for features and velocities; `None`: there are none.
     fn around(width: usize, height: usize, wanted: &dyn Fn(usize, usize) -> bool) -> Option<Self> {
         /// Descriptors of ordinary features and motion of a frame reach no farther, pixels.
         const MARGIN: usize = 48;

@@ -186,7 +186,7 @@ const MOST: usize = 2000;
 /// Chance of leaving too early.
 const MISSED: f64 = 1e-3;
 
-/// Where so large a share of the points agrees with a lens whose focal length adapts, others need not be tried.
+/// If such a share of the points agrees with a lens whose focal length adapts, others need not be tried.
 const ENOUGH: f64 = 0.6;
 
 /// The camera that explains most of the known points, with one of these lenses or, where `free`, one of a focal length

@@ -3,9 +3,9 @@
 
 use splat4d::math::Rng;
 
-/// What a model is searched for in.
+/// Data of the search for a model.
 pub(crate) trait Data {
-    /// What is searched for.
+    /// The model.
     type Model: Clone;
     /// Data that a model is made of.
     const SAMPLE: usize;

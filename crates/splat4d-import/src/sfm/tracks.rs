@@ -182,8 +182,8 @@ pub(crate) struct Known {
 
 /// Second-best matches are searched for along the epipolar line alone, where there are few: they must be farther away.
 const GUIDED_RATIO: f32 = 0.75;
-/// What is alone on its line must be as good as if something quite unlike was next to it: squared distance of
-/// descriptors, an eighth of the largest there is.
+/// A match without a competitor on its line must beat an unlike one: squared distance of descriptors, an eighth of the
+/// largest there is.
 const FAR: f32 = 65_536.0;
 /// Cameras whose axes are farther apart see other sides of objects, degrees.
 const WIDEST: f64 = 80.0;
@@ -359,7 +359,7 @@ pub fn join(sights: &[CameraView], links: &[Link]) -> Vec<Track> {
 /// link votes for
 /// those with which its fundamental matrix is an essential one.
 pub(crate) fn focal_votes(sights: &[CameraView], links: &[Link], candidates: &[f64]) -> Vec<f64> {
-    /// What a matrix of noisy matches misses, at the right focal length: the vote falls to 1/e.
+    /// Residual of a matrix of noisy matches at the right focal length: the vote falls to 1/e.
     const OFF: f64 = 0.05;
     let vote = |focal: f64| -> f64 {
         let of = |l: &Link| {

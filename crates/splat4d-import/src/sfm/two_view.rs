@@ -1,5 +1,4 @@
-//! What two images of one scene show about each other: fundamental and essential matrices, and the motion between their
-//! cameras.
+//! Two-view geometry: fundamental and essential matrices, and the motion between their cameras.
 
 use super::algebra::{
     Mat3, add, eliminate, least_vector, multiply, null_space, orthonormal, roots, rotation, skew, svd, value,

@@ -154,7 +154,7 @@ fn interval(tracks: &[Track]) -> f64 {
     median(&mut steps.collect::<Vec<_>>())
 }
 
-/// Where a track was, and the squared slope of the line there; None: it was not.
+/// Position of a track and the squared slope of the line there; none: outside the track.
 type TrackPoint = Option<([f64; 2], f64)>;
 
 /// A pair of tracks and its mean squared distance at every lag.
@@ -289,7 +289,7 @@ impl Problem<'_> {
         fits.into_iter().filter(best).map(|f| f.0).collect()
     }
 
-    /// Where the first camera saw the pairs when the second did at all lags between two.
+    /// Positions of the pairs in the first camera at the second one's times, at all lags between two.
     fn sightings(&self, pairs: &[[usize; 2]], ends: [f64; 2]) -> Vec<Sightings> {
         let of = |&pair: &[usize; 2]| {
             let other = &self.b[pair[1]];

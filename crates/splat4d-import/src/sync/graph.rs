@@ -12,10 +12,10 @@ const LEAST_SIGMA: f64 = 1e-5;
 const NARROWER: f64 = 1.4;
 /// Steps at most.
 const STEPS: usize = 100;
-/// What keeps unconnected cameras from making the equations singular, relative to the least certain lag's weight.
+/// Ridge that keeps the equations regular for unconnected cameras, relative to the least certain lag's weight.
 const RIDGE: f64 = 1e-9;
 
-/// What a lag is from, the most trusted first.
+/// Source of a lag, the most trusted first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub enum Kind {
     /// Given by the user.
@@ -55,7 +55,7 @@ pub struct Evidence {
     pub kind: Kind,
 }
 
-/// What is added to a camera's times: an event at t is at `t·(1 + rate) + seconds` on the clock of all.
+/// Correction of a camera's times: an event at t is at `t·(1 + rate) + seconds` on the clock of all.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Offset {
     /// Seconds.
@@ -91,7 +91,7 @@ pub(crate) struct Refused {
 pub(crate) struct Solution {
     /// Per camera; None: nothing connects it with camera 0 or one whose offset is given.
     pub offsets: Vec<Option<Offset>>,
-    /// What was left out.
+    /// Rejected lags.
     pub refused: Vec<Refused>,
 }
 

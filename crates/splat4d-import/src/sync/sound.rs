@@ -258,7 +258,7 @@ fn fine(a: &SoundTrack, b: &SoundTrack, coarse: f64) -> Result<SoundLag, Refusal
     })
 }
 
-/// What a window states.
+/// Evidence of a window.
 struct Window {
     /// Its middle, on a's clock.
     at: f64,

@@ -55,7 +55,7 @@ pub struct Track {
 }
 
 impl Track {
-    /// Where it was at a time, between its first and last: on the line between two frames.
+    /// Position at a time between its first and last: on the line between two frames.
     #[cfg(test)]
     pub(crate) fn at(&self, time: f64) -> Option<[f64; 2]> {
         let after = self.samples.partition_point(|s| s.0 < time);
@@ -68,7 +68,7 @@ impl Track {
         Some([a[0] + part * (b[0] - a[0]), a[1] + part * (b[1] - a[1])])
     }
 
-    /// Where it was at a time, smoothed by a cubic B-spline over four frames; None within a frame of its ends.
+    /// Position at a time, smoothed by a cubic B-spline over four frames; None within a frame of its ends.
     ///
     /// A line between two noisy places is less noisy half way than at either end, so that lags would be biased to half
     /// frames (on a real rig half of the pairs were); the weights of a cubic B-spline have nearly the same sum of
@@ -187,8 +187,8 @@ fn smaller_eigenvalue([xx, xy, yy]: [f64; 3]) -> f64 {
     0.5 * (xx + yy) - (0.25 * (xx - yy) * (xx - yy) + xy * xy).sqrt()
 }
 
-/// Where points of image a are in image b; None where they are lost: they left, nothing there is like them, or they do
-/// not return to the start when tracked backwards.
+/// Positions of points of image a in image b; None where they are lost: they left, nothing there is like them, or they
+/// do not return to the start when tracked backwards.
 pub fn follow(a: &Pyramid, b: &Pyramid, points: &[[f64; 2]]) -> Vec<Option<[f64; 2]>> {
     let both = |&p: &[f64; 2]| {
         let there = step(a, b, p)?;

@@ -26,7 +26,7 @@ pub(super) struct Avi {
     interval: f64,
 }
 
-/// What the walk through the file has found.
+/// Result of reading the file's structure.
 #[derive(Default)]
 struct AviContents {
     /// Kind and codec of each stream, and seconds a sample.

@@ -15,7 +15,7 @@ const END_FRAMES: f64 = 2.0;
 /// Which part of which recording a file is, by its name.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Chapter {
-    /// What all chapters of the recording share: `GX0012`.
+    /// Common part of the chapters' names: `GX0012`.
     pub recording: String,
     /// The chapter, from 1 on.
     pub number: u32,
@@ -110,7 +110,7 @@ impl Joined {
         self.info.average_rate.or(self.info.nominal_rate).map_or(0.0, |r| 1.0 / r)
     }
 
-    /// What of part `i` a selection needs: on the part's clock, every frame; none: nothing.
+    /// The part of chapter `i` that a selection needs: on the part's clock, every frame; none: nothing.
     fn wanted(&self, i: usize, selection: &Selection) -> Option<Selection> {
         let start = self.starts[i];
         let end = self.starts.get(i + 1).copied().or(self.info.duration).unwrap_or(f64::INFINITY);

@@ -1,4 +1,4 @@
-//! What the times of a video's frames show: its rate, whether it varies, missing and duplicate frames.
+//! Findings from the times of a video's frames: its rate, whether it varies, missing and duplicate frames.
 
 use super::Rgb8;
 
@@ -17,7 +17,7 @@ const SAME_PART: f64 = 0.2;
 /// half
 /// differ by nothing.
 const MOST: f64 = 0.75;
-/// Where most images differ by less than this, nothing moves, and nothing is doubled.
+/// If most images differ by less than this, there is no motion, and no frame counts as doubled.
 const STILL: f64 = 0.02;
 /// Intervals that differ from the median by more than this part of it vary.
 const VARIES: f64 = 0.1;
@@ -40,7 +40,7 @@ pub struct Clock {
     pub interval: f64,
     /// Whether intervals differ without frames missing.
     pub variable: bool,
-    /// Where frames are missing.
+    /// Positions of missing frames.
     pub dropped: Vec<Gap>,
     /// Numbers of frames that show the one before again.
     pub doubled: Vec<usize>,

@@ -159,7 +159,7 @@ pub trait Source: Send + Sync {
     /// there is none.
     fn sound(&self) -> Result<Option<Vec<f32>>>;
 
-    /// What changes when the contents do: 16 hexadecimal digits.
+    /// Fingerprint of the content: 16 hexadecimal digits.
     fn fingerprint(&self) -> Result<String>;
 }
 

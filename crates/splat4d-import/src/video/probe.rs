@@ -1,4 +1,4 @@
-//! What a video is, as ffprobe reports it.
+//! Properties of a video from ffprobe.
 
 use super::program::ratio;
 use serde_json::Value;
@@ -30,7 +30,7 @@ pub enum Transfer {
     Pq,
 }
 
-/// What a video's numbers mean.
+/// Colour interpretation of a video.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Color {
     /// The matrix from luma and chroma to RGB, as ffmpeg names it; None: the file holds RGB or grey.
@@ -51,7 +51,7 @@ impl Info {
     }
 }
 
-/// What a source is.
+/// Properties of a source.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Info {
     /// A name for its camera: the file's or folder's, without an ending.
@@ -78,7 +78,7 @@ pub struct Info {
     pub pixels: String,
     /// Whether a frame is two half images of different times.
     pub interlaced: bool,
-    /// What its numbers mean.
+    /// Colour interpretation.
     pub color: Color,
     /// Whether there is sound.
     pub sound: bool,
@@ -88,7 +88,7 @@ pub struct Info {
     pub warnings: Vec<String>,
 }
 
-/// What a probe found, and where.
+/// Result of a probe, and its path.
 #[derive(Debug)]
 pub(super) struct Probe {
     pub info: Info,
@@ -236,7 +236,7 @@ mod tests {
     use super::*;
     use serde_json::json;
 
-    /// What a telephone writes, with `change`.
+    /// Output for a phone's video, with `change`.
     fn phone(change: impl FnOnce(&mut Value)) -> Value {
         let mut film = json!({
             "index": 0, "codec_type": "video", "codec_name": "hevc", "width": 1920, "height": 1080,

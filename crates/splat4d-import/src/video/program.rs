@@ -76,7 +76,7 @@ impl Tools {
         out.is_ok_and(|out| String::from_utf8_lossy(&out.stdout).lines().any(named))
     }
 
-    /// What ffprobe reports of a file, as JSON. Errors: an unsupported file, damage.
+    /// Output of ffprobe for a file, as JSON. Errors: an unsupported file, damage.
     pub(super) fn probe(&self, path: &Path) -> Result<String> {
         let mut command = Command::new(&self.ffprobe);
         command.args([
@@ -157,7 +157,7 @@ fn file(path: &Path) -> OsString {
     name
 }
 
-/// What ffmpeg complained about.
+/// Warnings of ffmpeg.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Said {
     /// The first complaints.

@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 /// Times are written to this many parts of a second: cameras' clocks are no finer, and people can read them.
 const TICKS: f64 = 1e6;
 
-/// Where a camera was.
+/// Pose of a camera.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Poses {
     /// In one place: `cam_from_world`.
@@ -32,9 +32,9 @@ pub struct Placed {
     pub intrinsics: Intrinsics,
     /// Of the stored images, which are not undistorted.
     pub lens: Lens,
-    /// Where it was.
+    /// Its pose.
     pub poses: Poses,
-    /// What of its images counts.
+    /// Mask of its images.
     pub masks: Option<Masks>,
 }
 

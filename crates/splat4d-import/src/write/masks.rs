@@ -23,7 +23,7 @@ pub struct Masks {
     pub fingerprint: u64,
 }
 
-/// Where the images of a camera begin in its video.
+/// Start of a camera's images in its video.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Begin {
     /// The second that reading began at; none: the first frame.

@@ -74,7 +74,7 @@ impl Format {
     }
 }
 
-/// What of a source is stored, and under which name.
+/// Stored part of a source, and its name.
 pub(crate) struct Clip<'a> {
     /// The camera's name; see `camera_names`.
     pub name: String,
@@ -106,7 +106,7 @@ pub struct Pictures {
     pub shots: Vec<Shot>,
     /// The camera's clock.
     pub clock: Clock,
-    /// What was odd, a sentence or two each.
+    /// Remarks, a sentence or two each.
     pub warnings: Vec<String>,
     /// Changes with everything that the images were made of.
     pub fingerprint: String,

@@ -60,7 +60,7 @@ impl Map<'_> {
         (sights, tracks)
     }
 
-    /// Where the windows of a track agree; nothing where it has no place.
+    /// Positions where the windows of a track agree; none for a track without a point.
     fn laid(&self, t: usize) -> Option<Laid> {
         let (spot, track) = (self.spots[t].as_ref()?, &self.tracks[t]);
         let eye = |s: usize| Some(Eye { lens: self.lens(s), pose: self.poses[s].as_ref()? });
