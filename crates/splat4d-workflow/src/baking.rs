@@ -44,7 +44,7 @@ const PATH_STEP: f64 = 0.75;
 
 /// A file is to be so like its model, dB: what is lost by baking then hides behind what training leaves.
 pub const LIKE: f64 = 40.0;
-/// What a cut aims at beyond that, dB.
+/// Target of a cut beyond that, dB.
 const MARGIN: f64 = 0.3;
 /// A file may have the bytes of the learned scene and this many for each second of the clip: 12 Mbit/s, the rate of a
 /// streamed film of 1080 to 2160 lines.
@@ -182,7 +182,7 @@ struct Kitchen<'a> {
 }
 
 impl Kitchen<'_> {
-    /// What segments cost, where they are not cut by a tolerance.
+    /// Price of segments, unless cut by a tolerance.
     fn curve(&self, bakery: &mut Bakery<'_>) -> Result<Option<Curve>> {
         match self.baking.tolerance {
             Some(_) => Ok(None),
@@ -304,7 +304,7 @@ pub fn bake_into(source: &Source, title: &str, out: &Path, baking: &Baking, cons
     Ok(value)
 }
 
-/// What a file that is less like its model than requested would need.
+/// Requirements of a file that is less like its model than requested.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Needs {
     /// dB.

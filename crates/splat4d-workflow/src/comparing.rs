@@ -25,7 +25,7 @@ pub const WORDS: [&str; 2] = ["run", "motion"];
 #[derive(Clone, Debug, Default)]
 pub struct Entry {
     pub name: String,
-    /// What it shows, in the order of [`SCORES`].
+    /// Scores, in the order of [`SCORES`].
     pub scores: Vec<Option<f64>>,
     pub motion: Option<String>,
     pub steps: Option<usize>,

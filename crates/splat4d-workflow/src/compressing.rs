@@ -197,7 +197,7 @@ impl CompressJob {
 
 /// Message for the first Ctrl-C during fine-tuning.
 const SAVING: &str = "stopping: a checkpoint is being saved";
-/// What an owner's record calls this verb.
+/// Name of this verb in an owner's record.
 const COMMAND: &str = "compress";
 
 /// Reports whether the stop flag is polled after this event: steps poll it, the start of a stage (scores, baking,
@@ -354,7 +354,7 @@ impl Work {
         Ok(())
     }
 
-    /// What is reported where a Ctrl-C ends it.
+    /// Message if Ctrl-C ends it.
     fn kept(&self) -> String {
         format!("finished work is kept: splat4d compress --resume {} continues", in_command(&self.dir))
     }
@@ -450,7 +450,7 @@ impl Work {
             .remedy(format!("Continue with: splat4d compress --resume {}", in_command(&self.dir)))
     }
 
-    /// Where the file must stay within a size, the gentlest settings that do.
+    /// For a size limit, the gentlest settings within it.
     fn choose_size(&mut self, original: &Original<'_>, console: &dyn Listener) -> Result<()> {
         let begun = !checkpoint::list(&self.dir).is_empty() || !self.order.tried.is_empty();
         let Some(most) = self.order.max_bytes.filter(|_| !begun) else { return Ok(()) };

@@ -8,7 +8,7 @@ use splat4d::render::{RenderConfig, Tables, Wanted};
 /// on stderr on machines without a screen.
 const LINUX_GPUS: [&str; 5] = ["/dev/dri", "/dev/nvidiactl", "/dev/kfd", "/dev/dxg", "/dev/mali0"];
 
-/// What is reported where `auto` finds none.
+/// Message if `auto` finds none.
 const NO_GPU: &str = "this machine has no GPU";
 
 /// Whether there is none for certain.

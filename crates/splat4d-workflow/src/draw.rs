@@ -70,7 +70,7 @@ impl Channel {
         }
     }
 
-    /// What it shows.
+    /// Its content.
     pub fn about(self) -> &'static str {
         match self {
             Self::Color => "Colour over the background",

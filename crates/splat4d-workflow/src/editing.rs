@@ -145,7 +145,7 @@ fn say_count(text: &str, scene: &Scene<f32>, context: &dyn Context, console: &dy
     Ok(())
 }
 
-/// Where edits find what they name.
+/// Sources of the data that edits name.
 pub struct Bring<'a> {
     source: &'a Source,
     /// Names of files are relative to this folder, that of the edits.

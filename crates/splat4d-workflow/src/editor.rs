@@ -82,7 +82,7 @@ impl Eye {
     }
 }
 
-/// Where a handle is pulled.
+/// Target of a handle.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Pulled {
@@ -91,7 +91,7 @@ struct Pulled {
     by: [f64; 3],
 }
 
-/// What a page can request.
+/// Requests of a page.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(tag = "do", rename_all = "kebab-case", deny_unknown_fields)]
 enum Ask {
@@ -103,11 +103,11 @@ enum Ask {
     Bake { steps: Vec<Step> },
     /// Saves the list to its file.
     Save { steps: Vec<Step> },
-    /// Who is selected.
+    /// The selected Gaussians.
     Select { steps: Vec<Step>, select: String, t: f64 },
     /// A selection in words, by what was drawn on the image: corners as x/z and y/z in the camera's axes.
     Pick { steps: Vec<Step>, shape: Shape, corners: Vec<[f64; 2]>, view: Eye, t: f64, through: bool, now: bool },
-    /// Who floats.
+    /// The floaters.
     Floaters { steps: Vec<Step>, strength: f64, t: f64 },
     /// The nodes by which a selection can be bent: their places are meant at second `at`, and shown at `t`.
     Bend { steps: Vec<Step>, select: String, at: f64, t: f64, nodes: usize },
@@ -122,7 +122,7 @@ struct Replayed {
     done: Vec<Done>,
 }
 
-/// What is bent under the hand.
+/// The interactively deformed part.
 struct Bent {
     number: u64,
     dragging: Dragging,
@@ -384,7 +384,7 @@ fn rounded(of: &[[f64; 3]]) -> Vec<[f32; 3]> {
     of.iter().map(|x| x.map(|x| x as f32)).collect()
 }
 
-/// What a page gets of a selection.
+/// Response for a selection.
 fn held(select: &str, scene: &Scene<f32>, selected: &Selected, t: f64) -> Value {
     let [start, end] = scene.clip;
     let mut times: Vec<f64> = (0..MOMENTS).map(|i| start + (end - start) * i as f64 / (MOMENTS - 1) as f64).collect();

@@ -1,4 +1,4 @@
-//! What follows training: scores and renders of held-out views, the playback file, an orbit film and the report, within
+//! Work after training: scores and renders of held-out views, the playback file, an orbit film and the report, within
 //! what is left of `--minutes`.
 
 use crate::baking::{Baking, bake_into};
@@ -138,8 +138,8 @@ pub fn all(
     write_report(run, console)
 }
 
-/// What is left of the minutes of a run that was resumed: the time of earlier commands until the end of training counts
-/// once, and time between commands does not count.
+/// Remaining minutes of a resumed run: the time of earlier commands until the end of training counts once, and time
+/// between commands does not count.
 pub fn rest_of(run: &Run, clock: Stopwatch) -> Deadline {
     let budget = &run.info["budget"];
     let left = || Some(60.0 * budget["minutes"].as_f64()? - budget["before"].as_f64()? - run.number("seconds")?);

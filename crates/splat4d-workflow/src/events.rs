@@ -1,4 +1,4 @@
-//! What workflows report while they work, and who listens.
+//! Events of workflows, and their listeners.
 
 use serde_json::Value;
 use splat4d_train::capture::Capture;

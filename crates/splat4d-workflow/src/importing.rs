@@ -18,7 +18,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 /// The file by which a capture is recognised.
 const CAPTURE: &str = "capture.json";
-/// What an import writes into its folder, in addition to its corrections.
+/// Files that an import writes into its folder, in addition to its corrections.
 const WRITTEN: [&str; 5] = [CAPTURE, "points.ply", "images", "masks", "import"];
 /// Findings of the doctor that the text contains; its page has all.
 const MOST: usize = 6;
@@ -27,7 +27,7 @@ const MOST: usize = 6;
 #[derive(Debug)]
 #[non_exhaustive]
 pub struct Imported {
-    /// What was found of each camera.
+    /// Results of each camera.
     pub report: Report,
     /// Findings of the doctor and its page, where it was called.
     pub checked: Option<(Checked, PathBuf)>,

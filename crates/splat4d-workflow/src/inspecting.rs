@@ -70,7 +70,7 @@ pub struct InspectOptions {
     pub doctor: Option<PathBuf>,
 }
 
-/// What a capture, a run or a file contains.
+/// Content of a capture, a run or a file.
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub struct Inspection {
@@ -302,7 +302,7 @@ fn in_short(names: &[&str]) -> String {
     }
 }
 
-/// What is next to the images, in words.
+/// Files next to the images, as text.
 fn priors(capture: &Capture) -> Vec<String> {
     let count = |has: fn(&Frame) -> bool| capture.frames.iter().filter(|f| has(f)).count();
     type Has = fn(&Frame) -> bool;

@@ -1,4 +1,4 @@
-//! What the `splat4d` command does beyond parsing and printing, as functions for Rust and Python: import, inspect,
+//! The work of the `splat4d` command without parsing and printing, as functions for Rust and Python: import, inspect,
 //! train, open runs and scenes, render their channels, bake, convert, export, localise, evaluate, compress, label,
 //! predict, edit and report. Functions take typed options, report [`events::Event`]s and print nothing.
 //!

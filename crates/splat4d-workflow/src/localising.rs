@@ -31,8 +31,8 @@ pub struct LocaliseOptions {
 /// Finds pose and time of images (JPEG, PNG or WebP) of a scene, each independently; returns the cameras as entries of
 /// `cameras.json`, in the order of the images.
 ///
-/// Errors: an image was not found, after all of them were tried and those found were written; files that cannot be read; a scene
-/// file without start cameras; an image whose shape is not that of a start.
+/// Errors: an image was not found, after all of them were tried and those found were written; files that cannot be
+/// read; a scene file without start cameras; an image whose shape is not that of a start.
 ///
 /// ```no_run
 /// use splat4d_workflow::localising::{LocaliseOptions, localise};
@@ -99,7 +99,7 @@ pub fn localise(
     .remedy("Give a camera nearer to it with option `start`."))
 }
 
-/// Where to begin.
+/// Start cameras.
 fn starts(scene: &Path, start: Option<&Path>, source: &Source) -> Result<Vec<View>> {
     let mut views = match (start, &source.run) {
         (Some(path), _) => match views_in(path)? {

@@ -32,7 +32,7 @@ const MOST_CELLS: usize = 24;
 /// Least side of a cell, pixels of the image in which depths are looked up.
 const CELL: f64 = 2.0;
 
-/// What was drawn on the image.
+/// The shape drawn on the image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub(crate) enum Shape {
@@ -74,7 +74,7 @@ pub(crate) fn there(scene: &Scene<f32>, t: f64, which: impl Fn(usize, usize) -> 
     out
 }
 
-/// What was drawn on the image.
+/// The shape drawn on the image.
 pub(crate) struct Drawn<'a> {
     pub shape: Shape,
     pub corners: &'a [[f64; 2]],

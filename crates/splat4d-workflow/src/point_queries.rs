@@ -17,7 +17,7 @@ pub struct PointQuery {
     camera: Option<String>,
 }
 
-/// What the columns of a file mean.
+/// Columns of a file.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Column {
     Camera,
@@ -206,6 +206,8 @@ impl QueryResult {
     }
 
     /// As JSON:
+    ///
+    ///
     ///
     ///
     /// `{"version": 1, "times": [s], "points": [{"start": [x, y, z], "camera": name, "path": [[x, y, z] or null], "pixels": [[u, v] or null], "visible": [bool]}]}`;

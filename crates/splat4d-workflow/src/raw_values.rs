@@ -19,14 +19,14 @@ pub enum RawFormat {
 
 /// First number of a .flo file, as text "PIEH" (Baker et al. 2011).
 const FLO_MAGIC: f32 = 202_021.25;
-/// What represents a flow that is not known there: readers take anything above 1e9 for it.
+/// Marker of unknown flow: readers take anything above 1e9 for it.
 const FLO_UNKNOWN: f32 = 1e10;
 
 impl RawFormat {
     /// All of them.
     pub const ALL: [Self; 3] = [Self::Npy, Self::Flo, Self::Exr];
 
-    /// What it stores.
+    /// Its content.
     pub fn about(self) -> &'static str {
         match self {
             Self::Npy => "NumPy float32, [h,w,C], or [h,w] for one value",

@@ -24,7 +24,7 @@ const PROBES: usize = 8;
 /// Range of a film in which nothing is to be seen, or of a channel that needs none.
 const NO_RANGE: [f32; 2] = [1.0, 2.0];
 
-/// What is composited behind a scene: red, green, blue.
+/// Background of a scene: red, green, blue.
 pub type Color = [f32; 3];
 
 /// Options of [`film`] and [`image()`].

@@ -1,4 +1,4 @@
-//! What a run folder holds, read back: `recipe.toml`, `run.json`, `metrics.csv`, `results.json`, `per_view.json`,
+//! Reads the files of a run folder: `recipe.toml`, `run.json`, `metrics.csv`, `results.json`, `per_view.json`,
 //! `cameras.json`, `scene.safetensors` and checkpoints. Everything but the folder may be missing.
 
 use crate::files::{self, read_text};
@@ -453,7 +453,7 @@ pub struct RunRequest {
     pub minutes: Option<f64>,
     /// Whether the time is foretold.
     pub predict: bool,
-    /// What the capture reads from elsewhere.
+    /// Files that the capture reads from elsewhere.
     #[serde(skip)]
     elsewhere: BTreeSet<PathBuf>,
 }

@@ -111,8 +111,7 @@ fn part(name: &OsStr, from: usize, to: usize) -> Option<OsString> {
     Some(name.to_str()?.get(from..to)?.into())
 }
 
-/// What is read of a command that writes frames: none of it may be the folder of the frames. Renders may be in their
-/// run.
+/// Inputs of a command that writes frames: none of it may be the folder of the frames. Renders may be in their run.
 pub struct Read<'a> {
     /// The scene.
     pub path: &'a Path,

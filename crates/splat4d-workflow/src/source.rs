@@ -41,7 +41,7 @@ pub struct Source {
     pub playback: Option<Index>,
     /// Provenance of the playback file, if stated; copied into playback files made of it.
     pub provenance: Option<Provenance>,
-    /// Whose format it is, where it is not our own.
+    /// Name of a foreign format.
     pub dialect: Option<Dialect>,
     /// Warnings about parts that could not be read, or had to be assumed.
     pub warnings: Warnings,

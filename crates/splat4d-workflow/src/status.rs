@@ -29,7 +29,7 @@ pub enum State {
 /// A part of a run: a chunk, the static background, or all of it.
 #[derive(Clone, Debug, Serialize)]
 pub struct PartStatus {
-    /// What `train --chunk` calls it; `all`: the run is not in chunks.
+    /// Its name for `train --chunk`; `all`: the run is not in chunks.
     part: String,
     /// First frame and the one after the last.
     frames: Option<[usize; 2]>,
@@ -64,7 +64,7 @@ pub struct Status {
     parts: Vec<PartStatus>,
     /// Parts that were begun and that no worker has.
     failures: Vec<String>,
-    /// What to type next.
+    /// The next command.
     next: Option<String>,
 }
 

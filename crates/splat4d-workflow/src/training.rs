@@ -27,14 +27,14 @@ use std::time::Duration;
 
 /// Time between two checks whether the worker that begins a long capture has begun it.
 const WAIT: Duration = Duration::from_millis(200);
-/// What an owner's record calls this work.
+/// Name of this work in an owner's record.
 const TRAIN: &str = "train";
 /// The same of joining chunks.
 const JOIN: &str = "join";
-/// What is reported when training is stopped.
+/// Message when training is stopped.
 const SAVING: &str = "stopping: a checkpoint is being saved";
 
-/// What follows training.
+/// Work after training.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Finish {
     /// Nothing: the run has its scene.
@@ -63,14 +63,14 @@ pub struct TrainingOptions {
     pub device: Device,
     /// How held-out views are measured.
     pub measure: Measure,
-    /// What follows training. With [`Finish::Scene`] a long capture is trained as a whole unless the recipe states
+    /// Work after training. With [`Finish::Scene`] a long capture is trained as a whole unless the recipe states
     /// chunks.
     pub finish: Finish,
     /// The clock of `minutes`; its zero is when these options were made.
     pub clock: Stopwatch,
     /// A loss of the caller in addition to the recipe's.
     pub own_loss: Option<OwnLoss>,
-    /// What the folder's lock names as its owner, for other programs.
+    /// The owner named by the folder's lock, for other programs.
     pub command: &'static str,
 }
 
@@ -208,7 +208,7 @@ impl<'a> Work<'a> {
         }
     }
 
-    /// What follows training, in training steps.
+    /// Work after training, in training steps.
     fn finish_steps(&self, capture: &Capture, recipe: &Recipe) -> f64 {
         match self.options.finish {
             Finish::Scene => 0.0,

@@ -1,5 +1,4 @@
-//! What the index of a playback file states: sections, sizes, and how much has to arrive before there is something to
-//! see.
+//! Content of a playback file's index: sections, sizes, and how much has to arrive before there is something to see.
 
 use super::line;
 use crate::files::{grouped, human_bytes};

@@ -1,4 +1,4 @@
-//! What compression did, as part of a run's page: before and after side by side, where the bytes are, the images of
+//! Compression results, as part of a run's page: before and after side by side, where the bytes are, the images of
 //! both, and how it was done. All of it is read from `compress.json`, the file itself and the two runs' images.
 
 use super::chart::{Series, bars, escape, lines, short};

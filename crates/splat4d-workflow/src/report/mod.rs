@@ -348,7 +348,7 @@ fn lives(out: &mut String, run: &Run) {
     }
 }
 
-/// What the figures hold for, and what else was measured: other views, another background.
+/// Conditions of the figures, and further measurements: other views, another background.
 fn conditions(out: &mut String, run: &Run) {
     let own = run.results.as_ref().map(|scores| Baseline { name: "", step: run.iteration().unwrap_or(0), scores });
     let mut rows = String::new();
