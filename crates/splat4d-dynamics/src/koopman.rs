@@ -145,7 +145,7 @@ impl Projection {
         self.gram.solve(&(self.a.transpose() * y))
     }
 
-    /// What the columns leave of y.
+    /// Residual of y after the columns.
     fn rest(&self, y: &DMatrix<f64>) -> DMatrix<f64> {
         y - &self.a * self.amounts(y)
     }

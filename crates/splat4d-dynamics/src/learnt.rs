@@ -39,12 +39,12 @@ impl<F: Real> State<F> {
     }
 }
 
-/// What acts on a copy, scaled: vectors \[3 each], then scalars.
+/// Scaled inputs of a copy: vectors \[3 each], then scalars.
 pub type Action<F> = Vec<F>;
 
 /// A network whose weights are in a [`Params`].
 pub trait Network: Clone {
-    /// What a step's backward needs.
+    /// State for a step's backward.
     type Tape<F: Real>: Default;
 
     /// Nodes.

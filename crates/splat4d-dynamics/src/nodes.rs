@@ -23,7 +23,8 @@ pub const MAX_NODES: usize = 128;
 const MEMBERS: usize = 24;
 /// Fainter Gaussians carry nothing.
 const OPAQUE: f32 = 0.1;
-/// What is slower than this share of the scene's size a second is static: Gaussians of even surfaces drift unseen.
+/// Gaussians slower than this share of the scene's size per second are static: Gaussians of uniform surfaces drift
+/// unseen.
 const SPEED: f64 = 0.03;
 /// Of the opaque Gaussians: how many make up the scene's size.
 const CORE: f64 = 0.9;
@@ -144,7 +145,7 @@ pub fn follow_among(scene: &Scene<f32>, start: &Moment, ticks: &[f64], among: &[
     out
 }
 
-/// What carries a node: Gaussians as they were at a tick, and the node there.
+/// Carriers of a node: Gaussians at a tick, and the node there.
 #[derive(Clone)]
 struct Tie {
     pose: Pose,

@@ -7,7 +7,7 @@ use splat4d::math::se3::{add, mat_vec, norm, scale, sub};
 /// Below this angle (radians) the rotation vector is twice the quaternion's vector part, to 1e-13.
 const SMALL_ANGLE: f64 = 1e-6;
 
-/// Where a node is and how it has turned.
+/// Position and rotation of a node.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pose {
     /// Position in the world, scene units.

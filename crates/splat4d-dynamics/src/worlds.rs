@@ -48,13 +48,13 @@ pub type Pose = ([f64; 3], [[f64; 3]; 3]);
 pub struct World {
     /// Its name.
     pub name: String,
-    /// What moves.
+    /// Moving bodies.
     pub bodies: Vec<Body>,
     /// \[frames]\[bodies].
     pub poses: Vec<Vec<Pose>>,
     /// \[frames]: nodes of the cloth, row by row; empty without one.
     pub cloth: Vec<Vec<[f64; 3]>>,
-    /// What is done to it.
+    /// Actions on it.
     pub actions: Option<Actions>,
 }
 
