@@ -26,7 +26,7 @@ pub struct Page<'a> {
     pub scene: SceneIn<'a>,
 }
 
-/// Where a page's scene is.
+/// Source of a page's scene.
 #[derive(Clone, Debug)]
 pub enum SceneIn<'a> {
     /// In the page: the bytes of a `.s4d`.

@@ -151,7 +151,7 @@ impl Running {
         &self.url
     }
 
-    /// Where it listens.
+    /// Listening address.
     pub fn address(&self) -> SocketAddr {
         self.address
     }
