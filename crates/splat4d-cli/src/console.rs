@@ -62,7 +62,7 @@ struct State {
     last_line: Option<Instant>,
     /// The first iteration after a pause gets a plain line of its own.
     said_progress: bool,
-    /// What `--json` would print, for a program that needs the objects themselves; none: it is printed.
+    /// Objects that `--json` would print, for a program that needs them; none: they are printed.
     objects: Option<Vec<Value>>,
 }
 

@@ -15,7 +15,7 @@ const INTERRUPTED: i32 = 1;
 /// Time for work that polls; users accept two seconds.
 const PATIENCE: Duration = Duration::from_millis(1200);
 
-/// What a Ctrl-C does now.
+/// Current effect of Ctrl-C.
 struct State {
     raised: bool,
     /// Message on the first one.
@@ -33,7 +33,7 @@ fn state() -> MutexGuard<'static, State> {
     STATE.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// What follows a Ctrl-C.
+/// Effects of Ctrl-C.
 #[derive(Debug, PartialEq)]
 enum Reaction {
     /// The program ends now.

@@ -60,7 +60,7 @@ Examples:
 
 Exit codes: 0 done, 1 failed or interrupted, 2 bad input.";
 
-/// What `--version` prints: another program has a command of this name.
+/// Output of `--version`: another program has a command of this name.
 const VERSION: &str = concat!(
     env!("CARGO_PKG_VERSION"),
     "\nwrites .s4d, also installed as s4d: https://github.com/splat4d/splat4d\n\

@@ -26,7 +26,7 @@ const SNAPSHOT_INTERVAL: Duration = Duration::from_secs(3);
 /// Time for the last news to reach pages before the server ends.
 const FAREWELL: Duration = Duration::from_millis(250);
 
-/// Where to serve.
+/// Address of the server.
 #[derive(Clone, Debug, Default, clap::Args)]
 pub(crate) struct Place {
     /// Port of the page; 0: any free one [default: 4440, or a free one after it]

@@ -15,7 +15,7 @@ use splat4d_workflow::files::{self, parse_bytes};
 use splat4d_workflow::training::{self, Finish, TrainingOptions};
 use std::path::PathBuf;
 
-/// What a run's lock names as its owner while it is continued.
+/// Owner named by a run's lock while it is continued.
 const RESUME: &str = "train --resume";
 /// Message for the first Ctrl-C in training.
 const SAVING: &str = "stopping: a checkpoint is being saved";
@@ -333,7 +333,7 @@ mod tests {
         args: Args,
     }
 
-    /// What the recipe becomes with these words.
+    /// The recipe after these arguments.
     fn typed(words: &[&str]) -> Recipe {
         recipe(&Typed::parse_from([&["train", "take"], words].concat()).args).unwrap()
     }
