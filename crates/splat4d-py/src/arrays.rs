@@ -71,7 +71,7 @@ pub(crate) fn finite<const N: usize>(value: &Bound<'_, PyAny>, what: &str) -> Py
     }
 }
 
-/// What the numbers of an image are.
+/// Type of an image's numbers.
 pub(crate) enum Kind {
     /// From 0 to 255.
     Bytes,

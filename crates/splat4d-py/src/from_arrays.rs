@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 /// Steps of a float image in its file: 16 bits a sample, whose rounding is far below a camera's resolution.
 const LEVELS: f32 = 65535.0;
 
-/// What the caller gave.
+/// Arguments of the caller.
 pub(crate) struct Arrays<'a, 'py> {
     pub(crate) images: &'a Bound<'py, PyAny>,
     pub(crate) cameras: &'a Bound<'py, PyAny>,

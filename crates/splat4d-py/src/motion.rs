@@ -138,7 +138,7 @@ struct PyMotion {
     rests: bool,
 }
 
-/// What a result leaves for its backward.
+/// State of a result for its backward.
 #[derive(Default)]
 struct Answer {
     tape: Option<Py<PyAny>>,

@@ -37,7 +37,7 @@ const DEPTH_ALPHA: f32 = 1.0 / 255.0;
 /// A scene in space and time.
 #[pyclass(frozen, module = "splat4d")]
 pub(crate) struct Scene {
-    /// Where it was opened; none: it was made here.
+    /// Path of an opened scene; none: it was made here.
     path: Option<PathBuf>,
     source: Arc<Source>,
     views: Vec<View>,

@@ -84,7 +84,7 @@ impl Given {
     }
 }
 
-/// What all Gaussians have, activated, as gsplat's `rasterization` takes it.
+/// Activated arrays of all Gaussians, as for gsplat's `rasterization`.
 pub(crate) struct Shapes {
     pub(crate) means: Given,
     pub(crate) quats: Given,
