@@ -99,7 +99,7 @@ pub(crate) fn moving() -> Scene<f32> {
     Scene { layers: vec![layer], clip: [0.0, 1.0], fps: 10.0, up: [0.0, -1.0, 0.0], ..Scene::default() }
 }
 
-/// What the dialect with this ending writes, in every version.
+/// Output of the dialect with this ending, in every version.
 fn written(ending: &str) -> Vec<Vec<u8>> {
     let dialect = DIALECTS.iter().find(|d| d.ending == ending).expect("the ending is a dialect's");
     let scene = if dialect.moves { moving() } else { standing() };
@@ -190,7 +190,7 @@ fn gzip(bytes: &[u8]) -> Vec<u8> {
     zip.finish().expect("memory takes all bytes")
 }
 
-/// What is inside the gzip streams of versions 2 and 3: damage reaches it past the checksum.
+/// Content of the gzip streams of versions 2 and 3: damage reaches it past the checksum.
 fn spz_bodies() -> Vec<Vec<u8>> {
     let inside = |file: Vec<u8>| {
         let mut body = Vec::new();

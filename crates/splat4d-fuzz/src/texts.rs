@@ -1,6 +1,5 @@
-//! What people and programs give in addition to scenes and captures: recipes, edits, paths, points, actions,
-//! calibrations, requests of a
-//! page, videos.
+//! Inputs next to scenes and captures: recipes, edits, paths, points, actions, calibrations, requests of a page,
+//! videos.
 
 use crate::Reader;
 use splat4d::Error;
@@ -185,7 +184,7 @@ fn requests() -> Vec<Vec<u8>> {
     .into()
 }
 
-/// What a page of `view --edit` sends.
+/// Requests of a page of `view --edit`.
 fn edit_request(bytes: &[u8]) {
     PAGE.with_borrow_mut(|page| {
         let list = FOLDER.with(|folder| folder.path().join("edits.toml"));

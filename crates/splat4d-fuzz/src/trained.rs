@@ -1,4 +1,4 @@
-//! What training and evaluation read: checkpoints with the state of the optimiser, LPIPS weights, true tracks.
+//! Inputs of training and evaluation: checkpoints with the state of the optimiser, LPIPS weights, true tracks.
 
 use crate::Reader;
 use crate::captures;
