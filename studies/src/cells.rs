@@ -1,4 +1,4 @@
-//! What is done to a trained scene: a point of the study, and the points that it consists of.
+//! A cell of the study: operations on a trained scene, and the points that it consists of.
 
 use splat4d_train::compress::Compression;
 use splat4d_train::maintenance::importance::{Combine, Spatial, Temporal};

@@ -136,7 +136,7 @@ pub(crate) fn run(scene: Scene, s: &Settings) -> Findings {
     }
 }
 
-/// Where points are at rest: evenly random in [−1, 1]².
+/// Rest positions of points: evenly random in [−1, 1]².
 fn start(s: &Settings, rng: Rng) -> Vec<[f64; 2]> {
     (0..s.points).map(|i| [0, 1].map(|k| 2.0 * rng.fork(1).uniform((2 * i + k) as u64) - 1.0)).collect()
 }

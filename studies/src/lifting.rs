@@ -174,7 +174,7 @@ fn camera() -> Camera {
     Camera { cam_from_world, intrinsics, lens: Lens::Pinhole, width, height, near: Camera::NEAR }
 }
 
-/// Where every point is at every frame.
+/// Position of every point at every frame.
 fn truth(s: &Settings) -> Vec<Vec<[f64; 3]>> {
     let mut out = Vec::new();
     let frames = 0..s.frames;

@@ -1,4 +1,4 @@
-//! What a study found, as tables for Markdown pages and as curves.
+//! Results of a study, as tables for Markdown pages and as curves.
 
 use crate::cells::{Cell, Grid};
 use crate::study::{Findings, FolderContent};

@@ -1,4 +1,4 @@
-//! What happens: the hall, its props, and thirty frames of a knight who storms at a mage's orb.
+//! The scene: the hall, its props, and thirty frames of a knight who storms at a mage's orb.
 //!
 //! Scene units are about 0.7 m: the knight is 2.4 units tall. World +y is up.
 
@@ -33,7 +33,7 @@ pub(crate) const SIDE: f64 = 7.5;
 const HEIGHT: f64 = 7.2;
 
 const ORB_RADIUS: f64 = 0.32;
-/// Where the blow's clip is entered, seconds, and how fast it runs: at full speed the sword moves 80 px per frame.
+/// Start of the blow's clip, seconds, and its speed: at full speed the sword moves 80 px per frame.
 const BLOW_START: f64 = 0.30;
 const BLOW_RATE: f64 = 0.53;
 const BALL_RADIUS: f64 = 0.34;

@@ -240,7 +240,7 @@ impl Drop for Folder {
     }
 }
 
-/// Where the memory of training is: what tables hold, what the renderer holds after a step, and the process's peak.
+/// Memory of training by owner: what tables hold, what the renderer holds after a step, and the process's peak.
 fn memory(base: &Pinned, count: usize, degree: usize, side: usize, way: Way) -> Result<Vec<Row>> {
     let pinned = grown(base, count, degree, side);
     let columns: usize = pinned.scene.layers[0].params.keys().map(|k| pinned.scene.layers[0].params[k].width()).sum();

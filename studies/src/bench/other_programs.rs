@@ -45,7 +45,7 @@ const RATES: [RateOf; 6] = [
 const SCENE: &str = "scene.json";
 const OURS: &str = "splat4d.json";
 
-/// What a program reports of its run.
+/// Report of a program's run.
 #[derive(Debug, Serialize, Deserialize)]
 struct Ran {
     program: String,
@@ -152,7 +152,7 @@ fn learn(pinned: &Pinned, held: &Arc<Held>, backend: Box<dyn Backend>, device: &
     Ok((Ran { program: "splat4d".into(), device: device.into(), ms, losses }, order))
 }
 
-/// Where two runs do not agree.
+/// Disagreement of two runs.
 fn apart(ours: &Ran, theirs: &Ran) -> Option<String> {
     AGREE.iter().find_map(|&(step, most)| {
         let of = |ran: &Ran| ran.losses.get(step - 1).copied().unwrap_or(f64::NAN);
@@ -163,7 +163,7 @@ fn apart(ours: &Ran, theirs: &Ran) -> Option<String> {
     })
 }
 
-/// What is to be reported of all other programs whose runs are in a scene's folder.
+/// Report of all other programs whose runs are in a scene's folder.
 fn verdicts(ours: &Ran, folder: &Path) -> Result<Vec<String>> {
     let unread = |e: std::io::Error| Error::io("the folder cannot be read", e).at(folder.display());
     let mut paths: Vec<_> = std::fs::read_dir(folder).map_err(unread)?.flatten().map(|entry| entry.path()).collect();

@@ -1,4 +1,4 @@
-//! What was measured: rows, and the three forms in which they are printed.
+//! Measurements: rows, and the three forms in which they are printed.
 
 use serde::{Deserialize, Serialize};
 use splat4d::{Error, Result};

@@ -23,7 +23,7 @@ const OPAQUE: f32 = 0.5;
 pub(crate) struct FlowError {
     /// Over all pixels that have a truth.
     pub all: f64,
-    /// Where the truth is at least a pixel long.
+    /// Pixels with true flow of at least a pixel.
     pub moving: Option<f64>,
 }
 

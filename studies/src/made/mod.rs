@@ -245,7 +245,7 @@ mod tests {
         assert!(write("two-walls", Path::new("nowhere")).unwrap_err().to_string().contains("one-wall"));
     }
 
-    /// What every name is made of, without rendering it whole: a small image, the points and the description.
+    /// Content of every capture, without rendering it whole: a small image, the points and the description.
     fn print_of(name: &str) -> String {
         let scene = scene(name).unwrap();
         let (viewer, moment) = (&scene.viewers[scene.viewers.len() - 1], scene.moments / 2);

@@ -159,7 +159,7 @@ impl Thing {
     }
 }
 
-/// What a ray meets first.
+/// First hit of a ray.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Seen {
     pub point: V3,
@@ -183,7 +183,7 @@ pub(crate) struct World {
 }
 
 impl World {
-    /// What a ray (of length 1) from `eye` meets first at a share of the capture.
+    /// First hit of a ray (of length 1) from `eye` at a share of the capture.
     pub(crate) fn look(&self, eye: V3, ray: V3, at: f64) -> Option<Seen> {
         let mut first: Option<(f64, V3, usize)> = None;
         for (i, thing) in self.things.iter().enumerate() {
@@ -223,7 +223,7 @@ impl Pinhole {
         normalize(mat_vec(&transpose(&self.cam_from_world.rotation), own))
     }
 
-    /// Where a point is in the image; `None`: it is not in it.
+    /// Image position of a point; `None`: outside the image.
     pub(crate) fn project(&self, point: V3) -> Option<[f64; 2]> {
         let p = self.cam_from_world.apply(point);
         let [width, height] = self.size.map(|s| s as f64);

@@ -188,7 +188,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Where the rule is broken.
+/// Violations of the rule.
 fn judged(cells: &[FolderContent]) -> String {
     let longer = |s: &FolderContent| cells.iter().find(|l| l.capture == s.capture && l.steps == s.steps * MORE);
     let broken: Vec<String> = cells.iter().filter_map(|s| longer(s).map(|l| broken(s, l))).flatten().collect();

@@ -6,9 +6,9 @@ use serde::{Deserialize, Serialize};
 
 /// Times as many steps as the shorter run.
 pub(crate) const MORE: usize = 4;
-/// What the longer run may lose on held-out views, dB: about what two seeds differ by.
+/// Largest loss of the longer run on held-out views, dB: about what two seeds differ by.
 const LOSS: f64 = 0.1;
-/// What training views may lose during the run, dB.
+/// Largest loss of training views during the run, dB.
 const FALL: f64 = 1.0;
 
 /// Training views after this many steps.
@@ -47,7 +47,7 @@ pub(crate) fn largest_fall(probes: &[Probe], change: usize) -> Option<Fall> {
     worst
 }
 
-/// What a capture's runs break, a sentence each.
+/// Violations of a capture's runs, a sentence each.
 pub(crate) fn broken(short: &FolderContent, long: &FolderContent) -> Vec<String> {
     let mut out = Vec::new();
     if let (Some(before), Some(after)) = (short.psnr, long.psnr)

@@ -184,7 +184,7 @@ pub(super) fn check_said(ended: &Ending) -> Result<()> {
     }
 }
 
-/// What a trial compares: the files of the output, volatile ones by name alone.
+/// Compared output of a trial: the files of the output, volatile ones by name alone.
 fn result(place: &Path) -> Result<BTreeMap<PathBuf, Option<Vec<u8>>>> {
     let all = tree(place)?.into_iter().filter(|(path, _)| {
         let out = path.starts_with("out") || path.file_stem().is_some_and(|s| s == "out");

@@ -24,7 +24,7 @@ pub(super) struct Verb {
     pub(super) words: fn(&Setup, &Path) -> Vec<OsString>,
 }
 
-/// What all trials read.
+/// Shared inputs of all trials.
 pub(super) struct Setup {
     pub(super) program: Program,
     capture: PathBuf,
