@@ -205,7 +205,9 @@ impl Text {
         let fail = |e| Error::io("cannot be read", e).at(path.display());
         let length = std::fs::metadata(path).map_err(fail)?.len();
         if length > MAX_BYTES {
-            return Err(Error::input(format!("it is {length} bytes long, which is not a calibration")).at(path.display()));
+            return Err(
+                Error::input(format!("it is {length} bytes long, which is not a calibration")).at(path.display())
+            );
         }
         let bytes = splat4d_train::files::read(path)?;
         let tree = splat4d_train::text::decode(&bytes)
