@@ -126,7 +126,7 @@ pub struct Witness<'a> {
     pub t: Time,
 }
 
-/// The standard deviation of each Gaussian's place that its images leave open, scene units, by layer and row: √(tr
+/// The standard deviation of each Gaussian's position that its images leave open, scene units, by layer and row: √(tr
 /// (Σ_views H/σ² + I/ρ²)⁻¹ / 3), H the mean's 3x3 block of the Fisher information of an image
 /// ([`Sensitivity::fisher`](crate::render::Sensitivity::fisher)), σ `PIXEL_NOISE` and ρ `reach`, how far a Gaussian may
 /// be from where it is when no image shows it. Each witness represents `share` images. Other Gaussians are taken for

@@ -31,7 +31,7 @@ const FAINT: f64 = 1e-6;
 
 /// Numbers of a sample before its colours, whose running sums are kept.
 const NUMBERS: usize = 29;
-/// Their places.
+/// Their positions.
 mod at {
     pub(super) const W: usize = 0;
     pub(super) const WT: usize = 1;

@@ -58,7 +58,7 @@ impl Rounds {
         let ends = [self.first, self.first + self.length];
         let middle = 0.5 * (ends[0] + ends[1]);
         let mean: [f64; 3] = std::array::from_fn(|k| p.mean[k] + f64::from(p.velocity[k]) * (middle - p.center));
-        // A lifespan is highest in one place and falls from there: its extremes are at the ends or at the centre.
+        // A lifespan is highest at one time and falls from there: its extremes are at the ends or at the centre.
         let mut sigma = [1.0f64, 0.0];
         if p.half_width == f64::INFINITY {
             sigma = [1.0, 1.0];

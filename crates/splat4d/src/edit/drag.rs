@@ -98,7 +98,7 @@ impl Asked<'_> {
         Ok(())
     }
 
-    /// Frames of the clip, thinned out, with all key times and `at`; and the place of `at` among them.
+    /// Frames of the clip, thinned out, with all key times and `at`; and the position of `at` among them.
     fn times(&self, scene: &Scene<f32>) -> (Vec<f64>, usize) {
         let [start, end] = scene.clip;
         let frames = ((end - start) * scene.fps.max(1.0)).round().max(0.0) as usize;
@@ -382,8 +382,8 @@ struct Bend<'a> {
 type Pulled = (usize, Vec<(u32, f32)>);
 
 impl Bend<'_> {
-    /// Puts a drag around the selected Gaussians, which get layers of their own; returns the places of those, and which
-    /// nodes pull their rows. It is to be filled.
+    /// Puts a drag around the selected Gaussians, which get layers of their own; returns the positions of those, and
+    /// which nodes pull their rows. It is to be filled.
     fn around(&self, scene: &mut Scene<f32>, selected: &Selected) -> Result<Vec<Pulled>> {
         let count = self.start.len();
         let neighbours = PULLING.min(count - 1).max(1);

@@ -23,8 +23,8 @@ const ON_SUBJECT: f32 = 0.75;
 /// By layer and Gaussian: whether it is meant.
 pub type Selected = Vec<Vec<bool>>;
 
-/// Selects in a scene. A predicate of places holds for a Gaussian where it holds at more than half of the times of its
-/// life that are examined; `ever`, `always` and `at` differ.
+/// Selects in a scene. A predicate of positions holds for a Gaussian where it holds at more than half of the times of
+/// its life that are examined; `ever`, `always` and `at` differ.
 ///
 /// Errors: names of cameras, layers or masks that there are not; masks of another size than their camera.
 pub fn select(expr: &Expr, scene: &Scene<f32>, context: &dyn Context) -> Result<Selected> {
@@ -64,7 +64,8 @@ impl Looks {
             let frame = |t: f64| ((t - start) * fps).clamp(0.0, (frames - 1) as f64);
             // By frame: the rows that are examined then, and the index of that sample.
             let mut asked: Vec<(Vec<u32>, Vec<u8>)> = vec![Default::default(); frames];
-            // Who is never seen is examined nowhere: no predicate of places holds, and its negation does.
+            // A Gaussian that is never seen is examined nowhere: no predicate of positions holds, and its negation
+            // does.
             let mut count = vec![1; seen.len()];
             for (row, [from, to]) in seen.iter().enumerate().filter(|(_, [from, to])| from <= to) {
                 let (first, last) = (frame(*from).ceil() as usize, frame(*to).floor() as usize);
@@ -160,7 +161,7 @@ fn all(count: u8) -> u8 {
     ((1u16 << count) - 1) as u8
 }
 
-/// The rows whose features are like those of the Gaussian that is nearest to a place at any time that is examined.
+/// The rows whose features are like those of the Gaussian that is nearest to a position at any time that is examined.
 ///
 /// Errors: the scene has no features.
 fn alike(scene: &Scene<f32>, looks: &Looks, place: [f64; 3], least: f64) -> Result<Selected> {

@@ -83,7 +83,7 @@ pub struct Place {
     pub about: Option<[f64; 3]>,
 }
 
-/// A place at a time.
+/// A position at a time.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PlaceKey {
@@ -215,7 +215,7 @@ pub enum Step {
     Drag {
         /// The selection to deform.
         select: String,
-        /// Second at which the places below are meant.
+        /// Second at which the positions below are meant.
         at: f64,
         /// Nodes; 0: those that the model has.
         #[serde(default = "drag::usual_nodes")]

@@ -55,7 +55,7 @@ pub(super) fn wrap(scene: &mut Scene<f32>, selected: &Selected, change: &dyn Fn(
     Ok(())
 }
 
-/// After [`each_part`] kept every part: (number of the layer before, place of its part now).
+/// After [`each_part`] kept every part: (number of the layer before, position of its part now).
 pub(super) fn parts(selected: &Selected) -> Vec<(usize, usize)> {
     let (mut out, mut at) = (Vec::new(), 0);
     for (from, selected) in selected.iter().enumerate() {

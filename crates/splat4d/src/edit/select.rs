@@ -45,7 +45,7 @@ pub enum Expr {
     Visible(Box<Surface>),
     /// Name of a label.
     Label(String),
-    /// Features like those of the Gaussian nearest to a place, scene units: the least cosine between them.
+    /// Features like those of the Gaussian nearest to a position, scene units: the least cosine between them.
     Like([f64; 3], f64),
     /// On the white of a mask image, seen by a camera.
     Mask(String, String),
@@ -156,7 +156,7 @@ impl Expr {
         }
     }
 
-    /// Reads a selection. Errors: the first place that cannot be read, and what may be there.
+    /// Reads a selection. Errors: the first position that cannot be read, and what may be there.
     pub fn parse(text: &str) -> Result<Self> {
         let mut parser = Parser { text, tokens: tokens(text)?, at: 0, depth: 0 };
         let expr = parser.either()?;

@@ -1,11 +1,11 @@
-//! Points that are requested and followed: a pixel of an image, or a place in the world, through all times, with what a
-//! camera sees of it.
+//! Points that are requested and followed: a pixel of an image, or a position in the world, through all times, with
+//! what a camera sees of it.
 //!
 //! A pixel belongs to the Gaussians that it shows: the eight heaviest α_i T_i at about the depth of the one at which
 //! half of the pixel's weight is reached (what a translucent edge lets through behind it has another motion), and its
-//! point is on the pixel's ray at that depth. A place belongs to the Gaussians nearest to it. They carry the point on
-//! by their mean displacement; where half of them have died, the nearest ones that are still alive take over, so that
-//! points are followed through models with short lifespans, at the price of the drift of an integration.
+//! point is on the pixel's ray at that depth. A position belongs to the Gaussians nearest to it. They carry the point
+//! on by their mean displacement; where half of them have died, the nearest ones that are still alive take over, so
+//! that points are followed through models with short lifespans, at the price of the drift of an integration.
 
 use super::tracks::Member;
 use crate::layers::{Evaluation, Scene};
@@ -15,7 +15,7 @@ use crate::scene::splats::{COV, SPLAT_OPACITY};
 use crate::scene::{Camera, Rows, Time};
 use rayon::prelude::*;
 
-/// Gaussians of a pixel, and those that carry a place: one alone may be a floater.
+/// Gaussians of a pixel, and those that carry a position: one alone may be a floater.
 const HEAVIEST: usize = 8;
 const NEAREST: usize = 4;
 /// Fainter Gaussians are not taken for a surface.
@@ -24,7 +24,7 @@ const LEAST_OPACITY: f64 = 0.5;
 const ONE_SURFACE: f64 = 0.05;
 /// A pixel that shows less than this shows nothing; a point before which more than this is left is seen.
 const HALF: f64 = 0.5;
-/// Standard deviations of the nearest Gaussian (all three axes together) within which it carries a place.
+/// Standard deviations of the nearest Gaussian (all three axes together) within which it carries a position.
 const REACH: f64 = 4.0;
 
 /// Position of a point at the time of its query.
@@ -57,7 +57,7 @@ pub struct Followed {
 }
 
 impl Followed {
-    /// One query's places, a time each.
+    /// One query's positions, a time each.
     pub fn path(&self, query: usize) -> &[Option<[f64; 3]>] {
         &self.points[query * self.times.len()..(query + 1) * self.times.len()]
     }
@@ -343,7 +343,7 @@ mod tests {
     use crate::scene::params::{LOG_SCALE, OPACITY, QUAT};
     use crate::scene::{GEOMETRY, LIFE, LifeKind, Params};
 
-    /// A wall of 24x24 discs at depth z, `wide` across, that moves; of every place a chain of Gaussians of `life`
+    /// A wall of 24x24 discs at depth z, `wide` across, that moves; of every position a chain of Gaussians of `life`
     /// seconds.
     fn wall(z: f64, wide: f64, velocity: [f64; 3], life: Option<f64>) -> Layer<f32> {
         const SIDE: usize = 24;

@@ -3,7 +3,7 @@
 use crate::math::Rng;
 
 /// `count` damaged versions of `sample`: flipped bits, changed bytes, cuts, splices, repeats, and digits grown in
-/// place, so that text headers are as well.
+/// position, so that text headers are as well.
 pub(super) fn mutants(sample: &[u8], count: u64, purpose: &str) -> impl Iterator<Item = Vec<u8>> {
     (0..count).map(move |i| {
         let rng = Rng::new(11, purpose, i);

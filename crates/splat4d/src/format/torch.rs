@@ -27,7 +27,7 @@ const CALLABLES: [&str; 4] = [
     "collections OrderedDict",
 ];
 
-/// A place in the list of objects.
+/// A position in the list of objects.
 type Id = usize;
 
 /// An object of a pickle.
@@ -457,7 +457,7 @@ impl<'a> Machine<'a> {
         if items.len() > MOST_AXES { None } else { items.iter().map(|i| self.count(*i)).collect() }
     }
 
-    /// ("storage", class, key, place, numbers)
+    /// ("storage", class, key, position, numbers)
     fn storage(&self, id: Id) -> Result<Value> {
         let &[_, class, key, _, numbers] = self.items(id) else {
             return Err(damaged("its pickle refers to an object that is not a storage"));

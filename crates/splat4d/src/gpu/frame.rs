@@ -174,7 +174,7 @@ impl Groups {
 }
 
 /// Number of workgroups of a dispatch: known here, or written by an earlier kernel, in this buffer of sizes and at this
-/// place.
+/// position.
 #[derive(Clone, Copy)]
 enum Size {
     Known(usize),

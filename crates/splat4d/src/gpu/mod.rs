@@ -465,7 +465,7 @@ impl Backend<f32> for GpuRenderer {
 /// Work of a submission in addition to rendering a band.
 #[derive(Clone, Copy, Debug, Default)]
 struct Way {
-    /// Of the backward pass, flags and place of the sums in `Blend`.
+    /// Of the backward pass, flags and position of the sums in `Blend`.
     flags: u32,
     sums_at: u32,
     /// Whether records are added to those of earlier bands.

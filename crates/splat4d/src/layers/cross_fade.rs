@@ -135,7 +135,7 @@ mod tests {
         let mut seen = Evaluation::default();
         scene.at(Time(t), &mut seen);
         let (splats, camera) = (scene.splats(&seen), Camera::with_fov_y(Se3::IDENTITY, 0.9, SIZE, SIZE));
-        // Without the blend's shortcuts, which cut at other places where a splat is in two parts.
+        // Without the blend's shortcuts, which cut at other positions where a splat is in two parts.
         let config = RenderConfig { alpha_min: 0.0, transmittance_min: 0.0, ..RenderConfig::default() };
         oracle::render(&Shot::new(&splats, &camera, [0.2, 0.5, 0.7]), &config)
     }

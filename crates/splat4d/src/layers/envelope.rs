@@ -55,7 +55,7 @@ pub(super) fn active<F: Real>(geometry: &Table<F>, life: &Table<F>, kind: LifeKi
     ids.truncate(count);
 }
 
-/// Fills the front of `ids`, which has a place for every row from `first` on; returns how many are alive.
+/// Fills the front of `ids`, which has an entry for every row from `first` on; returns how many are alive.
 fn find<F: Real>(alive: &Alive<'_, F>, first: usize, ids: &mut [u32], simd: Simd) -> usize {
     if ids.len() <= TASK_ROWS {
         return dispatch(simd, Find { alive, first, ids });

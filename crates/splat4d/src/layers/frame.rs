@@ -65,7 +65,8 @@ impl<F: Real> Work<F, 1> for Backward<'_, F> {
         let mut rows: [Lane<F>; WIDTH] = batch.at.read(self.d_world, 0);
         for l in 0..BLOCK {
             let mean = apply(&self.transposed, [rows[0][l], rows[1][l], rows[2][l]]);
-            // An off-diagonal's gradient represents both of its places: halves of it in the full matrix G, and Aᵀ G A.
+            // An off-diagonal's gradient represents both of its positions: halves of it in the full matrix G, and Aᵀ G
+            // A.
             let [xx, xy, xz, yy, yz, zz]: [F; 6] = std::array::from_fn(|k| rows[COV + k][l]);
             let h = F::HALF;
             let g = congruence(&self.transposed, symmetric([xx, h * xy, h * xz, yy, h * yz, zz]));

@@ -468,7 +468,7 @@ impl<F: Real> Scene<F> {
         evaluation.splats(self, evaluation.tapes().next().map_or(Time(0.0), |tape| tape.time()))
     }
 
-    /// The layer that holds the head's weights, and their places there; `None`: there is no head.
+    /// The layer that holds the head's weights, and their positions there; `None`: there is no head.
     pub fn head_keys(&self) -> Option<(usize, HeadKeys)> {
         match self.head {
             Head::Identity => None,

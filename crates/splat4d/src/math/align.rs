@@ -17,7 +17,7 @@ fn mean(points: &[[f64; 3]]) -> [f64; 3] {
 }
 
 /// The similarity of least squares that takes points to others (Umeyama 1991). `None`: fewer than two, or all in one
-/// place.
+/// position.
 /// Panics: not as many points as others.
 pub fn similarity(from: &[[f64; 3]], to: &[[f64; 3]]) -> Option<Sim3> {
     assert_eq!(from.len(), to.len(), "every point has one that it is taken to");
@@ -77,7 +77,7 @@ pub struct Trajectory {
 
 impl Trajectory {
     /// Compares poses with their truth; `pairs` of cameras are neighbours on a path. `None`: no similarity leads from
-    /// one to the other, since there are fewer than two centres or they are all in one place. Panics: not as many poses
+    /// one to the other, since there are fewer than two centres or they are all at one point. Panics: not as many poses
     /// as truths.
     pub fn of(poses: &[Se3], truth: &[Se3], pairs: &[[usize; 2]]) -> Option<Self> {
         let centers = |p: &[Se3]| p.iter().map(|q| q.inverse().translation).collect::<Vec<_>>();

@@ -70,7 +70,8 @@ struct Node {
     least: [u32; 2],
 }
 
-/// Level l holds 2^l nodes from place 2^l − 1 on; node i's children are 2i+1 and 2i+2. A range is halved at its middle.
+/// Level l holds 2^l nodes from position 2^l − 1 on; node i's children are 2i+1 and 2i+2. A range is halved at its
+/// middle.
 struct Tree {
     items: Vec<Item>,
     nodes: Vec<Node>,

@@ -5,7 +5,7 @@ use super::se3::{cross, dot, norm, transpose};
 use super::{Real, quat};
 
 /// Share of the matrix's size that is added along the identity, so that of several equally near rotations (points on a
-/// line or in one place leave some free) the one that turns least is taken. Rounding of f64 is some thousand times
+/// line or at one point leave some free) the one that turns least is taken. Rounding of f64 is some thousand times
 /// smaller, and the result elsewhere moves by no more than this.
 const LEAST_TURN: f64 = 1e-12;
 /// Sweeps of the Jacobi iteration, at most; it converges quadratically, four or five are usual for 4x4.
@@ -31,7 +31,7 @@ pub fn solve(a: [[f64; 3]; 3], b: [f64; 3]) -> Option<[f64; 3]> {
 /// The rotation R (det +1, never a reflection) that maximises Σ_ij R_ij cov_ij, so that for cov = Σ w a bᵀ it minimises
 /// Σ w ‖a − R b‖² (the orthogonal Procrustes or Wahba problem).
 ///
-/// Points on a line or in one place leave a choice: of the nearest rotations it is the one that turns least; the zero
+/// Points on a line or at one point leave a choice: of the nearest rotations it is the one that turns least; the zero
 /// matrix gives the identity, and so does one that is not finite. Computed in f64: the unit quaternion of the largest
 /// eigenvalue of Davenport's 4x4 matrix, by cyclic Jacobi rotations.
 /// Source: Davenport 1968; Horn 1987, "Closed-form solution of absolute orientation using unit quaternions".

@@ -1,4 +1,4 @@
-//! `edited`: any model with a change on top that no table of its own can take in: another clock, a key-framed place,
+//! `edited`: any model with a change on top that no table of its own can take in: another clock, a key-framed position,
 //! other colours, a fade, a drag of control nodes. Changes on changes are models around models.
 //!
 //! | change | result at t, from the inner result |
@@ -544,7 +544,7 @@ impl<F: Real> Motion<F> for Edited<F> {
                 if let Some(a) = placed.of(q.rows.id(j)) {
                     let g = [row[0], row[1], row[2]];
                     let mean: [F; 3] = std::array::from_fn(|i| (0..3).map(|k| a.m[k][i] * g[k]).sum());
-                    // An off-diagonal's gradient represents both of its places.
+                    // An off-diagonal's gradient represents both of its positions.
                     let h = F::HALF;
                     let [xx, xy, xz, yy, yz, zz]: [F; 6] = std::array::from_fn(|k| row[COV + k]);
                     let back = congruence(&transposed(&a.q), [xx, h * xy, h * xz, yy, h * yz, zz]);

@@ -256,7 +256,7 @@ struct Own<F> {
     seen: Tape<F>,
     /// Earlier results of the model inside, by frames; unused places are empty.
     earlier: Vec<Tape<F>>,
-    /// States at t and earlier, where the filter runs through its history; place 0 is unused.
+    /// States at t and earlier, where the filter runs through its history; entry 0 is unused.
     states: Vec<Table<F>>,
     /// Gradients to the states, by frames earlier; unused places are empty.
     d: Vec<Table<F>>,

@@ -237,7 +237,7 @@ impl<F: Real, W: Work<F, N>, const N: usize> Kernel for Scatter<'_, F, W, N> {
 /// would be compiled separately and for the baseline only.
 pub(crate) struct Batches<'a> {
     rows: Rows<'a>,
-    /// The next block, or place in the list of rows; and the end of these.
+    /// The next block, or position in the list of rows; and the end of these.
     next: usize,
     to: usize,
     end: usize,

@@ -325,7 +325,8 @@ impl<F: Real> Cell<F> {
     }
 }
 
-/// Four grid points around a place, of one run of channels: their blend and its slopes along the first and second axis.
+/// Four grid points around a position, of one run of channels: their blend and its slopes along the first and second
+/// axis.
 #[inline(always)]
 fn bilinear<F: Real>(plane: &[Lane<F>], first: usize, block: usize, row: usize, s: [F; 2]) -> [Lane<F>; 3] {
     let (a, b) = (&plane[first], &plane[first + block]);
@@ -341,7 +342,7 @@ fn bilinear<F: Real>(plane: &[Lane<F>], first: usize, block: usize, row: usize, 
     out
 }
 
-/// Two grid points around a place on a line: their blend and its slope.
+/// Two grid points around a position on a line: their blend and its slope.
 #[inline(always)]
 fn linear<F: Real>(line: &[Lane<F>], first: usize, block: usize, s: F) -> [Lane<F>; 2] {
     let (a, b) = (&line[first], &line[first + block]);

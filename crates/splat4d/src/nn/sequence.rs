@@ -32,7 +32,7 @@ impl Layout {
         at
     }
 
-    /// Names and places, in order.
+    /// Names and positions, in order.
     pub(crate) fn parts(&self) -> &[(String, Range<usize>)] {
         &self.parts
     }

@@ -167,11 +167,11 @@ pub struct Bins {
     pub first: Vec<u32>,
     /// Of each chunk of splats and each bin: first the pairs, then the index of the next one in `staged`.
     cursors: Vec<u32>,
-    /// Scratch: the next place of each bin.
+    /// Scratch: the next position of each bin.
     next: Vec<u32>,
     /// Gradient slots before each chunk.
     chunk_starts: Vec<u32>,
-    /// Keys by bin, not yet sorted. Every place is written by exactly one task.
+    /// Keys by bin, not yet sorted. Every position is written by exactly one task.
     staged: Vec<AtomicU64>,
 }
 
@@ -325,7 +325,7 @@ impl Bins {
         if run.is_empty() {
             return self.keys.clear();
         }
-        // A bin's keys are those of the first chunk, then those of the second, and so on: counts become places.
+        // A bin's keys are those of the first chunk, then those of the second, and so on: counts become positions.
         let starts = &mut self.starts[run.start..];
         for counts in self.cursors.chunks(run.len()) {
             for (start, &count) in starts[1..].iter_mut().zip(counts) {

@@ -485,7 +485,7 @@ fn fisher<F: Real>(
         }
         let g = project_backward(view, mean, cov, opacity, row, &d);
         let h = g.cov.map(F::f64);
-        // d/d s_k of Σ s² v vᵀ is 2 s v vᵀ; a packed off-diagonal represents both places.
+        // d/d s_k of Σ s² v vᵀ is 2 s v vᵀ; a packed off-diagonal represents both positions.
         let along = |n: usize| {
             let v = [axes[0][n], axes[1][n], axes[2][n]];
             let quadratic = h[0] * v[0] * v[0] + h[3] * v[1] * v[1] + h[5] * v[2] * v[2];

@@ -150,7 +150,7 @@ pub struct ImageGrads<'a, F = f32> {
 /// Gradients to one part of the splats, in its compact rows.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PartGrads<F = f32> {
-    /// [splats, 10]: mean 3, covariance 6 (an off-diagonal represents both its places), opacity 1.
+    /// [splats, 10]: mean 3, covariance 6 (an off-diagonal represents both its positions), opacity 1.
     pub out: Table<F>,
     /// To direct colours [splats, C], or to SH that is not the layer's own [splats, 3·K·blocks].
     pub color: Option<Table<F>>,

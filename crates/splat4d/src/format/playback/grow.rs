@@ -71,7 +71,7 @@ impl<F: Read + Write + Seek> Growing<F> {
     fn add(&mut self, part: &[u8], meta: Meta, sync: &mut dyn FnMut(&mut F) -> std::io::Result<()>) -> Result<()> {
         let theirs = Index::parse(part, Some(part.len() as u64))?;
         let wanted = |e: &&Entry| matches!(e.kind, Kind::Page | Kind::Palette | Kind::Masks | Kind::Labels);
-        // Sections are named by their places, which change.
+        // Sections are named by their positions, which change.
         let mut places = vec![0u32; theirs.sections.len()];
         let mut next = self.index.sections.len() as u32;
         for (place, e) in places.iter_mut().zip(&theirs.sections) {

@@ -118,9 +118,9 @@ pub struct Entry {
     pub count: u32,
     /// Page: it is rendered for from ≤ t < to, seconds. Masks: first and last key time.
     pub span: [f64; 2],
-    /// Page: place of its palette in the table of sections; none: base colour only.
+    /// Page: position of its palette in the table of sections; none: base colour only.
     pub palette: Option<u32>,
-    /// Masks, labels, features: place of their page in the table of sections.
+    /// Masks, labels, features: position of their page in the table of sections.
     pub page: Option<u32>,
 }
 
@@ -217,8 +217,8 @@ impl Index {
         Ok(index)
     }
 
-    /// The pages (with their places in the table) that are rendered at second t, most important tier first. Clamps t to
-    /// the clip.
+    /// The pages (with their positions in the table) that are rendered at second t, most important tier first. Clamps t
+    /// to the clip.
     pub fn pages_at(&self, t: f64) -> Vec<(usize, &Entry)> {
         let t = t.max(self.meta.clip[0]).min(self.meta.clip[1]);
         let mut pages: Vec<_> = self.pages().filter(|(_, e)| e.span[0] <= t && t < e.span[1]).collect();
@@ -226,7 +226,7 @@ impl Index {
         pages
     }
 
-    /// All pages with their places in the table.
+    /// All pages with their positions in the table.
     pub(crate) fn pages(&self) -> impl Iterator<Item = (usize, &Entry)> {
         self.sections.iter().enumerate().filter(|(_, e)| e.kind == Kind::Page)
     }

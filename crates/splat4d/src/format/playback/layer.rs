@@ -388,8 +388,8 @@ pub(crate) fn primitives(layer: &Layer<f32>) -> Vec<super::Primitive> {
     (0..p.len()).map(one).collect()
 }
 
-/// Nodes as layers in their base colours, as the default depths hold them, and of each layer its node and the place of
-/// its first row in that.
+/// Nodes as layers in their base colours, as the default depths hold them, and of each layer its node and the position
+/// of its first row in that.
 pub(crate) fn as_layers(nodes: &[Node]) -> (Vec<Layer<f32>>, Vec<(usize, usize)>) {
     let (mut layers, mut places) = (Vec::new(), Vec::new());
     for (i, node) in nodes.iter().enumerate() {

@@ -56,7 +56,7 @@ pub fn with_provenance(bytes: &[u8], new: Option<&Provenance>) -> Result<Vec<u8>
         return Err(broken("it is cut short".into()));
     }
     let mut parts: Vec<Vec<u8>> = Vec::with_capacity(index.sections.len() + 1);
-    // Sections are named by their places, which move up after a removed one.
+    // Sections are named by their positions, which move up after a removed one.
     let places: Vec<u32> = index
         .sections
         .iter()

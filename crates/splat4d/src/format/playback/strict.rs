@@ -7,7 +7,7 @@ use crate::Result;
 
 /// Bits of words that no field has, by word.
 const SPARE: [(usize, u32); 3] = [(4, 3 << 30), (5, 3 << 30), (7, 0xFF << 24)];
-/// Ranges of a block header: name, place of the least number, distance to the greatest.
+/// Ranges of a block header: name, position of the least number, distance to the greatest.
 const RANGES: [(&str, usize, usize); 11] = [
     ("x", at::BOX, 3),
     ("y", at::BOX + 1, 3),

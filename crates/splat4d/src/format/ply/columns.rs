@@ -15,7 +15,7 @@ pub(super) enum Thickness {
     Sphere,
 }
 
-/// Properties of Gaussians, by their places in the element.
+/// Properties of Gaussians, by their positions in the element.
 pub(super) struct Columns {
     /// One for each column of the geometry; those of scales that are not there repeat the first.
     pub(super) geometry: Vec<usize>,

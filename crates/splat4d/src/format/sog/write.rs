@@ -147,7 +147,7 @@ impl Book {
         Self { values }
     }
 
-    /// The nearest number's place.
+    /// The nearest number's position.
     fn code(&self, x: f32) -> u8 {
         let after = self.values.partition_point(|v| *v < x).min(CODES - 1);
         let before = after.saturating_sub(1);

@@ -6,7 +6,7 @@ use crate::Result;
 /// Deepest nesting of brackets that is followed.
 const DEEPEST: usize = 128;
 
-/// A value as far as Gaussians and their places need it.
+/// A value as far as Gaussians and their positions need it.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Value {
     /// A number, a truth or a tuple (of tuples).
@@ -37,7 +37,7 @@ impl Value {
     }
 }
 
-/// A place in the text.
+/// A position in the text.
 pub(super) struct Lexer<'a> {
     text: &'a [u8],
     at: usize,

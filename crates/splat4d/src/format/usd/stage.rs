@@ -52,7 +52,7 @@ impl Default for Stage {
     }
 }
 
-/// Whether an attribute is one of a field of Gaussians or of a place.
+/// Whether an attribute is one of a field of Gaussians or of a position.
 fn is_wanted(name: &str) -> bool {
     let name = name.strip_suffix('h').unwrap_or(name);
     [POSITIONS, ORIENTATIONS, SCALES, OPACITIES, DEGREE, COEFFICIENTS, "visibility"].contains(&name)

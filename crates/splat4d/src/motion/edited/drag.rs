@@ -47,7 +47,7 @@ pub(crate) type NodeOffset = ([f64; 3], [f64; 3], [f64; 4]);
 /// Numbers of a drag, to be written into its tables.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct NodeOffsets {
-    /// [times, nodes]: place, shift, and the turn as a unit quaternion.
+    /// [times, nodes]: position, shift, and the turn as a unit quaternion.
     pub nodes: Vec<NodeOffset>,
     /// [Gaussians, K]: node and weight.
     pub pulls: Vec<(u32, f32)>,

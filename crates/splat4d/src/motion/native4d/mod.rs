@@ -176,7 +176,7 @@ impl<F: Real> Motion<F> for Native4d {
     }
 
     /// Q(l X r̄)Q̄ = (Ql) X (Qr)̄: the right quaternion of a rotation of four dimensions rotates as the left one does.
-    /// A scale has no place, since it would change κ.
+    /// A scale is not supported, since it would change κ.
     fn apply_transform(&self, p: &mut Params<F>, frame: &Sim3) -> bool {
         if frame.scale != 1.0 {
             return false;

@@ -20,7 +20,7 @@ fn added<F: Read + Write + Seek>(file: &mut Growing<F>, part: &[u8], meta: Meta)
     file.append(part, meta, &mut |_| Ok(()))
 }
 
-/// What a file shows, by the place of its first Gaussian.
+/// What a file shows, by the position of its first Gaussian.
 fn shown(bytes: &[u8], t: f64) -> Vec<[f64; 3]> {
     let scene = read(bytes).unwrap();
     let layers = scene.layers.iter().filter(|l| l.span[0] <= t && t < l.span[1]);
