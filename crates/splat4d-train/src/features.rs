@@ -256,7 +256,7 @@ mod tests {
 
     const SIDE: usize = 32;
 
-    /// The features of a place on the wall: one grows to the right, one is a step downwards, one the same everywhere.
+    /// The features of a point on the wall: one grows to the right, one is a step downwards, one the same everywhere.
     fn asked(x: f64, y: f64) -> [f32; 3] {
         [x as f32, if y > 0.0 { 0.8 } else { -0.3 }, 0.5]
     }

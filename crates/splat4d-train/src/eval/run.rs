@@ -429,7 +429,7 @@ struct Drawn {
     sums: ColourSums,
 }
 
-/// Fits a camera's colours over all its views (`sums`, one a place), and sets `PSNR-cc` of each of them.
+/// Fits a camera's colours over all its views (`sums`, one a position), and sets `PSNR-cc` of each of them.
 fn correct_colours(name: &str, places: &[usize], sums: &[ColourSums], views: &mut [Option<View>]) -> CameraScores {
     let mut all = ColourSums::default();
     sums.iter().for_each(|view| all.add(view));
@@ -442,7 +442,7 @@ fn correct_colours(name: &str, places: &[usize], sums: &[ColourSums], views: &mu
     CameraScores { name: name.into(), places: places.to_vec(), colour }
 }
 
-/// A camera and the places of its frames in a list, in time.
+/// A camera and the positions of its frames in a list, in time.
 struct CameraFrames {
     id: usize,
     places: Vec<usize>,

@@ -69,7 +69,7 @@ pub(crate) fn between(frames: &dyn Frames, known: &[[f64; 3]], count: usize) -> 
     Ok(out)
 }
 
-/// One image of every fixed camera, and of every place of moving ones.
+/// One image of every fixed camera, and of every position of moving ones.
 fn views(frames: &dyn Frames) -> Vec<usize> {
     let mut places = HashSet::new();
     let new = |&i: &usize| {

@@ -10,7 +10,7 @@ use splat4d::flow::lift::lift;
 use splat4d::math::median;
 use splat4d::scene::Planes;
 
-/// The four pixels about a place show one surface where their depths differ by less than this share.
+/// The four pixels about a position show one surface where their depths differ by less than this share.
 const ONE_SURFACE: f64 = 0.05;
 /// A velocity is the median, axis by axis, of this many known ones nearest to it: flow errs where patches straddle an
 /// edge.

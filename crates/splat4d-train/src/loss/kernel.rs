@@ -40,7 +40,7 @@ const GROUP: usize = 4;
 const SPAN: usize = GROUP + TAPS - 1;
 /// Rows in a ring: a span, rounded up to a power of two.
 const RING: usize = 16;
-/// Rows by which the place of the gradient's derivatives in the ring, ten rows back, is past a whole group.
+/// Rows by which the position of the gradient's derivatives in the ring, ten rows back, is past a whole group.
 const LAG: usize = (RING - 2 * REACH) % GROUP;
 /// Moments (x, y, xx+yy, xy) and derivatives.
 const MOMENTS: usize = 4;
@@ -427,7 +427,7 @@ fn vertical<F: Real, const FMA: bool, const MAPS: usize, const PHASE: usize>(
     }
 }
 
-/// The same from one place of the ring on.
+/// The same from one position of the ring on.
 #[inline(always)]
 fn vertical_at<F: Real, const FMA: bool, const MAPS: usize>(
     taps: &[F; TAPS],

@@ -12,7 +12,7 @@ use splat4d::scene::Params;
 /// Hidden layers and width of the large trunk, and the layer after which its input is appended again (Yang et al.
 /// 2024).
 const LARGE: (usize, usize, usize) = (8, 256, 4);
-/// Levels of places with the large trunk, at least (Yang et al. 2024).
+/// Levels of positions with the large trunk, at least (Yang et al. 2024).
 const LARGE_X_LEVELS: usize = 10;
 /// Grids learn so much faster than networks: an entry is met by few Gaussians.
 const GRID_SPEEDUP: f64 = 50.0;

@@ -83,7 +83,7 @@ const OUTSIDE: f64 = 0.002;
 const MARGIN: f64 = 0.1;
 /// Smallest side of the box, of its longest: a flat cloud may still move out of its plane.
 const FLATTEST: f64 = 0.1;
-/// One of this many steps has a coarse stage's place if the recipe leaves it open.
+/// The coarse stage takes one of this many steps if the recipe leaves it open.
 const COARSE_PART: usize = 10;
 
 impl Method for HexplaneMethod {

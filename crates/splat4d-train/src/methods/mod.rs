@@ -350,8 +350,8 @@ pub trait Method: Send + Sync {
         build(&self.spec(plan), params)
     }
     /// The lifespan its Gaussians have: the recipe's. Where it leaves the choice to the model, those of a cloud that
-    /// lasts ([`one_time`](Self::one_time)) may appear and vanish with fixed cameras, which see that a place is empty
-    /// before an object appears there (docs/models.md); a camera that moves sees every place at few times, and
+    /// lasts ([`one_time`](Self::one_time)) may appear and vanish with fixed cameras, which see that a position is
+    /// empty before an object appears there (docs/models.md); a camera that moves sees every position at few times, and
     /// lifespans gain nothing. Others, and those whose future is to be predicted, are there forever.
     fn life(&self, plan: &TrainContext) -> LifeKind {
         let lasting = self.one_time(plan) && plan.fixed_cameras > 0 && !plan.predicted;

@@ -298,7 +298,7 @@ fn normal_backward<F: Real>(camera: &Camera, mean: [F; 3], cov: [F; 6], d: [F; 3
     let (gu, gv) = (dot(u, d_n), dot(v, d_n));
     let (yu, yv) = ((c * gu - b * gv) / det, (a * gv - b * gu) / det);
     let y: [f64; 3] = std::array::from_fn(|i| yu * u[i] + yv * v[i]);
-    // An off-diagonal represents both of its places.
+    // An off-diagonal represents both of its positions.
     let pair = |i: usize, j: usize| if i == j { y[i] * n[i] } else { y[i] * n[j] + y[j] * n[i] };
     [pair(0, 0), pair(0, 1), pair(0, 2), pair(1, 1), pair(1, 2), pair(2, 2)].map(F::of)
 }

@@ -53,7 +53,7 @@ pub struct Position {
     pub stage_step: usize,
     /// Steps taken in it.
     pub taken: usize,
-    /// Whether the last step left the place in the schedule as it was: what is due there was done.
+    /// Whether the last step left the position in the schedule as it was: what is due there was done.
     pub rests: bool,
     /// Every rate is multiplied by this; halved after a rollback.
     pub rate_scale: f64,

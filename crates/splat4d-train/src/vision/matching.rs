@@ -154,7 +154,7 @@ fn matches(views: &[View], [a, b]: [usize; 2], [from, to]: [&[Feature]; 2]) -> V
             }
             let d = feature.distance(other);
             back[j] = back[j].min((d, i));
-            // One place may have two features, of two directions: they are no rivals.
+            // One point may have two features, of two directions: they are not rivals.
             let place = |k: usize| to[k].pixel;
             let same = |k: usize| (place(k)[0] - other.pixel[0]).hypot(place(k)[1] - other.pixel[1]) < OFF;
             if d < first.0 {

@@ -89,7 +89,7 @@ struct Window {
     y: usize,
 }
 
-/// A place in depth: inverse depth, and by how much of itself it changes from pixel to pixel.
+/// A position in depth: inverse depth, and by how much of itself it changes from pixel to pixel.
 #[derive(Clone, Copy)]
 struct Patch {
     inverse: f64,

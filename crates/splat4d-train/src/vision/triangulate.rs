@@ -70,7 +70,7 @@ impl PixelObservation<'_> {
     }
 }
 
-/// The angle at a point between the directions to two places, radians.
+/// The angle at a point between the directions to two positions, radians.
 pub fn angle_at(x: [f64; 3], a: [f64; 3], b: [f64; 3]) -> f64 {
     dot(normalize(sub(a, x)), normalize(sub(b, x))).clamp(-1.0, 1.0).acos()
 }

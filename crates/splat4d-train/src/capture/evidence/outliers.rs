@@ -21,7 +21,7 @@ const SUSPECTS: usize = 4;
 const FEW: f64 = 0.2;
 /// Images before and after that an image is compared with: in most captures they overlap.
 const BESIDE: usize = 2;
-/// Matches of two images that show one place: chance makes fewer.
+/// Matches of two images that show one scene: chance makes fewer.
 const OVERLAP: usize = 20;
 /// Share of these that fit right poses at least, and wrong ones at most: what moves and repeats itself leaves right
 /// poses less than all, and a wrong pose fits what is near its lines by chance. Between them nothing is reported.
@@ -258,8 +258,8 @@ fn warning(wrong: &[usize], pairs: &[Pair], told: &dyn Fn(usize) -> (String, Opt
     Some(Finding { severity: Severity::Warning, aspect: Some(Aspect::Assumed), what, remedy })
 }
 
-/// One frame of every place that has a pose of its own: of a fixed camera the one that is nearest to the time of which
-/// most is seen, of moving ones all for training; ordered as they were taken.
+/// One frame of every position that has a pose of its own: of a fixed camera the one that is nearest to the time of
+/// which most is seen, of moving ones all for training; ordered as they were taken.
 fn places(capture: &Capture) -> Vec<usize> {
     let mut counts: BTreeMap<usize, usize> = BTreeMap::new();
     capture.train.iter().for_each(|&i| *counts.entry(capture.frames[i].index).or_default() += 1);
@@ -373,7 +373,7 @@ mod tests {
         assert_eq!(jumps(&far), [5]);
         let turned: Vec<Se3> = moved(5, Se3::look_at([0.5, 4.0, 1.0], [0.5, 8.0, 0.0], [0.0, 0.0, 1.0]));
         assert_eq!(jumps(&turned), [5]);
-        // A cut to another place is not a jump out and back.
+        // A cut to another scene is not a jump out and back.
         let cut: Vec<Se3> =
             path.iter().enumerate().map(|(i, p)| if i < 6 { *p } else { at(9.0 + 0.1 * i as f64) }).collect();
         assert!(jumps(&cut).is_empty());

@@ -88,7 +88,7 @@ pub(super) fn between(images: [usize; 2], from: &[Mark], to: &[Mark], ratio: f64
             let d = a.feature.distance(&b.feature);
             back[j] = back[j].min((d, i));
             if d < first.0 {
-                // A place may have two features, of two directions: they are no rivals.
+                // A point may have two features, of two directions: they are not rivals.
                 if first.0 < u32::MAX && to[first.1].feature.pixel != b.feature.pixel {
                     second = first.0;
                 }

@@ -22,7 +22,7 @@ pub(super) const CONVINCES: (f64, f64) = (0.03, MISFIT);
 /// images of one scene 0.14, and real captures 0.38 and more (studies/records, 26 November 2026).
 const MISFIT: f64 = 0.2;
 const MANY: usize = 200;
-/// Share of points in images below which, of that many points, they are of another place.
+/// Share of points in images below which, of that many points, they are of another scene.
 const APART: f64 = 0.05;
 const FEW: usize = 100;
 /// Share of points that another convention shows at least, and how many times that of the poses as read.

@@ -7,8 +7,8 @@ use splat4d::math::se3::{dot, norm, normalize, sub};
 
 /// Images with a foreground that are needed.
 const ENOUGH: usize = 4;
-/// Angle between the ray to a foreground's middle and the common place, radians: objects move, and are seen from other
-/// sides.
+/// Angle between the ray to a foreground's middle and the common position, radians: objects move, and are seen from
+/// other sides.
 const WITHIN: f64 = 0.2;
 /// Of the cameras' spread: nearer positions are not in front of a camera.
 const CLOSE: f64 = 0.05;
@@ -26,7 +26,7 @@ const AIMED: f64 = 0.35;
 /// Mean difference of two masks below which they are one: they hide a part of the camera, such as its own mount.
 const ONE_MASK: f64 = 0.01;
 
-/// Part of the images whose foreground is at the place that is nearest to all; `None`: too few have one.
+/// Part of the images whose foreground is at the position that is nearest to all; `None`: too few have one.
 pub(super) fn measure(images: &[SmallImage], poses: &[Se3]) -> Option<f64> {
     at_one_place(images, poses, |look| look.foreground).map(|(share, _)| share)
 }

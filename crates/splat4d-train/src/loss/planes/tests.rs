@@ -14,7 +14,7 @@ fn planes() -> (Params<f64>, Planes) {
     (p, planes)
 }
 
-/// Sets every plane: f(plane, place along the first axis, along the second, channel).
+/// Sets every plane: f(plane, position along the first axis, along the second, channel).
 fn set(p: &mut Params<f64>, planes: &Planes, f: impl Fn(usize, usize, usize, usize) -> f64) {
     for (level, keys) in planes.keys().iter().enumerate() {
         for (plane, &key) in keys.iter().enumerate() {

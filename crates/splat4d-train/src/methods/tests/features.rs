@@ -61,7 +61,7 @@ fn detached_features_give_lifespans_no_gradient() {
     assert!(gradient(false) > 0.1);
 }
 
-/// The synthetic capture, whose ball changes its colour with time and with the place it is seen from.
+/// The synthetic capture, whose ball changes its colour with time and with the position it is seen from.
 struct Changing(Made);
 
 impl Frames for Changing {

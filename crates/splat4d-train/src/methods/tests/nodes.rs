@@ -108,7 +108,7 @@ fn full<F: Real>(c: [F; 6]) -> Matrix<F> {
     [[c[0], c[1], c[2]], [c[1], c[3], c[4]], [c[2], c[4], c[5]]]
 }
 
-/// dL/dΣ as a symmetric matrix, from the gradient to six numbers of which an off-diagonal represents two places.
+/// dL/dΣ as a symmetric matrix, from the gradient to six numbers of which an off-diagonal represents two positions.
 fn full_gradient<F: Real>(c: [F; 6]) -> Matrix<F> {
     let h = F::HALF;
     full([c[0], h * c[1], h * c[2], c[3], h * c[4], c[5]])
