@@ -66,7 +66,7 @@ fn sight(name: &str, number: usize, stand: &Stand, most: usize) -> CameraView {
     }
 }
 
-/// The mean of a channel around a place, and the patch's detail relative to its brightness.
+/// The mean of a channel around a position, and the patch's detail relative to its brightness.
 fn around(stand: &Stand, [u, v]: [f64; 2]) -> Option<([f64; 3], f64)> {
     let p = &stand.picture;
     let (x, y) = (u as usize, v as usize);

@@ -25,7 +25,7 @@ pub(super) const CELL: usize = 8;
 /// A cell moves from this part of its pixels on.
 const MOVING: f64 = 0.25;
 
-/// An image from a place: of the static background, or one of a moving camera.
+/// An image from a position: of the static background, or one of a moving camera.
 pub(super) struct Stand {
     pub(super) view: Camera,
     pub(super) picture: Rgb8,
@@ -168,7 +168,7 @@ fn moved(ends: [&[Rgb8]; 2]) -> Option<f64> {
         let seen = ends[k].iter().map(|p| cells(&Grey::of(p), &still[k]));
         seen.reduce(|a, b| a.iter().zip(&b).map(|(a, b)| a | b).collect()).unwrap_or_default()
     });
-    // The cell of a place, and those around it, which its window reaches into.
+    // The cell of a position, and those around it, which its window reaches into.
     let rests = |k: usize, p: &[f64; 2]| {
         let [x, y] = p.map(|v| v.max(0.0) as usize / CELL);
         let down = restless[k].len() / across;

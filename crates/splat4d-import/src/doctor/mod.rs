@@ -70,7 +70,7 @@ pub struct CameraReport {
     pub offset: Option<[f64; 2]>,
     /// Brightness relative to other cameras, stops: red, green, blue.
     pub exposure: Option<[f64; 3]>,
-    /// Sharpness relative to other cameras, at places that both see.
+    /// Sharpness relative to other cameras, at positions that both see.
     pub sharpness: Option<f64>,
     /// Pixels (of 1920) that the background moved between the first and the last images.
     pub moved: Option<f64>,

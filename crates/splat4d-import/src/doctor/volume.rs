@@ -9,9 +9,9 @@ use splat4d_train::vision::triangulate::{self, PixelObservation};
 const SIDE: usize = 40;
 /// Half the cube's side, of the cameras' median distance from their target: it reaches half way to them.
 const HALF: f64 = 0.6;
-/// This many cameras bound a place, and this many give it a shape.
+/// This many cameras bound a position, and this many give it a shape.
 const SEES: [usize; 2] = [2, 3];
-/// Of the cameras that see a place so large a part must see something move there: noise and shade hide some of it.
+/// This share of the cameras that see a position must see something move there: noise and shade hide some of it.
 const MOVES: f64 = 0.75;
 /// Cells in all times that must move before a share means anything.
 const LEAST: usize = 60;
@@ -52,7 +52,7 @@ pub(super) fn seen_by_three(seen: &[&CameraObservations], target: [f64; 3]) -> O
     (known >= LEAST).then(|| shaped as f64 / known as f64)
 }
 
-/// The cell of a camera's image in which a place is seen.
+/// The cell of a camera's image in which a position is seen.
 fn cell_of(view: &Camera, place: [f64; 3]) -> Option<usize> {
     let ([u, v], _) = view.project(place)?;
     let inside = u >= 0.0 && v >= 0.0 && u < view.width as f64 && v < view.height as f64;

@@ -62,9 +62,8 @@ const STEPS: [Step; 3] = [
     },
 ];
 
-/// Lenses and places of all cameras. The work is in `import/colmap` of the capture's folder, and is not done again
-/// where images
-/// and masks are the same.
+/// Lenses and positions of all cameras. The work is in `import/colmap` of the capture's folder, and is not done again
+/// where images and masks are the same.
 ///
 /// Errors: no program; it fails; cameras that it could not place; of kind `Interrupted` if `stop` requests it.
 pub(super) fn calibrate(

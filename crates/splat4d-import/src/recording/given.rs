@@ -28,7 +28,7 @@ pub(super) struct Given {
 impl Given {
     /// The calibration that a request names.
     ///
-    /// Errors: it cannot be read, names do not match, videos are of another shape, places of cameras that move.
+    /// Errors: it cannot be read, names do not match, videos are of another shape, positions of cameras that move.
     pub(super) fn read(request: &Request, cameras: &[Camera], moving: bool) -> Result<Option<Self>> {
         let Some(path) = &request.calibration else { return Ok(None) };
         let place = |e: Error| e.at(path.display());

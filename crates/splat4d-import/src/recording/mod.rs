@@ -73,7 +73,7 @@ pub struct Request {
     pub camera_height: Option<(String, f64)>,
     /// A calibration of the cameras, in any of [`crate::calibration`]'s dialects.
     pub calibration: Option<PathBuf>,
-    /// Whether the COLMAP program finds lenses and places.
+    /// Whether the COLMAP program finds lenses and positions.
     pub colmap: bool,
     /// A folder of masks; see `write::masks`.
     pub masks: Option<PathBuf>,

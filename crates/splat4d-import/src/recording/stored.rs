@@ -16,7 +16,7 @@ pub(super) struct Stored<'a> {
     pub folder: &'a Path,
     pub pictures: &'a [Pictures],
     pub offsets: Vec<Option<Offset>>,
-    /// Lenses, and places, that were given.
+    /// Lenses, and positions, that were given.
     pub known: &'a [Option<Known>],
     /// Masks of images; empty: none.
     pub masks: &'a [Masks],
@@ -42,7 +42,7 @@ impl<'a> Stored<'a> {
         self.known.get(camera).copied().flatten()
     }
 
-    /// Whether all places were given.
+    /// Whether all positions were given.
     pub(super) fn posed(&self) -> bool {
         !self.known.is_empty() && self.known.iter().all(|k| k.is_some_and(|k| k.pose.is_some()))
     }

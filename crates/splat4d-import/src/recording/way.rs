@@ -132,15 +132,15 @@ struct Source<'a> {
 }
 
 impl Source<'_> {
-    /// How a lag changes with the place of the source, seconds a metre.
+    /// How a lag changes with the position of the source, seconds a metre.
     fn slope(&self, e: &Evidence, from: [f64; 3]) -> [f64; 3] {
         let to = |c: usize| normalize(sub(from, self.places[c].expect("it is placed").0));
         let [a, b] = e.cameras;
         sub(to(b), to(a)).map(way)
     }
 
-    /// The most likely place by lags of cameras whose clocks are known, and its standard deviation. (Gauss and Newton;
-    /// differences of times of arrival.)
+    /// The most likely position by lags of cameras whose clocks are known, and its standard deviation. (Gauss and
+    /// Newton; differences of times of arrival.)
     fn heard(&self, lags: &[&Evidence], clocks: &[Option<f64>]) -> ([f64; 3], f64) {
         let known: Vec<(&Evidence, f64)> = lags
             .iter()

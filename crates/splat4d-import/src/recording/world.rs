@@ -111,7 +111,7 @@ fn turn(solved: &mut Solved, up: [f64; 3], fixed: bool) -> Axes {
     Axes { rotation, ..found }
 }
 
-/// A camera's only, or first known, place.
+/// A camera's only, or first known, position.
 fn place(solved: &Solved, stored: &Stored<'_>, name: &str) -> Option<[f64; 3]> {
     let k = stored.pictures.iter().position(|p| p.name == name)?;
     let stand = solved.cameras[k].as_ref().ok()?;

@@ -478,7 +478,7 @@ fn moved(bundle: &Bundle, cameras: &[f64], points: &[[f64; 3]], held: &[bool]) -
 
 /// Adjusts a bundle in place.
 ///
-/// The first view's pose stays, and one number of another's translation: they fix place, direction and size of the
+/// The first view's pose stays, and one number of another's translation: they fix position, direction and size of the
 /// world.
 pub(crate) fn adjust(bundle: &mut Bundle, settings: &Settings) -> Report {
     assert!(bundle.sightings.is_sorted_by_key(|s| s.point), "sightings are ordered by their points");

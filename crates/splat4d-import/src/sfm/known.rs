@@ -1,5 +1,5 @@
-//! Cameras of which the lens is known, or the lens and the place: features are straightened once, and the rest is found
-//! about them.
+//! Cameras of which the lens is known, or the lens and the position: features are straightened once, and the rest is
+//! found about them.
 
 use super::lens::{Known, Lens as Plain, unit};
 use super::mapper::{Ground, Mapped, Mapping};

@@ -1,4 +1,4 @@
-//! How a camera makes pixels of places: square pixels, one radial coefficient, a principal point.
+//! How a camera makes pixels of positions: square pixels, one radial coefficient, a principal point.
 
 use splat4d::math::Se3;
 use splat4d::math::se3::mat_vec;
@@ -17,7 +17,7 @@ pub(crate) fn unit(size: f64) -> f64 {
 
 /// Focal length, distortion and principal point of a camera.
 ///
-/// A place (x, y, z) in the camera's axes is seen at f·d·(x/z, y/z) + (cx, cy) with d = 1 + k1·(x² + y²)/z².
+/// A position (x, y, z) in the camera's axes is seen at f·d·(x/z, y/z) + (cx, cy) with d = 1 + k1·(x² + y²)/z².
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Lens {
     /// f, pixels.
@@ -31,7 +31,7 @@ pub struct Lens {
 /// A pixel position and how it changes.
 pub(crate) struct LensProjection {
     pub pixel: [f64; 2],
-    /// With the place in the camera's axes.
+    /// With the position in the camera's axes.
     pub by_place: [[f64; 3]; 2],
     /// With log f and k1.
     pub by_lens: [[f64; 2]; 2],
@@ -81,7 +81,7 @@ impl Lens {
         for _ in 0..STEPS {
             let slope = 1.0 + 3.0 * self.k1 * r * r;
             if slope <= 0.0 {
-                // Beyond where the model turns back no place is seen at all: as if it did not bend.
+                // Beyond where the model turns back no position is seen at all: as if it did not bend.
                 r = radius;
                 break;
             }
@@ -119,7 +119,7 @@ impl Lens {
     }
 }
 
-/// Distance in pixels of where a place of the world is seen from where it should be; infinite behind the camera.
+/// Distance in pixels of where a position of the world is seen from where it should be; infinite behind the camera.
 pub(crate) fn off(lens: &Lens, pose: &Se3, x: [f64; 3], pixel: [f64; 2]) -> f64 {
     let p = mat_vec(&pose.rotation, x);
     let p = std::array::from_fn(|k| p[k] + pose.translation[k]);

@@ -271,7 +271,7 @@ impl Map<'_> {
         std::array::from_fn(|a| f.pixel[a] + f.velocity[a] * self.taus[sight])
     }
 
-    /// How far from there a place is seen, of the tolerance.
+    /// How far from there a position is seen, of the tolerance.
     fn off(&self, track: usize, k: usize, x: [f64; 3]) -> f64 {
         let sight = self.tracks[track].seen[k].0;
         let pose = self.poses[sight].as_ref().expect("only placed sights are queried");
@@ -339,7 +339,7 @@ impl Map<'_> {
         (0..self.sights.len()).map(of).collect()
     }
 
-    /// Leaves out what does not fit, takes in what fits, and finds places for tracks that have none.
+    /// Leaves out what does not fit, takes in what fits, and finds positions for tracks that have none.
     pub(super) fn renew(&mut self) {
         let cameras = self.cameras();
         let next = |t: usize| -> Option<Spot> {

@@ -61,8 +61,8 @@ impl Shown {
     }
 }
 
-/// Weights of four neighbours at a place between the middle two (Catmull and Rom 1974): linear ones blur, by how much
-/// depends on the position, and bias positions to pixel centres.
+/// Weights of four neighbours at a position between the middle two (Catmull and Rom 1974): linear ones blur, by how
+/// much depends on the position, and bias positions to pixel centres.
 fn cubic(t: f64) -> [f64; 4] {
     let (t2, t3) = (t * t, t * t * t);
     [0.5 * (-t + 2.0 * t2 - t3), 0.5 * (2.0 - 5.0 * t2 + 3.0 * t3), 0.5 * (t + 4.0 * t2 - 3.0 * t3), 0.5 * (t3 - t2)]
@@ -148,7 +148,7 @@ const SIDE: usize = 2 * REACH as usize + 1;
 /// Steps at most; it rests at steps shorter than this many pixels.
 const STEPS: usize = 20;
 const STILL: f64 = 0.003;
-/// Farthest that a place may move, pixels.
+/// Farthest that a position may move, pixels.
 const FARTHEST: f64 = 1.5;
 /// Windows whose correlation is less do not show one object from both sides.
 const ALIKE: f64 = 0.9;
@@ -157,8 +157,8 @@ const FLAT: f64 = 4.0;
 /// How far the warp may differ from a plane's that faces the cameras: slanted planes are up to twice as narrow.
 const SLANT: f64 = 1.0;
 
-/// The place of every sighting that agrees with the most central one's, by number, as offsets in pixels; those that do
-/// not agree have none. The most central one itself stays. All `None`: nothing can be determined. Then the same of
+/// The position of every sighting that agrees with the most central one's, by number, as offsets in pixels; those that
+/// do not agree have none. The most central one itself stays. All `None`: nothing can be determined. Then the same of
 /// `more` cameras, whose places are guesses.
 pub(super) fn aligned(x: [f64; 3], seen: &[ImagePoint<'_>], more: &[ImagePoint<'_>]) -> Vec<Option<[f64; 2]>> {
     let toward: Vec<[f64; 3]> = seen.iter().map(|s| normalize(sub(s.eye.center(), x))).collect();
@@ -216,7 +216,7 @@ impl Template {
         (variance.sqrt() > FLAT).then_some(Self { values })
     }
 
-    /// How far the place of another sighting is from where its window agrees with this one.
+    /// How far the position of another sighting is from where its window agrees with this one.
     fn over(&self, other: &ImagePoint<'_>, start: [[f64; 2]; 2]) -> Option<[f64; 2]> {
         /// Shift, warp, gain, offset.
         const N: usize = 8;

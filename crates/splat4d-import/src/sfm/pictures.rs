@@ -32,7 +32,7 @@ pub trait Pictures: Sync {
     fn lens(&self, camera: usize) -> usize {
         camera
     }
-    /// Its lens, or lens and place, where they are known exactly.
+    /// Its lens, or lens and position, where they are known exactly.
     fn known(&self, _camera: usize) -> Option<Known> {
         None
     }
@@ -42,7 +42,7 @@ pub trait Pictures: Sync {
     }
 }
 
-/// A place in an image that others may show too.
+/// A position in an image that others may show too.
 #[derive(Clone, Debug)]
 pub struct Feature {
     /// Pixels.
@@ -312,7 +312,7 @@ impl CameraView {
         let Some(known) = pictures.known(camera) else { return self };
         let straight = known.straight(self.size, self.factor);
         self.features.retain_mut(|f| straight.feature(f));
-        // Images are as the lens bent them: places of straightened features are not theirs.
+        // Images are as the lens bent them: positions of straightened features are not theirs.
         Self { focal: Some(straight.focal()), exact: true, pose: known.pose, shown: Vec::new(), ..self }
     }
 }
@@ -448,7 +448,7 @@ pub(crate) fn walking(
                     ..empty(pictures, camera, [picture.width, picture.height], factor)
                 };
                 let sight = sight.straightened(pictures, camera);
-                // One frame's place is not the camera's.
+                // One frame's position is not the camera's.
                 Ok(CameraView { pose: None, ..sight })
             })
             .collect();

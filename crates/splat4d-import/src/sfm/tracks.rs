@@ -1,4 +1,4 @@
-//! Features of many images that show one place: matched without any pose, verified two images at a time, joined.
+//! Features of many images that show one point: matched without any pose, verified two images at a time, joined.
 
 use super::pictures::{CameraView, Feature};
 use super::two_view::{Pair, fundamental, unlike_focal};
@@ -13,7 +13,7 @@ use splat4d_train::vision::triangulate::Transfer;
 
 /// The second best match must be this many times farther away (Lowe 2004; measured on the hall of `Look`).
 const RATIO: f32 = 0.8;
-/// Features nearer than this to each other show one place: no rivals, pixels.
+/// Features nearer than this to each other show one point: no rivals, pixels.
 const SAME: f64 = 1.5;
 /// Pairs of images with fewer verified matches carry no information: seven always agree.
 const LEAST: usize = 14;
@@ -141,7 +141,7 @@ fn mutual(a: &Rows, b: &Rows, from: &[Feature], to: &[Feature]) -> Vec<([usize; 
     let places = |k: usize| from[a.features.start + k].pixel;
     let mut out = Vec::new();
     for (i, (j, ratio)) in forth.into_iter().enumerate() {
-        // Another feature of the same place may be the best one back.
+        // Another feature of the same point may be the best one back.
         let (p, q) = (places(back[j].1), places(i));
         let agree = back[j].1 == i || (p[0] - q[0]).abs().max((p[1] - q[1]).abs()) < SAME;
         if ratio < RATIO && agree {
@@ -311,7 +311,7 @@ fn verified(sights: &[CameraView], [a, b]: [usize; 2], matches: Vec<([usize; 2],
 /// Joins the matches of all links, surest first, so that no track has two features of one sight. Tracks ascend by their
 /// first features.
 pub fn join(sights: &[CameraView], links: &[Link]) -> Vec<Track> {
-    // Features of exactly one place are one.
+    // Features of exactly one position are one.
     let mut starts = vec![0];
     let mut place_of: Vec<Vec<usize>> = Vec::with_capacity(sights.len());
     let mut first_of: Vec<usize> = Vec::new();

@@ -8,7 +8,7 @@ use splat4d::math::se3::{cross, dot, mat_mul, mat_vec, norm, normalize, transpos
 use splat4d::math::{Rng, Se3};
 use std::sync::LazyLock;
 
-/// A place as the first and the second image show it.
+/// A position as the first and the second image show it.
 pub type Pair = [[f64; 2]; 2];
 
 /// Samples, at most: enough for seven clean of thirty per cent clean data with a chance of one half, and for five of
@@ -155,7 +155,7 @@ const MONOMIALS: [[usize; 3]; 20] = [
 /// A polynomial in x, y and z: a coefficient for each of [`MONOMIALS`].
 type Cubic = [f64; 20];
 
-/// The place of every product of two monomials in [`MONOMIALS`]; 20: of degree above three.
+/// The position of every product of two monomials in [`MONOMIALS`]; 20: of degree above three.
 static PRODUCTS: LazyLock<[[usize; 20]; 20]> = LazyLock::new(|| {
     let place = |a: [usize; 3], b: [usize; 3]| {
         let sum: [usize; 3] = std::array::from_fn(|k| a[k] + b[k]);

@@ -172,7 +172,7 @@ fn likelihoods(costs: &[Costs], tracks: usize, lags: usize) -> Vec<f64> {
     (0..lags).map(|k| known.iter().map(|s| (NO_MATCH + s[k]).ln()).sum()).collect()
 }
 
-/// The place of the highest likelihood, if it is much higher than elsewhere.
+/// The position of the highest likelihood, if it is much higher than elsewhere.
 fn is_prominent(grid: &[f64], heights: &[f64], tracks: usize, interval: f64) -> Result<usize, Refusal> {
     let highest = |of: &mut dyn Iterator<Item = usize>| of.max_by(|&i, &j| heights[i].total_cmp(&heights[j]));
     let best = highest(&mut (0..grid.len())).expect("the grid is not empty");
@@ -225,8 +225,8 @@ impl Problem<'_> {
 
     /// Mean squared distances of pairs at every lag, none more than the tolerance's; only pairs that fit somewhere.
     fn costs(&self, pairs: &[[usize; 2]], grid: &[f64]) -> Vec<Costs> {
-        // Everything that does not depend on the pair comes first: lines of the one's places, places of the other and
-        // their lines, by time.
+        // Everything that does not depend on the pair comes first: lines of the one's positions, positions of the other
+        // and their lines, by time.
         let mut times: Vec<f64> = self.a.iter().flat_map(|t| t.samples.iter().map(|s| s.0)).collect();
         times.sort_by(f64::total_cmp);
         times.dedup();
@@ -356,7 +356,7 @@ pub(crate) fn sampson(f: &[[f64; 3]; 3], x: [f64; 2], y: [f64; 2]) -> f64 {
     if size > 0.0 { (y[0] * l[0] + y[1] * l[1] + l[2]) / size.sqrt() } else { 0.0 }
 }
 
-/// The least of a function with one minimum between two places (Kiefer 1953).
+/// The least of a function with one minimum between two positions (Kiefer 1953).
 fn golden(f: impl Fn(f64) -> f64, mut low: f64, mut high: f64, resolution: f64) -> f64 {
     const PART: f64 = 0.618_033_988_749_894_8;
     let (mut x, mut y) = (high - PART * (high - low), low + PART * (high - low));

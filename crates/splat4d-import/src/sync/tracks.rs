@@ -50,7 +50,7 @@ pub fn small(picture: Rgb8) -> (Rgb8, f64) {
 /// time.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Track {
-    /// Time and place, frame by frame without gaps.
+    /// Time and position, frame by frame without gaps.
     pub samples: Vec<(f64, [f64; 2])>,
 }
 
@@ -70,8 +70,8 @@ impl Track {
 
     /// Position at a time, smoothed by a cubic B-spline over four frames; None within a frame of its ends.
     ///
-    /// A line between two noisy places is less noisy half way than at either end, so that lags would be biased to half
-    /// frames (on a real rig half of the pairs were); the weights of a cubic B-spline have nearly the same sum of
+    /// A line between two noisy positions is less noisy half way than at either end, so that lags would be biased to
+    /// half frames (on a real rig half of the pairs were); the weights of a cubic B-spline have nearly the same sum of
     /// squares everywhere (0.50 to 0.46), and blur the motion by the same third of a squared frame.
     pub(crate) fn smooth(&self, time: f64) -> Option<[f64; 2]> {
         let after = self.samples.partition_point(|s| s.0 <= time);
@@ -97,7 +97,7 @@ impl Track {
         Some([x, y])
     }
 
-    /// The pixels between its places farthest from each other along an axis: how much it moved at least.
+    /// The pixels between its positions farthest from each other along an axis: how much it moved at least.
     pub(crate) fn extent(&self) -> f64 {
         let side = |k: usize| {
             let of = self.samples.iter().map(|s| s.1[k]);

@@ -116,7 +116,7 @@ fn info(path: &Path, interval: f64, warnings: Vec<String>) -> Info {
     }
 }
 
-/// Reads the list at a place; returns the position after it.
+/// Reads the list at a position; returns the position after it.
 fn list(file: &mut BufReader<File>, at: u64, end: u64, found: &mut AviContents, depth: usize) -> std::io::Result<u64> {
     file.seek(SeekFrom::Start(at))?;
     let mut head = [0; 12];
@@ -155,7 +155,7 @@ fn list(file: &mut BufReader<File>, at: u64, end: u64, found: &mut AviContents, 
             }
             _ => {}
         }
-        // Chunks begin at even places.
+        // Chunks begin at even positions.
         place += 8 + u64::from(length) + u64::from(length % 2);
     }
     Ok((at + 8 + size + size % 2).max(at + 12))

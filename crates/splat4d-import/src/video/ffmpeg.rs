@@ -71,7 +71,7 @@ impl Source for Video {
         }
         let seek = selection.from.map_or(0.0, |from| (from - SEEK_MARGIN).max(0.0));
         if seek > 0.0 {
-            // Its own clock is kept: shifted to the place that was sought, time stamps are rounded to ticks of the
+            // Its own clock is kept: shifted to the position that was sought, time stamps are rounded to ticks of the
             // file, and those of AVI are whole frames.
             input.extend(["-copyts".into(), "-start_at_zero".into(), "-ss".into(), format!("{seek:.6}")]);
         }

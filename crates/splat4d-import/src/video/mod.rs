@@ -134,7 +134,7 @@ pub struct Frame {
 
 /// Frames in the order of time, one in memory at a time.
 pub trait Reader {
-    /// The next chosen frame, in the place of the last one; false at the end.
+    /// The next chosen frame, in place of the last one; false at the end.
     ///
     /// Errors: nothing can be decoded at all, an image is damaged or of another size. What can be decoded in part ends
     /// early, and a warning states so.
@@ -202,7 +202,7 @@ fn stem(path: &Path) -> String {
 /// Distinguishes two files: FNV-1a of length, beginning, middle and end, against mistakes and not against malice.
 fn fingerprint_of_file(path: &Path) -> Result<u64> {
     use std::io::{Read, Seek, SeekFrom};
-    /// Bytes of each of the three places: a video's tables and some of its images.
+    /// Bytes of each of the three positions: a video's tables and some of its images.
     const PIECE: u64 = 64 << 10;
     let fail = |e| Error::io("cannot be read", e).at(path.display());
     let mut file = splat4d_train::files::open(path)?;

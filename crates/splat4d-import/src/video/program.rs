@@ -40,7 +40,7 @@ impl Tools {
         Self::at(Path::new("ffmpeg"), Path::new("ffprobe"))
     }
 
-    /// Takes the programs from these places.
+    /// Takes the programs from these folders.
     pub(crate) fn at(ffmpeg: &Path, ffprobe: &Path) -> Result<Self> {
         let ask = |program: &Path, arguments: &[&str]| {
             let mut command = Command::new(program);
@@ -188,7 +188,7 @@ impl Said {
     }
 }
 
-/// Which of the two places in the chain of filters printed a time: all frames, or those that are kept.
+/// Which of the two points in the chain of filters printed a time: all frames, or those that are kept.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Stamp {
     All,

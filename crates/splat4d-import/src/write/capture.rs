@@ -15,13 +15,13 @@ const TICKS: f64 = 1e6;
 /// Pose of a camera.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Poses {
-    /// In one place: `cam_from_world`.
+    /// One pose for all shots: `cam_from_world`.
     Fixed(Se3),
-    /// In another for every shot; shots whose place is not known are left out.
+    /// A pose for every shot; shots whose pose is not known are left out.
     Moving(Vec<Option<Se3>>),
 }
 
-/// A camera whose clock, lens and place are known.
+/// A camera whose clock, lens and position are known.
 #[derive(Clone, Debug)]
 pub struct Placed {
     /// Its images.

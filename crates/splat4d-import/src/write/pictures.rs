@@ -100,7 +100,7 @@ pub struct Pictures {
     pub name: String,
     /// Pixels across and down.
     pub size: [usize; 2],
-    /// The pattern of the files, from the capture's folder on; the number is the place in `shots`.
+    /// The pattern of the files, from the capture's folder on; the number is the position in `shots`.
     pub pattern: String,
     /// The frames, in the order of time.
     pub shots: Vec<Shot>,
