@@ -265,7 +265,7 @@ fn sociable(points: Vec<[f32; 3]>) -> Vec<[f32; 3]> {
     points.into_iter().zip(square).filter(|(_, s)| *s <= most).map(|p| p.0).collect()
 }
 
-/// The centre of the points nearest to one: corners of dynamic regions are poor places to be carried at.
+/// The centre of the points nearest to one: corners of dynamic regions are poor positions to carry it by.
 fn centre(of: [f32; 3], points: &[[f32; 3]]) -> [f64; 3] {
     let square = |p: &[f32; 3]| (0..3).map(|c| f64::from(p[c] - of[c]).powi(2)).sum::<f64>();
     let mut order: Vec<(f64, usize)> = points.iter().enumerate().map(|(i, p)| (square(p), i)).collect();

@@ -17,7 +17,7 @@ pub struct Pose {
 }
 
 impl Pose {
-    /// Unturned, at a place.
+    /// Unturned, at a position.
     pub fn at(x: [f64; 3]) -> Self {
         Self { x, q: [1.0, 0.0, 0.0, 0.0] }
     }

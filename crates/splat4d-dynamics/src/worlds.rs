@@ -84,7 +84,7 @@ impl World {
         Ok(Self { name: name.into(), bodies, poses, cloth: Vec::new(), actions: None })
     }
 
-    /// True places of all nodes at a frame.
+    /// True positions of all nodes at a frame.
     pub fn nodes(&self, frame: usize) -> Vec<[f64; 3]> {
         let of =
             |(body, (x, r)): (&Body, &Pose)| body.points.iter().map(|p| add(*x, mat_vec(r, *p))).collect::<Vec<_>>();
