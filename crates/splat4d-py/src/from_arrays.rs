@@ -111,7 +111,7 @@ struct Filmed<'a, 'py> {
 }
 
 impl Filmed<'_, '_> {
-    /// Its places: one, or one per frame.
+    /// Its positions: one, or one per frame.
     fn views(&self) -> PyResult<Vec<Camera>> {
         if let Ok(fixed) = self.cameras.extract::<Camera>() {
             return Ok(vec![fixed]);
