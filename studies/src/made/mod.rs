@@ -307,7 +307,7 @@ hand-held-60 36359dac295000bb
                 }
             }
         }
-        // A pixel is the mean over its own square, which matters at the textures' edges. The colours of places that
+        // A pixel is the mean over its own square, which matters at the textures' edges. The colours of positions that
         // have nothing to do with each other differ by 0.3.
         let mean = off / f64::from(compared);
         assert!(mean < 0.04, "{mean}");

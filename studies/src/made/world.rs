@@ -5,9 +5,9 @@
 use splat4d::math::se3::{cross, dot, mat_vec, normalize, sub, transpose};
 use splat4d::math::{Rng, Se3};
 
-/// A place, a direction or a colour.
+/// A position, a direction or a colour.
 pub(crate) type V3 = [f64; 3];
-/// A place in an image, pixels.
+/// A position in an image, pixels.
 pub(crate) type V2 = [f64; 2];
 
 /// Rays a pixel in each direction: their mean is the pixel.
@@ -46,7 +46,7 @@ pub(crate) fn sin_cos(a: f64) -> (f64, f64) {
     (sin, cos)
 }
 
-/// Colours in space: noise of a grain between two colours, a pure function of the seed and the place.
+/// Colours in space: noise of a grain between two colours, a pure function of the seed and the position.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Texture {
     pub seed: u64,
@@ -57,7 +57,7 @@ pub(crate) struct Texture {
 }
 
 impl Texture {
-    /// The colour at a place, sRGB values from 0 to 1.
+    /// The colour at a position, sRGB values from 0 to 1.
     pub(crate) fn at(&self, p: V3) -> V3 {
         let mut sum = [0.0; 4];
         let mut weights = 0.0;
