@@ -10,7 +10,8 @@ pub use resident::ResidentMotion;
 use crate::gpu::{Adapters, Gpu, GpuRenderer, Tuning};
 use crate::math::{Rng, Se3, sym3};
 use crate::render::{
-    Backend, Comparison, Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Resident, Shot, Tables, Target, Wanted,
+    Abilities, Backend, Comparison, Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Resident, Shot, Tables,
+    Target,
 };
 use crate::scene::splats::{COV, SPLAT_COLUMNS, SPLAT_OPACITY};
 use crate::scene::{Camera, Color, Part, Planes, Splats, Table};
@@ -49,13 +50,13 @@ pub fn cpu(config: RenderConfig) -> Box<dyn Backend> {
     Box::new(Renderer::new(config))
 }
 
-/// The requested device, if it has the abilities in `wanted`, or else the CPU.
-pub fn open(device: Device, config: RenderConfig, wanted: &Wanted, tables: Tables) -> Opened {
+/// The requested device, if it has these abilities, or else the CPU.
+pub fn open(device: Device, config: RenderConfig, abilities: &Abilities, tables: Tables) -> Opened {
     if device == Device::Cpu {
         let why = format!("drawing on {CPU}");
         return Opened { backend: cpu(config), name: CPU.into(), why, fell_back: false };
     }
-    or_cpu(config, gpu(device, config, wanted, tables))
+    or_cpu(config, gpu(device, config, abilities, tables))
 }
 
 /// A GPU and its name, or, where there is none, the CPU and why.
@@ -69,7 +70,7 @@ fn or_cpu(config: RenderConfig, gpu: Result<(Box<dyn Backend>, String)>) -> Open
 /// The requested device, together with the CPU, which renders what the GPU does not support, image by image, and a GPU
 /// that fails is not used again. Each is reported once ([`Backend::notice`]), and neither is an error.
 pub fn open_to_train(device: Device, config: RenderConfig) -> Opened {
-    let opened = open(device, config, &Wanted { backward: true, ..Wanted::default() }, Tables::Changing);
+    let opened = open(device, config, &Abilities { backward: true, ..Abilities::default() }, Tables::Changing);
     let why = opened.why.replacen("drawing", "training", 1);
     match device == Device::Cpu || opened.fell_back {
         true => Opened { why, ..opened },
@@ -122,7 +123,7 @@ impl WithCpu {
     /// The other device, if it is there and can render a shot and take it back.
     fn able(&mut self, shot: &Shot<'_>) -> Option<&mut Box<dyn Backend>> {
         let other = self.other.as_mut()?;
-        match other.can(&Wanted { backward: true, ..shot.wanted() }) {
+        match other.can(&Abilities { backward: true, ..shot.abilities() }) {
             Ok(()) => Some(other),
             Err(refusal) => {
                 let why = refusal.cause();
@@ -143,10 +144,10 @@ impl WithCpu {
 }
 
 impl Backend for WithCpu {
-    fn can(&self, wanted: &Wanted) -> Result<()> {
+    fn can(&self, abilities: &Abilities) -> Result<()> {
         match &self.other {
-            Some(other) if wanted.compare => other.can(wanted),
-            _ => self.cpu.can(wanted),
+            Some(other) if abilities.compare => other.can(abilities),
+            _ => self.cpu.can(abilities),
         }
     }
 
@@ -281,17 +282,22 @@ fn trusted(backend: &mut dyn Backend) -> Result<()> {
 }
 
 #[cfg(not(feature = "gpu"))]
-fn gpu(_: Device, _: RenderConfig, _: &Wanted, _: Tables) -> Result<(Box<dyn Backend>, String)> {
+fn gpu(_: Device, _: RenderConfig, _: &Abilities, _: Tables) -> Result<(Box<dyn Backend>, String)> {
     Err(Error::new(ErrorKind::Unsupported, "this splat4d was built without the feature `gpu`"))
 }
 
 #[cfg(feature = "gpu")]
-fn gpu(device: Device, config: RenderConfig, wanted: &Wanted, tables: Tables) -> Result<(Box<dyn Backend>, String)> {
+fn gpu(
+    device: Device,
+    config: RenderConfig,
+    abilities: &Abilities,
+    tables: Tables,
+) -> Result<(Box<dyn Backend>, String)> {
     // Cheap, where opening a driver takes a moment. The CPU is chosen without the advice to choose it.
-    GpuRenderer::refuses(wanted).map_err(|refusal| Error::new(refusal.kind(), refusal.cause()))?;
+    GpuRenderer::refuses(abilities).map_err(|refusal| Error::new(refusal.kind(), refusal.cause()))?;
     let adapters = if device == Device::Gpu { Adapters::Any } else { Adapters::Hardware };
     let open = || Gpu::open(adapters);
-    if wanted.backward {
+    if abilities.backward {
         return to_train(&open, config, tables, &mut trusted);
     }
     let gpu = open()?;

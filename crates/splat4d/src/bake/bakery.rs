@@ -6,7 +6,7 @@ use super::rank::rank;
 use super::rate::{PRICES, Rate, Sums, price};
 use super::repeat::Rounds;
 use super::sample::{self, Framed, Row, Samples};
-use super::sampling::Lookout;
+use super::sampling::Viewpoints;
 use super::straight::{Line, learnt};
 use super::tally::{Tally, bounded, cut, in_order, page, quantiles, sh_degree};
 use super::tree::{Span, Tree};
@@ -105,7 +105,7 @@ pub struct Bakery<'a> {
     scene: &'a Scene<f32>,
     options: &'a Options,
     tree: Tree,
-    sampling: Lookout,
+    sampling: Viewpoints,
     weights: Option<Weights>,
     /// By layer and run, where they are kept.
     kept: Vec<Vec<Samples>>,
@@ -130,8 +130,8 @@ impl<'a> Curved<'a> {
         Self { layer, lives: Lives::new(layer), frame: Framed::of(layer), rows, colors }
     }
 
-    fn look(&self, rows: &[(usize, [f64; 2])], tree: &Tree) -> Samples {
-        sample::look(self.layer, &self.frame, rows, tree, self.colors)
+    fn sample(&self, rows: &[(usize, [f64; 2])], tree: &Tree) -> Samples {
+        sample::sample_rows(self.layer, &self.frame, rows, tree, self.colors)
     }
 
     /// Calls `each` with one run of samples after the other: those that were kept, or new ones.
@@ -143,7 +143,7 @@ impl<'a> Curved<'a> {
         while !rest.is_empty() {
             let (run, later) = rest.split_at(sample::run_length(rest, tree, self.colors));
             rest = later;
-            each(Cow::Owned(self.look(run, tree)))?;
+            each(Cow::Owned(self.sample(run, tree)))?;
         }
         Ok(())
     }
@@ -165,7 +165,7 @@ impl<'a> Bakery<'a> {
         let tree = Tree::new(scene.clip, scene.fps, options.sample_rate, options.segment, usize::MAX)?;
         let cameras: Vec<_> =
             options.cameras.iter().chain(options.path.iter().map(|(_, camera)| camera)).cloned().collect();
-        let sampling = Lookout::new(&cameras, &means(scene));
+        let sampling = Viewpoints::new(&cameras, &means(scene));
         let mut bakery = Self { scene, options, tree, sampling, weights: None, kept: Vec::new() };
         bakery.tree = bakery.tree_of(options.sample_rate)?;
         Ok(bakery)
@@ -331,7 +331,7 @@ impl<'a> Bakery<'a> {
                 let curved = Curved::new(layer, &finer);
                 let stride = curved.rows.len().div_ceil(PROBED).max(1);
                 let rows: Vec<_> = curved.rows.iter().copied().step_by(stride).collect();
-                let samples = curved.look(&rows, &finer);
+                let samples = curved.sample(&rows, &finer);
                 let of = |row: &Row| {
                     let sums = self.sums(&finer, &curved, index, &samples, row)?;
                     Some((0..finer.frames()).step_by(2).map(|k| sums.error([k, k + 2])).sum::<f64>())

@@ -2,7 +2,7 @@
 
 use super::life::Envelope;
 use super::sample::{GEOMETRY, Row, Samples};
-use super::sampling::Lookout;
+use super::sampling::Viewpoints;
 use super::shape::{Shape, decompose, difference};
 use super::tree::{Span, Tree};
 use crate::format::playback::Primitive;
@@ -39,7 +39,7 @@ pub(super) struct Piece {
 #[derive(Clone, Copy)]
 pub(super) struct Fitter<'a> {
     pub tree: &'a Tree,
-    pub sampling: &'a Lookout,
+    pub sampling: &'a Viewpoints,
     /// Errors of shape and lifespan that need not be improved, pixels.
     pub tolerance: f64,
     /// Largest error that is not split further, pixels.

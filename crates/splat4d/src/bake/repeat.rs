@@ -2,7 +2,7 @@
 //! round.
 
 use super::fit::LEVEL_PIXELS;
-use super::sampling::Lookout;
+use super::sampling::Viewpoints;
 use crate::format::playback::{Node, Primitive};
 
 /// How a clip is repeated.
@@ -17,7 +17,7 @@ pub(super) struct Rounds {
 
 impl Rounds {
     /// The nodes of all rounds from those of one; the first node must be the root.
-    pub(super) fn spread(&self, nodes: Vec<Node>, sampling: &Lookout, tolerance: f64) -> Vec<Node> {
+    pub(super) fn spread(&self, nodes: Vec<Node>, sampling: &Viewpoints, tolerance: f64) -> Vec<Node> {
         let end = self.first + self.length * self.count as f64;
         let mut root = Node { from: self.first, to: end, primitives: Vec::new() };
         let mut round = nodes;
@@ -54,7 +54,7 @@ impl Rounds {
     }
 
     /// The primitive as one with an infinite lifespan, where that stays within the tolerance.
-    fn still(&self, p: &Primitive, sampling: &Lookout, tolerance: f64) -> Option<Primitive> {
+    fn still(&self, p: &Primitive, sampling: &Viewpoints, tolerance: f64) -> Option<Primitive> {
         let ends = [self.first, self.first + self.length];
         let middle = 0.5 * (ends[0] + ends[1]);
         let mean: [f64; 3] = std::array::from_fn(|k| p.mean[k] + f64::from(p.velocity[k]) * (middle - p.center));

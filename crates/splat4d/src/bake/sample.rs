@@ -104,7 +104,7 @@ pub(super) fn run_length(rows: &[(usize, [f64; 2])], tree: &Tree, colors: usize)
 }
 
 /// Samples the rows at every frame at which they are visible, and at one frame before and after.
-pub(super) fn look(
+pub(super) fn sample_rows(
     layer: &Layer<f32>,
     frame: &Framed,
     rows: &[(usize, [f64; 2])],

@@ -3,7 +3,7 @@
 use super::fit::{COLORS, Piece, home, is_visible, primitive, seen};
 use super::life::{Envelope, Lives};
 use super::sample::own_colors;
-use super::sampling::Lookout;
+use super::sampling::Viewpoints;
 use super::shape::Shape;
 use super::tree::Tree;
 use crate::layers::Layer;
@@ -34,7 +34,7 @@ impl Line {
         id: usize,
         span: [f64; 2],
         tree: &Tree,
-        sampling: &Lookout,
+        sampling: &Viewpoints,
     ) -> Option<Piece> {
         let seen = seen(tree, span)?;
         let node = home(tree, seen)?;

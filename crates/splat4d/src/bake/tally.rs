@@ -1,7 +1,7 @@
 //! Collects the primitives of the layers and makes nodes of them.
 
 use super::fit::Piece;
-use super::sampling::Lookout;
+use super::sampling::Viewpoints;
 use super::tree::Span;
 use super::{Errors, TOLERANCE};
 use crate::format::playback::{Node, Primitive, primitives};
@@ -67,7 +67,7 @@ pub(super) fn bounded(primitives: usize) -> Result<()> {
 }
 
 /// A layer of a playback file: its segments are kept unchanged in their span. Their importance is not in the file.
-pub(super) fn page(layer: &Layer<f32>, sampling: &Lookout, tally: &mut Tally) -> Result<Option<Node>> {
+pub(super) fn page(layer: &Layer<f32>, sampling: &Viewpoints, tally: &mut Tally) -> Result<Option<Node>> {
     let mut all = primitives(layer);
     let before = all.len();
     all.retain(|p| is_sound(p) && p.opacity >= crate::layers::ALPHA_MIN as f32);

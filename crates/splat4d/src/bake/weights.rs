@@ -7,7 +7,7 @@
 //! opacity give, so that it is not lost for other views.
 
 use super::sample::GEOMETRY;
-use super::sampling::Lookout;
+use super::sampling::Viewpoints;
 use crate::layers::{Evaluation, Scene};
 use crate::math::sym3;
 use crate::render::{Importance, RenderConfig, Shot};
@@ -163,7 +163,7 @@ impl Weights {
     }
 
     /// The weight of row `row` of a layer that renders like `sample` where it is clearest.
-    pub(super) fn of(&self, layer: usize, row: usize, sample: &[f32], sampling: &Lookout) -> Weight {
+    pub(super) fn of(&self, layer: usize, row: usize, sample: &[f32], sampling: &Viewpoints) -> Weight {
         let v: [f64; GEOMETRY] = std::array::from_fn(|k| f64::from(sample[k]));
         let square = v[SPLAT_OPACITY] * v[SPLAT_OPACITY];
         let values = sym3::eigen([v[3], v[4], v[5], v[6], v[7], v[8]]).0;

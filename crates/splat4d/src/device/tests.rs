@@ -16,7 +16,7 @@ const BACKGROUND: [f32; 3] = [0.25, 0.5, 0.75];
 #[test]
 fn the_cpu_is_always_available() {
     for device in [Device::Cpu, Device::Auto, Device::Gpu] {
-        let mut opened = open(device, RenderConfig::default(), &Wanted::default(), Tables::Constant);
+        let mut opened = open(device, RenderConfig::default(), &Abilities::default(), Tables::Constant);
         let (splats, camera, mut image) = (Splats::default(), view(), Image::default());
         assert!(draw(&mut opened.backend, &Shot::new(&splats, &camera, BACKGROUND), &mut image).is_none());
         assert_eq!(image.color.data[..7], [0.25, 0.25, 0.25, 0.25, 0.25, 0.25, 0.5]);
@@ -27,7 +27,8 @@ fn the_cpu_is_always_available() {
 
 #[test]
 fn work_unsupported_by_the_device_runs_on_the_cpu() {
-    for wanted in [Wanted { head: true, ..Wanted::default() }, Wanted { extra: true, ..Wanted::default() }] {
+    for wanted in [Abilities { head: true, ..Abilities::default() }, Abilities { extra: true, ..Abilities::default() }]
+    {
         let opened = open(Device::Gpu, RenderConfig::default(), &wanted, Tables::Changing);
         assert!(opened.fell_back && opened.backend.can(&wanted).is_ok(), "{}", opened.why);
     }
@@ -41,7 +42,7 @@ struct Failing {
 }
 
 impl Backend for Failing {
-    fn can(&self, wanted: &Wanted) -> Result<()> {
+    fn can(&self, wanted: &Abilities) -> Result<()> {
         if wanted.extra { Err(refusal("it", "blend further channels")) } else { Ok(()) }
     }
     fn render(&mut self, shot: &Shot<'_>, out: &mut Image) -> Result<()> {
@@ -131,7 +132,7 @@ fn training_continues_on_the_cpu_with_equal_gradients() {
 struct Crooked(Renderer<f32>, [f32; 2]);
 
 impl Backend for Crooked {
-    fn can(&self, _: &Wanted) -> Result<()> {
+    fn can(&self, _: &Abilities) -> Result<()> {
         Ok(())
     }
     fn render(&mut self, shot: &Shot<'_>, out: &mut Image) -> Result<()> {
@@ -292,7 +293,7 @@ impl<F: Real> Scene<F> {
         let background = BACKGROUND.map(|v| F::of(f64::from(v)));
         let shot = Shot { extra: self.extra.as_ref(), sh_degree, depth, ..Shot::new(&splats, camera, background) };
         let mut image = Image::default();
-        match (backend.can(&shot.wanted()), backend.render(&shot, &mut image)) {
+        match (backend.can(&shot.abilities()), backend.render(&shot, &mut image)) {
             (Ok(()), Ok(())) => Some(image),
             (Err(refused), Err(_)) => {
                 println!("{}: {refused}", backend.name());
@@ -315,7 +316,7 @@ fn differences<F: Real>(a: &Planes<F>, b: &Planes<f64>, unit: f64) -> [f64; 2] {
 fn every_backend_renders_as_the_reference_does() {
     let mut backends = vec![cpu(RenderConfig::default())];
     #[cfg(feature = "gpu")]
-    match gpu(Device::Gpu, RenderConfig::default(), &Wanted::default(), Tables::Changing) {
+    match gpu(Device::Gpu, RenderConfig::default(), &Abilities::default(), Tables::Changing) {
         Ok((gpu, name)) => {
             println!("{name}");
             backends.push(gpu);
@@ -366,7 +367,7 @@ fn every_backend_renders_as_the_reference_does() {
 
 #[test]
 fn the_reference_renderer_refuses_a_backward_pass() {
-    let (mut oracle, wanted) = (Oracle::default(), Wanted { backward: true, ..Wanted::default() });
+    let (mut oracle, wanted) = (Oracle::default(), Abilities { backward: true, ..Abilities::default() });
     let error = oracle.can(&wanted).expect_err("it is a forward alone").to_string();
     assert!(error.contains("the oracle does not take gradients back"), "{error}");
     let (splats, camera, color) = (Splats::default(), view(), Planes::new(3, 2, 3));

@@ -137,7 +137,7 @@ pub(super) fn run(step: &Step, scene: &mut Scene<f32>, context: &dyn Context) ->
         }
         Step::Drag { select, at, nodes, handles, pins } => {
             let (selected, count) = find(select, scene)?;
-            drag::run(scene, &selected, &drag::Asked { at: *at, nodes: *nodes, handles, pins }, context)?;
+            drag::run(scene, &selected, &drag::DragRequest { at: *at, nodes: *nodes, handles, pins }, context)?;
             Ok(count)
         }
         Step::Floaters { strength } => {

@@ -61,14 +61,14 @@ pub struct DragKey {
 }
 
 /// A drag as requested.
-pub(super) struct Asked<'a> {
+pub(super) struct DragRequest<'a> {
     pub at: f64,
     pub nodes: usize,
     pub handles: &'a [DragHandle],
     pub pins: &'a [[f64; 4]],
 }
 
-impl Asked<'_> {
+impl DragRequest<'_> {
     fn check_time(&self, scene: &Scene<f32>) -> Result<()> {
         let bad = |what: String, remedy: &str| Err(Error::input(what).remedy(remedy.to_owned()));
         if !(scene.clip[0]..=scene.clip[1]).contains(&self.at) {
@@ -133,7 +133,12 @@ fn within(nodes: &[[f64; 3]], place: [f64; 3], radius: f64) -> Vec<usize> {
 }
 
 /// Bends the selected Gaussians, which get layers of their own.
-pub(super) fn run(scene: &mut Scene<f32>, selected: &Selected, asked: &Asked<'_>, context: &dyn Context) -> Result<()> {
+pub(super) fn run(
+    scene: &mut Scene<f32>,
+    selected: &Selected,
+    asked: &DragRequest<'_>,
+    context: &dyn Context,
+) -> Result<()> {
     asked.check(scene)?;
     let (times, first) = asked.times(scene);
     let (start, paths) = carried(scene, selected, asked, (&times, first), context)?;
@@ -228,9 +233,9 @@ impl Dragging {
         context: &dyn Context,
     ) -> Result<Self> {
         scene.without_head("a drag under the hand")?;
-        let asked = Asked { at, nodes, handles: &[], pins: &[] };
+        let asked = DragRequest { at, nodes, handles: &[], pins: &[] };
         asked.check_time(scene)?;
-        Asked { at: now, ..asked }.check_time(scene)?;
+        DragRequest { at: now, ..asked }.check_time(scene)?;
         // Frame by frame, as a step follows them.
         let between = |t: &f64| (at.min(now)..=at.max(now)).contains(t);
         let mut times: Vec<f64> = asked.times(scene).0.into_iter().filter(between).chain([now]).collect();
@@ -314,7 +319,7 @@ type Carried = (Vec<[f64; 3]>, Vec<Vec<[f64; 3]>>);
 fn carried(
     scene: &Scene<f32>,
     selected: &Selected,
-    asked: &Asked<'_>,
+    asked: &DragRequest<'_>,
     (times, first): (&[f64], usize),
     context: &dyn Context,
 ) -> Result<Carried> {
@@ -348,7 +353,7 @@ pub(super) fn own_nodes<'a>(scene: &'a Scene<f32>, selected: &Selected) -> Optio
 }
 
 /// Nodes at farthest points of the selected Gaussians that can be seen at `at`.
-fn nodes(scene: &Scene<f32>, selected: &Selected, asked: &Asked<'_>) -> Result<Vec<[f64; 3]>> {
+fn nodes(scene: &Scene<f32>, selected: &Selected, asked: &DragRequest<'_>) -> Result<Vec<[f64; 3]>> {
     let mut seen = Evaluation::default();
     scene.at(Time(asked.at), &mut seen);
     let mut carriers = Vec::new();

@@ -235,7 +235,7 @@ fn labels_are_selected_kept_and_merged() {
 }
 
 #[test]
-fn a_mask_selects_what_its_camera_sees() {
+fn a_mask_selects_gaussians_visible_to_its_camera() {
     let s = walker();
     // The left half of the image is white: x < 0 of the camera, which sees the world mirrored in no axis.
     let white = (0..48 * 64).map(|i| i % 64 < 32).collect::<Vec<_>>();

@@ -98,7 +98,7 @@ pub fn follow(scene: &Scene<f32>, queries: &[Query], times: &[f64]) -> Followed 
         let (mut now, mut next) = (ActiveGaussians::default(), ActiveGaussians::default());
         for (step, &k) in order.iter().enumerate() {
             if step == 0 {
-                now.look(scene, moments[k]);
+                now.evaluate(scene, moments[k]);
             }
             for (q, start) in begin(scene, &now, queries, &begins, k) {
                 out.starts[q] = start.as_ref().map(|p| p.at);
@@ -112,7 +112,7 @@ pub fn follow(scene: &Scene<f32>, queries: &[Query], times: &[f64]) -> Followed 
                 }
             }
             let Some(&to) = order.get(step + 1) else { break };
-            next.look(scene, moments[to]);
+            next.evaluate(scene, moments[to]);
             on_the_way.par_iter_mut().for_each(|point| {
                 if let Some(p) = point
                     && !p.step(&now, &next)
@@ -129,7 +129,7 @@ pub fn follow(scene: &Scene<f32>, queries: &[Query], times: &[f64]) -> Followed 
 /// Points seen by a camera at one time.
 pub fn sights(scene: &Scene<f32>, camera: &Camera, t: Time, points: &[Option<[f64; 3]>]) -> Vec<Option<PointView>> {
     let mut seen = ActiveGaussians::default();
-    seen.look(scene, t.0);
+    seen.evaluate(scene, t.0);
     let projected = projected(scene, &seen, camera);
     let sight = |point: &Option<[f64; 3]>| {
         let (pixel, z) = camera.project((*point)?)?;
@@ -279,7 +279,7 @@ struct ActiveGaussians {
 }
 
 impl ActiveGaussians {
-    fn look(&mut self, scene: &Scene<f32>, t: f64) {
+    fn evaluate(&mut self, scene: &Scene<f32>, t: f64) {
         scene.at(Time(t), &mut self.evaluation);
     }
 

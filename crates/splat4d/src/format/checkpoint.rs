@@ -41,7 +41,7 @@ fn read(bytes: &[u8]) -> Result<Opened> {
     {
         let file = Tensors { torch: &torch, dict: pipeline, prefix: SPLATFACTO };
         let params = file.gaussians(["features_dc", "features_rest"])?;
-        warnings.say("the model is in the world of nerfstudio (z up), which its data parser scaled and centred");
+        warnings.add("the model is in the world of nerfstudio (z up), which its data parser scaled and centred");
         return Ok(Opened { up: Some(NERFSTUDIO_UP), ..Opened::from((params, warnings)) });
     }
     let splats = [torch.get(root, "splats"), Some(root)].into_iter().flatten();

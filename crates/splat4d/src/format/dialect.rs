@@ -168,9 +168,9 @@ impl Dialect {
         let (of, mut mended) = (opened.scene.len(), opened.ply.as_ref().map(|p| p.mended).unwrap_or_default());
         for layer in &mut opened.scene.layers {
             mended += Mended::of(&mut layer.params);
-            mend::say_coarse(&layer.params, &mut opened.warnings);
+            mend::warn_coarse(&layer.params, &mut opened.warnings);
         }
-        mended.say(of, &mut opened.warnings);
+        mended.report(of, &mut opened.warnings);
         opened
     }
 
@@ -289,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn no_dialect_writes_what_is_not_finite() {
+    fn no_dialect_writes_numbers_that_are_not_finite() {
         for dialect in DIALECTS.iter().filter(|d| d.is_written()) {
             for bad in [f32::NAN, f32::INFINITY] {
                 let (mut scene, mut bytes) = (sample(dialect.moves), Vec::new());

@@ -84,7 +84,7 @@ fn read(bytes: &[u8]) -> Result<(Scene<f32>, Warnings)> {
         (1..frames).any(|f| (0..3).any(|k| (colors[3 * (f * rows + row) + k] - colors[3 * row + k]).abs() > VISIBLE))
     };
     warnings.counted((0..rows).filter(changes).count(), rows, "change their colour: that of the first frame is read");
-    warnings.say(format!("the file states no frame rate: {DEFAULT_FPS} frames per second are assumed"));
+    warnings.add(format!("the file states no frame rate: {DEFAULT_FPS} frames per second are assumed"));
     let times: Vec<f64> = (0..frames).map(|i| i as f64 / DEFAULT_FPS).collect();
     let clip = [0.0, times[frames - 1]];
     let motion = Tracked::new(&TrackedSpec { times, foreground: false }, &mut params)?;

@@ -31,11 +31,11 @@ pub(super) fn duration(frames: Option<usize>, warnings: &mut Warnings) -> f64 {
     match frames.filter(|n| *n > 1) {
         Some(n) => {
             warnings
-                .say(format!("the file states {n} frames, but no frame rate: {DEFAULT_FPS} per second are assumed"));
+                .add(format!("the file states {n} frames, but no frame rate: {DEFAULT_FPS} per second are assumed"));
             (n - 1) as f64 / DEFAULT_FPS
         }
         None => {
-            warnings.say("the file does not state its duration: one second is assumed");
+            warnings.add("the file does not state its duration: one second is assumed");
             UNKNOWN_CLIP
         }
     }

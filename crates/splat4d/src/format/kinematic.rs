@@ -42,7 +42,7 @@ impl Clock {
 
     /// The clock assumed for a file that gives none.
     pub(super) fn assumed(warnings: &mut Warnings) -> Self {
-        warnings.say("the file does not state its duration: one second is assumed");
+        warnings.add("the file does not state its duration: one second is assumed");
         Self { clip: [0.0, UNKNOWN_CLIP], fps: crate::scene::time::DEFAULT_FPS, duration: UNKNOWN_CLIP }
     }
 }

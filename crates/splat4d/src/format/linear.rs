@@ -193,7 +193,7 @@ pub fn from_linear(layer: &mut Layer<f32>, what: Linear) -> Warnings {
     };
     let mut warnings = Warnings::default();
     if white != 1.0 {
-        warnings.say(format!("{} are read from 0 to {white}", what.name()));
+        warnings.add(format!("{} are read from 0 to {white}", what.name()));
     }
     warnings.counted(outside, rows, &range);
     warnings

@@ -60,7 +60,7 @@ pub(crate) fn write(params: &Params, out: &mut impl Write) -> Result<Warnings> {
     let mut warnings = Warnings::default();
     let (geometry, sh) = (&params[GEOMETRY], &params[SH]);
     if sh.width() > 3 {
-        warnings.say("view dependence (spherical harmonics above degree 0) is left out: .splat holds one colour");
+        warnings.add("view dependence (spherical harmonics above degree 0) is left out: .splat holds one colour");
     }
     let mut clipped = 0;
     let mut bytes = Vec::with_capacity(params.len() * ROW);
@@ -122,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_clipped_or_damaged_is_counted() {
+    fn clipped_and_damaged_values_are_counted() {
         let mut p = gaussians(3, 1);
         p[SH].write(0, 0, [9.0, 0.0, 0.0]);
         p[SH].write(1, 0, [0.0; 3]);

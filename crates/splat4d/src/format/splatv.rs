@@ -158,7 +158,7 @@ pub fn read(bytes: &[u8]) -> Result<(Scene<f32>, Warnings)> {
         if chunk["type"] == "splat" {
             return splats(chunk, body, warnings);
         }
-        warnings.say(format!("a chunk of type {} is not read", chunk["type"]));
+        warnings.add(format!("a chunk of type {} is not read", chunk["type"]));
     }
     Err(damaged("it has no chunk of type \"splat\""))
 }

@@ -9,14 +9,14 @@ pub struct Warnings {
 
 impl Warnings {
     /// Adds a sentence.
-    pub fn say(&mut self, text: impl Into<String>) {
+    pub fn add(&mut self, text: impl Into<String>) {
         self.lines.push(text.into());
     }
 
     /// Adds "`count` of `of` Gaussians `what`", unless the count is zero.
     pub fn counted(&mut self, count: usize, of: usize, what: &str) {
         if count > 0 {
-            self.say(format!("{count} of {of} Gaussians {what}"));
+            self.add(format!("{count} of {of} Gaussians {what}"));
         }
     }
 

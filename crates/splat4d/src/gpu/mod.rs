@@ -35,8 +35,8 @@ pub use tuning::Tuning;
 
 use crate::render::backend::refusal;
 use crate::render::{
-    Antialias, Backend, Comparison, Image, ImageGrads, RenderConfig, RenderGrads, Resident, Shot, Tables, Target,
-    Wanted,
+    Abilities, Antialias, Backend, Comparison, Image, ImageGrads, RenderConfig, RenderGrads, Resident, Shot, Tables,
+    Target,
 };
 use crate::scene::{Planes, Table};
 use crate::{Error, ErrorKind, Result};
@@ -171,9 +171,9 @@ impl GpuRenderer {
     }
 
     /// Refuses what the shaders cannot do, without opening a GPU.
-    pub(crate) fn refuses(wanted: &Wanted) -> Result<()> {
-        let lacks = [(wanted.head, "render scenes with a pixel head"), (wanted.extra, "blend further channels")];
-        lacks.iter().find(|(wanted, _)| *wanted).map_or(Ok(()), |(_, what)| Err(refusal("the GPU", what)))
+    pub(crate) fn refuses(abilities: &Abilities) -> Result<()> {
+        let lacks = [(abilities.head, "render scenes with a pixel head"), (abilities.extra, "blend further channels")];
+        lacks.iter().find(|(abilities, _)| *abilities).map_or(Ok(()), |(_, what)| Err(refusal("the GPU", what)))
     }
 
     /// Renders all bands of an image that has pixels.
@@ -389,13 +389,13 @@ impl GpuRenderer {
 }
 
 impl Backend<f32> for GpuRenderer {
-    fn can(&self, wanted: &Wanted) -> Result<()> {
-        Self::refuses(wanted)
+    fn can(&self, abilities: &Abilities) -> Result<()> {
+        Self::refuses(abilities)
     }
 
     /// Errors in addition to those of every backend: the scene or the image is too large for WebGPU's limits.
     fn render(&mut self, shot: &Shot<'_, f32>, out: &mut Image<f32>) -> Result<()> {
-        self.can(&shot.wanted())?;
+        self.can(&shot.abilities())?;
         let (n, w, h) = (shot.splats.len(), shot.camera.width, shot.camera.height);
         self.timings = GpuTimings::default();
         self.stats = GpuStats { splats: n, ..GpuStats::default() };
@@ -408,7 +408,7 @@ impl Backend<f32> for GpuRenderer {
     }
 
     fn render_bytes(&mut self, shot: &Shot<'_, f32>, out: &mut Vec<[u8; 4]>) -> Result<bool> {
-        self.can(&shot.wanted())?;
+        self.can(&shot.abilities())?;
         let (n, w, h) = (shot.splats.len(), shot.camera.width, shot.camera.height);
         self.timings = GpuTimings::default();
         self.stats = GpuStats { splats: n, ..GpuStats::default() };
@@ -428,7 +428,7 @@ impl Backend<f32> for GpuRenderer {
         d_sh: &mut [Option<&mut Table<f32>>],
         d: &mut RenderGrads<f32>,
     ) -> Result<()> {
-        self.can(&Wanted { backward: true, ..shot.wanted() })?;
+        self.can(&Abilities { backward: true, ..shot.abilities() })?;
         self.backward_band(shot, grads, d_sh, d)
     }
 
@@ -441,7 +441,7 @@ impl Backend<f32> for GpuRenderer {
         d_sh: &mut [Option<&mut Table<f32>>],
         d: &mut RenderGrads<f32>,
     ) -> Result<Option<Comparison>> {
-        self.can(&Wanted { backward: true, ..shot.wanted() })?;
+        self.can(&Abilities { backward: true, ..shot.abilities() })?;
         if shot.depth { Ok(None) } else { self.compare_here(shot, target, d_sh, d) }
     }
 

@@ -33,7 +33,7 @@ pub(super) use flight::{AHEAD, Flights};
 use std::borrow::Cow;
 use std::ops::Range;
 use ties::Tied;
-use uniforms::{Ask, MOST_COLUMNS, RecordRule, Rule};
+use uniforms::{MOST_COLUMNS, Query, RecordRule, Rule};
 
 /// Number of the SH table; those before it are contiguous in one buffer.
 const SH: usize = KEPT - 1;
@@ -43,7 +43,7 @@ const STATS_WIDTH: usize = 3;
 const PIECES: usize = 3;
 /// Structures per page in the buffer of uniforms: the query, a rule per piece of a table, losses on rows, noise, ties.
 mod at {
-    pub(super) const ASK: usize = 0;
+    pub(super) const QUERY: usize = 0;
     pub(super) const RULES: usize = 1;
     pub(super) const ROWS: usize = RULES + super::KEPT * super::PIECES;
     pub(super) const NOISE: usize = ROWS + 1;
@@ -208,15 +208,15 @@ impl Tables {
     }
 
     /// The query to a page.
-    fn ask(&self, page: usize) -> wgpu::BindingResource<'_> {
-        self.uniform(page * at::ALL + at::ASK, size_of::<Ask>())
+    fn query(&self, page: usize) -> wgpu::BindingResource<'_> {
+        self.uniform(page * at::ALL + at::QUERY, size_of::<Query>())
     }
 
     /// Rows to splats.
     fn answer(&self, gpu: &Gpu, b: &Buffers, upload: &Upload, recorder: &mut Recorder<'_>) -> Result<()> {
         let bind = |(i, page): (usize, &ResidentBuffers)| {
             let part = &upload.parts[i];
-            let mut group = vec![self.ask(i), page.params.all(), part.geometry.all(), page.alive.all()];
+            let mut group = vec![self.query(i), page.params.all(), part.geometry.all(), page.alive.all()];
             if matches!(page.moves, Moves::Sliced { .. }) {
                 group.push(part.weights.all());
             }
@@ -312,8 +312,8 @@ impl ResidentPass<'_> {
         let mut first_splat = 0;
         for (i, page) in tables.pages.iter().enumerate() {
             let slot = |at: usize| i * at::ALL + at;
-            let ask = Ask::new(page, step.views[view].t, view == 0, step.alpha_min, first_splat);
-            put(slot(at::ASK), bytemuck::bytes_of(&ask));
+            let query = Query::new(page, step.views[view].t, view == 0, step.alpha_min, first_splat);
+            put(slot(at::QUERY), bytemuck::bytes_of(&query));
             first_splat += page.rows;
             for (table, rule) in step.rules[page.layer].iter().enumerate() {
                 let Some(rule) = rule else { continue };
@@ -356,8 +356,8 @@ impl ResidentPass<'_> {
     }
 
     /// The query to a page.
-    fn ask(&self, page: usize) -> wgpu::BindingResource<'_> {
-        self.tables.ask(page)
+    fn query(&self, page: usize) -> wgpu::BindingResource<'_> {
+        self.tables.query(page)
     }
 
     /// The sums of the view, the gradients of splats to those of rows, and, after the step's last view, Adam and the
@@ -377,7 +377,7 @@ impl ResidentPass<'_> {
             let view = super::frame::uniform(b, slot::VIEW, super::frame::VIEW_BYTES);
             let colors = [
                 view,
-                self.ask(i),
+                self.query(i),
                 b.counts.all(),
                 part.geometry.all(),
                 part.tables[0].all(),
@@ -387,7 +387,7 @@ impl ResidentPass<'_> {
                 part.weights.all(),
             ];
             runs.push(Run::new(gpu, &k.colors_back, 0, &colors, layer.row_groups(gpu)));
-            let mut rows = vec![self.ask(i), b.counts.all(), layer.params.all(), b.back.all()];
+            let mut rows = vec![self.query(i), b.counts.all(), layer.params.all(), b.back.all()];
             if matches!(layer.moves, Moves::Sliced { .. }) {
                 rows.push(part.weights.all());
             }
@@ -406,7 +406,7 @@ impl ResidentPass<'_> {
             self.adam(gpu, b, upload, (i, layer), &words, &mut runs);
             if self.step.noise[layer.layer].is_some() {
                 let noise = self.uniform(i * at::ALL + at::NOISE, size_of::<uniforms::Noise>());
-                let group = [self.ask(i), noise, b.counts.all(), layer.alive.all(), layer.params.all()];
+                let group = [self.query(i), noise, b.counts.all(), layer.alive.all(), layer.params.all()];
                 runs.push(Run::new(gpu, &k.shake, 0, &group, layer.row_groups(gpu)));
             }
         }
@@ -426,7 +426,7 @@ impl ResidentPass<'_> {
                 for (i, layer) in pages.iter().enumerate() {
                     let rule = self.uniform(i * at::ALL + at::ROWS, size_of::<uniforms::RowRule>());
                     let (params, alive, d) = (layer.params.all(), layer.alive.all(), layer.d_params.all());
-                    let group = [self.ask(i), rule, b.counts.all(), params, alive, d, words.clone()];
+                    let group = [self.query(i), rule, b.counts.all(), params, alive, d, words.clone()];
                     runs.push(Run::new(gpu, &k.row_losses, entry, &group, layer.groups()));
                 }
             }
@@ -436,7 +436,7 @@ impl ResidentPass<'_> {
             let rule = self.uniform(i * at::ALL + at::TIES, size_of::<uniforms::TieRule>());
             let [before, edges, links, turns] = ties.buffers();
             let (params, d) = (layer.params.all(), layer.d_params.all());
-            let group = [self.ask(i), rule, params, before, edges, links, turns, d, words.clone(), b.counts.all()];
+            let group = [self.query(i), rule, params, before, edges, links, turns, d, words.clone(), b.counts.all()];
             runs.extend([0, 1].map(|entry| Run::new(gpu, &k.ties, entry, &group, ties.groups())));
         }
     }

@@ -356,7 +356,7 @@ impl<F: Real> Motion<F> for Skinned<F> {
             fill_rows(&mut tape.out, q.rows, |id| frames.splat(&q.p[self.skin.nodes], id));
             return;
         }
-        let ask = blend::Ask { skin: &self.skin, p: q.p, weights: &c.weights, frames };
+        let ask = blend::SkinQuery { skin: &self.skin, p: q.p, weights: &c.weights, frames };
         fill(&ask, [&mut tape.out], q.rows);
     }
 
@@ -386,7 +386,7 @@ impl<F: Real> Motion<F> for Skinned<F> {
         } else {
             let width = c.weights.neighbours() * q.p.len();
             pending.weights.resize(width, F::ZERO);
-            let ask = blend::Ask { skin: &self.skin, p: q.p, weights: &c.weights, frames };
+            let ask = blend::SkinQuery { skin: &self.skin, p: q.p, weights: &c.weights, frames };
             let d_frames = ask.backward(q.rows, d_out.out, &mut pending.weights, d);
             let [d_nodes] = d.of([self.skin.nodes]);
             frames.backward(&d_frames, &mut d_poses, d_nodes);

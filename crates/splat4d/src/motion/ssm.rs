@@ -256,7 +256,7 @@ impl Field {
         // Sixteen nodes a task, each with working memory of its own.
         let tasks = out.par_chunks_mut(LANES * ticks * width).enumerate();
         tasks.for_each_init(NetTape::default, |tape, (block, out)| {
-            let said = self.say(p, &prepared, block, tape);
+            let said = self.node_poses(p, &prepared, block, tape);
             for (lane, out) in out.chunks_exact_mut(ticks * width).enumerate() {
                 for (t, out) in out.chunks_exact_mut(width).enumerate() {
                     (0..width).for_each(|k| out[k] = said[k * ticks + t][lane]);
@@ -267,7 +267,13 @@ impl Field {
     }
 
     /// Poses of sixteen nodes at all ticks in the world's coordinates, \[6 or 7, ticks\].
-    fn say<F: Real>(&self, p: &Params<F>, net: &Prepared<F>, block: usize, tape: &mut NetTape<F>) -> Vec<Lane<F>> {
+    fn node_poses<F: Real>(
+        &self,
+        p: &Params<F>,
+        net: &Prepared<F>,
+        block: usize,
+        tape: &mut NetTape<F>,
+    ) -> Vec<Lane<F>> {
         let around = context::of_block(self.spec.equivariance, &p[self.context], block);
         let mut local = self.net.forward(net, &embedding_lanes(&p[self.embeddings], block), &around, tape);
         context::to_world(self.spec.equivariance, &around, self.spec.extent, &mut local);

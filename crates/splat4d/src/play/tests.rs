@@ -61,7 +61,7 @@ impl ReadAt for Counted {
 }
 
 #[test]
-fn a_player_shows_exactly_what_the_scene_holds() {
+fn a_player_shows_exactly_the_scene() {
     let file = take();
     let scene = read(&file).unwrap();
     let mut whole = Player::of_scene(&scene);

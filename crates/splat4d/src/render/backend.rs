@@ -11,7 +11,7 @@ use crate::{Error, ErrorKind, Result};
 
 /// Abilities that not every backend has. Colour, alpha and depth over a background are rendered by all.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Wanted {
+pub struct Abilities {
     /// Further channels ([`Shot::extra`]).
     pub extra: bool,
     /// A pixel head ([`Splats::head`]).
@@ -46,8 +46,8 @@ impl<'a, F: Real> Shot<'a, F> {
     }
 
     /// Abilities that rendering it takes.
-    pub(crate) fn wanted(&self) -> Wanted {
-        Wanted { extra: self.extra.is_some(), head: self.splats.head.is_some(), ..Wanted::default() }
+    pub(crate) fn abilities(&self) -> Abilities {
+        Abilities { extra: self.extra.is_some(), head: self.splats.head.is_some(), ..Abilities::default() }
     }
 }
 
@@ -65,7 +65,7 @@ pub enum Tables {
 /// Renders splats and takes gradients back; memory is reused from image to image.
 pub trait Backend<F: Real = f32>: Send {
     /// Whether it has these abilities. Errors: it lacks one; the message names it and states what can.
-    fn can(&self, wanted: &Wanted) -> Result<()>;
+    fn can(&self, abilities: &Abilities) -> Result<()>;
 
     /// Renders into `out`, which is resized to the camera's image. Rows that are NaN, infinite, behind the camera or
     /// transparent are not rendered.
@@ -138,8 +138,8 @@ pub(crate) fn refusal(who: &str, what: &str) -> Error {
 }
 
 impl<F: Real> Backend<F> for Renderer<F> {
-    fn can(&self, wanted: &Wanted) -> Result<()> {
-        if wanted.compare { Err(refusal("the renderer of the CPU", "compare images")) } else { Ok(()) }
+    fn can(&self, abilities: &Abilities) -> Result<()> {
+        if abilities.compare { Err(refusal("the renderer of the CPU", "compare images")) } else { Ok(()) }
     }
 
     fn render(&mut self, shot: &Shot<'_, F>, out: &mut Image<F>) -> Result<()> {

@@ -32,7 +32,7 @@ pub mod shade;
 mod tests;
 
 pub use crate::simd::Simd;
-pub use backend::{Backend, Shot, Tables, Wanted};
+pub use backend::{Abilities, Backend, Shot, Tables};
 pub use compare::{Comparison, Target};
 pub(crate) use count::PairCounts;
 pub use importance::{Importance, Sensitivity};

@@ -2,7 +2,7 @@
 //!
 //! Shares no code with the fast path but the spherical-harmonics constants. For tests, goldens and doubts.
 
-use super::backend::{Backend, Shot, Wanted, refusal};
+use super::backend::{Abilities, Backend, Shot, refusal};
 use super::{Antialias, Image, ImageGrads, RenderConfig, RenderGrads};
 use crate::Result;
 use crate::math::{Real, se3, sh};
@@ -204,8 +204,8 @@ pub struct Oracle {
 }
 
 impl Backend<f64> for Oracle {
-    fn can(&self, wanted: &Wanted) -> Result<()> {
-        if wanted.backward || wanted.compare { Err(refusal("the oracle", "take gradients back")) } else { Ok(()) }
+    fn can(&self, abilities: &Abilities) -> Result<()> {
+        if abilities.backward || abilities.compare { Err(refusal("the oracle", "take gradients back")) } else { Ok(()) }
     }
 
     fn render(&mut self, shot: &Shot<'_, f64>, out: &mut Image<f64>) -> Result<()> {
@@ -220,7 +220,7 @@ impl Backend<f64> for Oracle {
         _: &mut [Option<&mut Table<f64>>],
         _: &mut RenderGrads<f64>,
     ) -> Result<()> {
-        self.can(&Wanted { backward: true, ..Wanted::default() })
+        self.can(&Abilities { backward: true, ..Abilities::default() })
     }
 
     fn radii(&self) -> &[f64] {

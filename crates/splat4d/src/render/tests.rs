@@ -486,7 +486,7 @@ fn no_gradient_passes_a_ceiling() {
 }
 
 #[test]
-fn tight_boxes_cover_what_a_three_sigma_circle_covers() {
+fn tight_boxes_cover_a_three_sigma_circle() {
     // At 3.3σ an opaque splat still has α = .0043 > 1/255: it must be rendered there.
     let (out, rgb) = simple(&[([0.0, 0.0, 2.0], 0.04, 1.0)]);
     let view = frontal(101, 100.0);
@@ -631,7 +631,7 @@ fn contributions_change_no_gradient_and_do_not_depend_on_threads() {
 
 /// A splat's removal is rendered: the same splats with its opacity at 0.
 #[test]
-fn removals_are_what_an_image_loses_with_each_splat() {
+fn removals_equal_the_loss_of_an_image_without_each_splat() {
     let mut s = scene(12, 12, 0.15);
     // No pixel stops early, since one that has would continue without the splat.
     s.outs.iter_mut().for_each(|out| (0..out.rows()).for_each(|j| out.set(j, 9, 0.5 * out.get(j, 9))));

@@ -473,7 +473,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn entry_claims_loaded_arrays_and_names_what_is_wrong() {
+    fn entry_claims_loaded_arrays_and_names_the_error() {
         let array =
             |name: &str, rows, width| LoadedArray { name: name.into(), rows, width, data: vec![1.0; rows * width] };
         let mut p = Params::<f32>::build(vec![array("v", 2, 3)], 2, 1, &[]).unwrap();
@@ -501,7 +501,7 @@ mod tests {
     }
 
     #[test]
-    fn clear_resets_what_was_touched() {
+    fn clear_resets_changed_entries() {
         let p = Params::<f32>::new(20, 1, &[]);
         let mut g = Grads::new(&p);
         g.activate(Space::Gaussians, crate::scene::Rows::Some(&[3, 17]));

@@ -228,7 +228,7 @@ impl File<'_> {
 /// Adds a remark that several meshes may share.
 fn warnings_once(warnings: &mut Warnings, text: Option<String>) {
     let mut one = Warnings::default();
-    text.into_iter().for_each(|text| one.say(text));
+    text.into_iter().for_each(|text| one.add(text));
     warnings.append(one);
 }
 

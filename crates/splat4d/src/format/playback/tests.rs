@@ -416,7 +416,7 @@ fn golden_file_is_written_only_on_request() {
 }
 
 #[test]
-fn what_cannot_be_written_is_named() {
+fn unsupported_content_is_named_when_writing() {
     let refused = |change: fn(&mut Draft)| {
         let mut draft = made_up(40, 1, 9);
         change(&mut draft);

@@ -67,7 +67,7 @@ fn read_ftgs(bytes: &[u8]) -> Result<Opened> {
         },
     };
     let mut warnings = Warnings::default();
-    info.assumed.into_iter().for_each(|sentence| warnings.say(sentence));
+    info.assumed.into_iter().for_each(|sentence| warnings.add(sentence));
     let own = header.comments.iter().find_map(|c| clock(c));
     let seconds = match own {
         Some(own) => span(own.clip),
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_format_lacks_is_fitted_or_refused() {
+    fn unsupported_features_are_fitted_or_refused() {
         let scene = moving(50, LifeKind::GaussHalf, 3, true);
         let said = written(&scene, true).unwrap_err().to_string();
         assert!(said.contains("paths curve") && said.contains("rotate"), "{said}");

@@ -144,9 +144,9 @@ pub fn read(bytes: &[u8]) -> Result<(Params, PlyInfo)> {
 fn open(bytes: &[u8]) -> Result<Opened> {
     let (params, info) = read(bytes)?;
     let mut warnings = Warnings::default();
-    info.assumed.iter().for_each(|sentence| warnings.say(sentence));
+    info.assumed.iter().for_each(|sentence| warnings.add(sentence));
     for (what, evidence) in linear::doubts(&params) {
-        warnings.say(format!("{evidence}. If so, convert the file with --linear {}", what.name()));
+        warnings.add(format!("{evidence}. If so, convert the file with --linear {}", what.name()));
     }
     let offset = info.offset;
     let mut opened = Opened { ply: Some(info), ..Opened::from((params, warnings)) };

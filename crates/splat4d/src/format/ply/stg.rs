@@ -85,7 +85,7 @@ pub(crate) fn read_stg(bytes: &[u8]) -> Result<(Scene<f32>, Warnings)> {
             .remedy("Export the file again with the program that trained it."));
     }
     if vertex.properties.iter().any(|p| p.name.starts_with("f_t_")) {
-        warnings.say("the colours come from STG's full model, whose network is not in the file: only its base is read");
+        warnings.add("the colours come from STG's full model, whose network is not in the file: only its base is read");
     }
     let [rows] = rows::find(&header, bytes, ["vertex"])?;
     let rows = rows.expect("the element was found above");

@@ -84,17 +84,17 @@ pub(super) fn read(bytes: &[u8], warnings: &mut Warnings) -> Option<Axes> {
     let (mut c, mut axes) = (Cursor::new(bytes, "extensions"), None);
     while let (Ok(kind), Ok(length)) = (c.u32(), c.u32()) {
         let Ok(payload) = c.take(length as usize) else {
-            warnings.say("the file's extensions are cut short");
+            warnings.add("the file's extensions are cut short");
             break;
         };
         if kind != EXTENSION {
-            warnings.say(format!("extension {kind:#010X} is not read"));
+            warnings.add(format!("extension {kind:#010X} is not read"));
             continue;
         }
         let number = payload.first_chunk().map(|b| u32::from_le_bytes(*b));
         axes = number.and_then(Axes::of_number);
         if axes.is_none() {
-            warnings.say("the file's extension for axes (0xADBE0003) names none of the 16 coordinate systems");
+            warnings.add("the file's extension for axes (0xADBE0003) names none of the 16 coordinate systems");
         }
     }
     axes
@@ -103,11 +103,11 @@ pub(super) fn read(bytes: &[u8], warnings: &mut Warnings) -> Option<Axes> {
 /// Reports what is assumed, makes a left-handed world right-handed, and returns which way is up.
 pub(super) fn settle(axes: Option<Axes>, params: &mut Params, warnings: &mut Warnings) -> [f64; 3] {
     let Some(axes) = axes else {
-        warnings.say(format!("{ASSUMED}: those of .ply are assumed (y down); --up y or z corrects that"));
+        warnings.add(format!("{ASSUMED}: those of .ply are assumed (y down); --up y or z corrects that"));
         return Y_DOWN;
     };
     if axes.is_mirrored() {
-        warnings.say(format!("the file's axes are left-handed ({}): x is mirrored", axes.name()));
+        warnings.add(format!("the file's axes are left-handed ({}): x is mirrored", axes.name()));
         mirror_x(params);
     }
     axes.up()

@@ -110,11 +110,11 @@ pub fn read(bytes: &[u8]) -> Result<(Params, SpzInfo, Warnings)> {
     let mut params = streams::unpack(&header, &streams)?;
     let up = axes::settle(axes, &mut params, &mut warnings);
     if header.degree > crate::math::sh::MAX_DEGREE {
-        warnings.say("spherical harmonics of degree 4 are left out: degree 3 is the highest here");
+        warnings.add("spherical harmonics of degree 4 are left out: degree 3 is the highest here");
     }
     let antialiased = header.flags & ANTIALIASED != 0;
     if antialiased {
-        warnings.say("the file was trained with an anti-aliasing filter: render it with one");
+        warnings.add("the file was trained with an anti-aliasing filter: render it with one");
     }
     let info = SpzInfo {
         version: header.version,
@@ -144,7 +144,7 @@ pub(crate) fn write(params: &Params, version: u32, up: [f64; 3], out: &mut impl 
     let axes = axes::Axes::of_up(up).filter(|_| version >= NAMES_AXES);
     if axes.is_none() && up != Y_DOWN {
         let what = "the file does not name its axes (version 2, or up lies along none of them)";
-        warnings.say(format!("{what}: other programs will read y as down, as in .ply"));
+        warnings.add(format!("{what}: other programs will read y as down, as in .ply"));
     }
     let flags = if axes.is_some() { EXTENDED } else { 0 };
     let header = Header { version, count: count as usize, degree, fraction_bits, flags };

@@ -208,7 +208,7 @@ fn files_store_the_up_direction_except_in_version_2() {
 }
 
 #[test]
-fn what_is_clipped_is_counted() {
+fn clipped_values_are_counted() {
     let mut p = gaussians(4, 4);
     p[GEOMETRY].set(0, 0, 1e9);
     p[GEOMETRY].set(1, LOG_SCALE, -11.0);

@@ -35,7 +35,7 @@ pub(super) fn opened(stage: &Stage) -> Result<Opened> {
     for (i, prim) in stage.prims.iter().enumerate().filter(|(_, p)| p.shown && p.kind == FIELD) {
         let (frame, moves) = stage.place(i)?;
         if moves {
-            warnings.say(format!("a transform of {} is animated: its first time sample is read", prim.name));
+            warnings.add(format!("a transform of {} is animated: its first time sample is read", prim.name));
         }
         let field = Field::of(prim, stage.codes_per_second).map_err(|e| e.at(format!("prim {}", prim.name)))?;
         if let [first, .., last] = field.times[..] {
@@ -55,7 +55,7 @@ pub(super) fn opened(stage: &Stage) -> Result<Opened> {
     }
     let unit = stage.meters_per_unit;
     if unit.is_finite() && unit != 1.0 {
-        warnings.say(format!("the file's unit is {unit} m: coordinates are read as they are"));
+        warnings.add(format!("the file's unit is {unit} m: coordinates are read as they are"));
     }
     if layers.len() > 1 && clip.is_none() {
         layers.iter_mut().enumerate().for_each(|(i, l)| l.name = format!("gaussians {i}"));
@@ -161,7 +161,7 @@ impl<'a> Field<'a> {
             let long = values.as_ref().is_some_and(|v| v.len() >= width * count);
             if !long && count > 0 {
                 let mut one = Warnings::default();
-                one.say(format!("{name} are missing or fewer than {POSITIONS}: the schema's fallback is used"));
+                one.add(format!("{name} are missing or fewer than {POSITIONS}: the schema's fallback is used"));
                 warnings.append(one);
             }
             values.filter(|_| long)
@@ -193,7 +193,7 @@ impl<'a> Field<'a> {
 
     fn layers(&self, warnings: &mut Warnings) -> Result<Vec<Layer<f32>>> {
         if self.degree > MAX_DEGREE && self.coefficients.is_some() {
-            warnings.say(format!("spherical harmonics above degree {MAX_DEGREE} are left out"));
+            warnings.add(format!("spherical harmonics above degree {MAX_DEGREE} are left out"));
         }
         let first = self.params(self.times[0], warnings)?;
         if self.times.len() == 1 {

@@ -53,7 +53,7 @@ impl Default for Stage {
 }
 
 /// Whether an attribute is one of a field of Gaussians or of a position.
-fn is_wanted(name: &str) -> bool {
+fn is_needed(name: &str) -> bool {
     let name = name.strip_suffix('h').unwrap_or(name);
     [POSITIONS, ORIENTATIONS, SCALES, OPACITIES, DEGREE, COEFFICIENTS, "visibility"].contains(&name)
         || name.starts_with("xformOp")
@@ -219,7 +219,7 @@ impl Prim {
         let name = if words.len() == 2 { words[1] } else { "" };
         if l.eat(b'=') {
             let (name, part) = name.split_once('.').map_or((name, ""), |(name, part)| (name, part));
-            if !is_wanted(name) || !matches!(part, "" | "timeSamples") {
+            if !is_needed(name) || !matches!(part, "" | "timeSamples") {
                 l.skip()?;
                 // `rel a = </b>, </c>` does not occur without brackets; strings may follow each other by commas only.
             } else if part.is_empty() {

@@ -102,9 +102,9 @@ impl Tables {
         let mut out = vec![0u8; self.pages.len() * at::ALL * UNIFORM_STRIDE as usize];
         let mut first_splat = 0;
         for (i, page) in self.pages.iter().enumerate() {
-            let ask = super::Ask::new(page, t, true, alpha_min, first_splat);
-            let bytes = bytemuck::bytes_of(&ask);
-            out[(i * at::ALL + at::ASK) * UNIFORM_STRIDE as usize..][..bytes.len()].copy_from_slice(bytes);
+            let query = super::Query::new(page, t, true, alpha_min, first_splat);
+            let bytes = bytemuck::bytes_of(&query);
+            out[(i * at::ALL + at::QUERY) * UNIFORM_STRIDE as usize..][..bytes.len()].copy_from_slice(bytes);
             first_splat += page.rows;
         }
         gpu.queue.write_buffer(self.uniforms.get(), 0, &out);

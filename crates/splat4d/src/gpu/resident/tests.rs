@@ -311,11 +311,11 @@ fn a_device_lost_during_a_step_is_an_error() {
     let camera = camera([0.0, 0.0, -4.0], 33, 20);
     stepped(&mut r, &one(&camera));
     r.gpu.device.destroy();
-    assert!(tried(&mut r, &one(&camera)).is_err(), "it is told");
+    assert!(tried(&mut r, &one(&camera)).is_err(), "an error is returned");
 }
 
 /// A request to a renderer.
-type Asked<'a> = &'a dyn Fn(&mut GpuRenderer) -> Result<()>;
+type Call<'a> = &'a dyn Fn(&mut GpuRenderer) -> Result<()>;
 
 #[test]
 fn a_device_lost_with_steps_in_flight_is_an_error_for_every_call() {
@@ -325,16 +325,16 @@ fn a_device_lost_with_steps_in_flight_is_an_error_for_every_call() {
     let step = |r: &mut GpuRenderer, number| begun(r, number, std::slice::from_ref(&camera), 0.01);
     // As many as may be in flight, and one.
     let more = |r: &mut GpuRenderer| (2..=r.ahead).try_for_each(|number| step(r, number).map(|_| ()));
-    let ways: [Asked<'_>; 3] = [&finish, &fetch, &more];
-    for (what, ask) in ["finish", "fetch", "more steps"].into_iter().zip(ways) {
+    let ways: [Call<'_>; 3] = [&finish, &fetch, &more];
+    for (what, call) in ["finish", "fetch", "more steps"].into_iter().zip(ways) {
         let Some(mut r) = own_renderer() else { return };
         stepped(&mut r, &one(&camera));
         for number in 0..2 {
             assert!(step(&mut r, number).expect("it is begun").is_empty(), "it is under way");
         }
         r.gpu.device.destroy();
-        assert!(ask(&mut r).is_err(), "{what}: it is told");
-        assert!(tried(&mut r, &one(&camera)).is_err(), "{what}: and told again");
+        assert!(call(&mut r).is_err(), "{what}: an error is returned");
+        assert!(tried(&mut r, &one(&camera)).is_err(), "{what}: and the error is returned again");
     }
 }
 
@@ -374,7 +374,7 @@ fn failed_allocations_drop_cached_images_first_then_are_errors() {
 }
 
 #[test]
-fn a_film_shows_what_an_image_does() {
+fn a_film_equals_the_images() {
     let Some(mut r) = own_renderer() else { return };
     let (p, _, motion) = params::<f32>(&Native4dSpec::default());
     let layer = Layer::new("all", p, motion, LifeKind::Infinite);

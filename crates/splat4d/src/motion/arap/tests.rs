@@ -56,7 +56,7 @@ fn energy_never_rises_and_handles_stay_at_their_targets() {
 }
 
 #[test]
-fn what_is_not_tied_to_a_handle_stays() {
+fn untied_gaussians_stay() {
     let mut rest = rod(80, [0.0; 3], 3);
     rest.extend(rod(80, [0.0, 3.0, 0.0], 4));
     let handles = [0, 40, 79].map(|k| Handle {

@@ -98,7 +98,7 @@ impl<F: Real> Frames<F> {
 }
 
 /// One query about Gaussians.
-pub(super) struct Ask<'a, F> {
+pub(super) struct SkinQuery<'a, F> {
     pub skin: &'a Skin,
     pub p: &'a Params<F>,
     pub weights: &'a Weights<F>,
@@ -127,7 +127,7 @@ fn counts<F: Real>(a: F, sign: F) -> Frame<F> {
     each(|i| if i < TURN { a } else { sign * a })
 }
 
-impl<F: Real> Ask<'_, F> {
+impl<F: Real> SkinQuery<'_, F> {
     /// The blend of one Gaussian's nodes, and the signs.
     #[inline(always)]
     fn blend(&self, id: usize) -> (Frame<F>, [F; super::MAX_NEIGHBOURS]) {
@@ -231,7 +231,7 @@ impl<F: Real> Ask<'_, F> {
     }
 }
 
-impl<F: Real> Work<F, 1> for Ask<'_, F> {
+impl<F: Real> Work<F, 1> for SkinQuery<'_, F> {
     #[inline(always)]
     fn run(&self, batch: &Batch, [out]: &mut [TableMut<'_, F>; 1]) -> f64 {
         batch.write(out, 0, &activate_lanes(&self.moved(batch).rows));
@@ -241,7 +241,7 @@ impl<F: Real> Work<F, 1> for Ask<'_, F> {
 
 /// The VJP of one task's rows.
 struct Back<'a, F> {
-    ask: &'a Ask<'a, F>,
+    ask: &'a SkinQuery<'a, F>,
     asked: Rows<'a>,
     d_out: &'a Table<F>,
     /// Of the geometry and of the masks.

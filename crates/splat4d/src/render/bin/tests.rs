@@ -39,7 +39,7 @@ fn touches(foot: &Footprint, x: usize, y: usize) -> bool {
 }
 
 #[test]
-fn lists_are_what_a_stable_sort_of_all_pairs_gives() {
+fn lists_equal_a_stable_sort_of_all_pairs() {
     let [across, down] = [21, 11];
     let feet = footprints(CHUNK + 700, [across, down]);
     let mut bins = Bins::default();

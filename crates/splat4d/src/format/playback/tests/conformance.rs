@@ -406,7 +406,7 @@ fn deviations(name: &str) -> Vec<String> {
 }
 
 #[test]
-fn the_conformance_set_names_what_to_refuse() {
+fn the_conformance_set_names_files_to_refuse() {
     let list = std::fs::read_to_string(folder().join("refused/refused.json")).unwrap();
     let list: serde_json::Map<String, Value> = serde_json::from_str(&list).unwrap();
     assert_eq!(list.len(), refused().len());
@@ -419,7 +419,7 @@ fn the_conformance_set_names_what_to_refuse() {
 }
 
 #[test]
-fn strict_names_what_readers_tolerate() {
+fn strict_names_deviations_that_readers_tolerate() {
     let (sample, _) = bytes_of(&scene(300, 1, 20), &WriteConfig { deflate_level: 0, ..WriteConfig::default() });
     assert!(strict(&sample).unwrap().is_empty());
     let index = Index::parse(&sample, None).unwrap();
