@@ -261,7 +261,7 @@ mod tests {
     }
 
     #[test]
-    fn gaussians_get_the_label_of_what_they_show_and_rounds_never_make_it_worse() {
+    fn gaussians_get_labels_and_rounds_never_increase_the_error() {
         let folder = tempfile::tempdir().unwrap();
         let (capture, mut scene) = (capture(folder.path()), wall());
         let before = scene.layers[0].params[GEOMETRY].clone();

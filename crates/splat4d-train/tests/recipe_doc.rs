@@ -147,7 +147,7 @@ fn row(k: &Setting) -> String {
 }
 
 #[test]
-fn the_reference_is_what_the_recipe_does() {
+fn the_reference_equals_the_recipe() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs");
     for page in &PAGES {
         let (path, text) = (folder.join(page.file), text(page));

@@ -561,7 +561,7 @@ mod tests {
     }
 
     #[test]
-    fn lists_of_names_are_compared_by_what_they_name() {
+    fn lists_of_names_are_compared_by_their_entries() {
         for name in
             ["./images/Cam0/0001.PNG", "IMAGES\\CAM0\\0001.JPG", "images\\cam0\\0001.png", "cam0/0001", "cam0/0001.jpg"]
         {

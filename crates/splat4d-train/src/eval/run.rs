@@ -326,7 +326,7 @@ impl<'a> Judge<'a> {
                 }
                 views[place] = Some(view);
                 if let Views::Whole(Some(folder)) = kind {
-                    write_pictures(folder, place, &image, &truth)?;
+                    write_images(folder, place, &image, &truth)?;
                 }
                 done += 1;
                 listen(&Event::Phase { name: name.into(), done, total: frames.len() });
@@ -500,7 +500,7 @@ fn file_name(place: usize) -> String {
     format!("{place:05}.png")
 }
 
-fn write_pictures(folder: &Path, place: usize, render: &Planes<f32>, truth: &Planes<f32>) -> Result<()> {
+fn write_images(folder: &Path, place: usize, render: &Planes<f32>, truth: &Planes<f32>) -> Result<()> {
     let error = metrics::error_map(render, truth, ERROR_FULL);
     let all = [("renders", render), ("gt", truth), ("errors", &error)];
     all.into_par_iter()

@@ -48,9 +48,9 @@ pub(crate) fn carve(
     let each = count.div_ceil(times.len().max(1));
     let mut out = Seeds::default();
     // A single camera sees one side at a time: all times together carve one hull for every time.
-    let monocular = pictures_near(frames, times[0]).1.len() < MIN_VIEWS;
+    let monocular = images_near(frames, times[0]).1.len() < MIN_VIEWS;
     for (k, &t) in times.iter().enumerate() {
-        let (near, mut pictures) = pictures_near(frames, t);
+        let (near, mut pictures) = images_near(frames, t);
         let stamp = (moving && !monocular).then_some(near);
         if monocular {
             pictures = spread(frames);
@@ -79,7 +79,7 @@ pub(crate) fn carve(
 
 /// The distinct time nearest to t and its frames; of cameras whose shutters do not open at once the frame that is
 /// nearest to it, if that is less than half a frame.
-pub(super) fn pictures_near(frames: &dyn Frames, t: f64) -> (f64, Vec<usize>) {
+pub(super) fn images_near(frames: &dyn Frames, t: f64) -> (f64, Vec<usize>) {
     let all = || (0..frames.len()).map(|i| (frames.rig(i), frames.time(i).0));
     let Some(best) = all().map(|(_, time)| time).min_by(|a, b| (a - t).abs().total_cmp(&(b - t).abs())) else {
         return (t, Vec::new());

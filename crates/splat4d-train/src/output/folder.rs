@@ -162,7 +162,7 @@ impl OutputFolder {
     }
 
     /// Request of the unfinished command in a folder.
-    pub fn asked(path: &Path) -> Option<String> {
+    pub fn unfinished_request(path: &Path) -> Option<String> {
         crate::files::read_text(&path.join(STATE).join(ASKED)).ok()
     }
 
@@ -332,7 +332,7 @@ fn plan_all(folder: &Path, request: &Request<'_>, there: &[OsString]) -> Result<
             }
         };
     }
-    if OutputFolder::asked(folder).is_some_and(|asked| asked == request.asked) {
+    if OutputFolder::unfinished_request(folder).is_some_and(|asked| asked == request.asked) {
         return Ok(Plan::Continue);
     }
     if there.is_empty() {

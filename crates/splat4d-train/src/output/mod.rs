@@ -21,7 +21,7 @@ mod write;
 pub use date::rfc3339;
 pub use folder::{FolderContent, Mixes, OutputFolder, Request};
 pub use list::{note, written};
-pub use owner::{Owner, Standing, check_free};
+pub use owner::{Owner, OwnerRecord, check_free};
 pub use place::{Input, check_apart, check_file};
 pub use write::{Staged, write_atomically, write_atomically_with};
 

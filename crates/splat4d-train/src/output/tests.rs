@@ -230,7 +230,7 @@ fn a_partial_output_is_continued_by_the_same_command_only() {
     let (out, found) = begin("one").unwrap();
     assert_eq!(found, FolderContent::Unfinished);
     out.clear().unwrap();
-    assert!(tree(&folder).is_empty() && OutputFolder::asked(&folder).as_deref() == Some("one"));
+    assert!(tree(&folder).is_empty() && OutputFolder::unfinished_request(&folder).as_deref() == Some("one"));
     write_all(&folder, &[("recipe.toml", "")]);
     // While it runs no other process does anything.
     assert!(begin("one").unwrap_err().to_string().contains("in use by"));

@@ -91,7 +91,7 @@ pub(super) struct Planner {
     /// Seconds between two readings.
     interval: f64,
     /// Seconds since the command's start at the last reading.
-    looked: f64,
+    last_check: f64,
     /// Seconds of steps since then: taken, and as they were timed before the run.
     taken: [f64; 2],
     /// The machine's slowness: seconds for one as timed before the run.
@@ -106,7 +106,7 @@ impl Planner {
         let last = replans.last().map_or(0, |row| row.at);
         // A part that begins late in a command is examined as often as one that begins at once.
         let interval = (60.0 * budget.minutes - now).max(0.0) / READINGS;
-        Self { budget, interval, looked: now, taken: [0.0; 2], slowness: None, last }
+        Self { budget, interval, last_check: now, taken: [0.0; 2], slowness: None, last }
     }
 
     /// The time that the run is kept to.
@@ -122,15 +122,15 @@ impl Planner {
     }
 
     /// The new plan, where one is due: the end is off, and there is something left to plan.
-    pub(super) fn look(&mut self, now: f64, place: &Place<'_>) -> Option<Replanned> {
+    pub(super) fn replan(&mut self, now: f64, place: &Place<'_>) -> Option<Replanned> {
         let all = 60.0 * self.budget.minutes;
         let at = place.progress.iteration;
-        if now - self.looked < self.interval || at <= self.last || self.taken[1] <= 0.0 {
+        if now - self.last_check < self.interval || at <= self.last || self.taken[1] <= 0.0 {
             return None;
         }
         let measured = self.taken[0] / self.taken[1];
         let slowness = self.slowness.map_or(measured, |old| old + NEWEST * (measured - old));
-        (self.looked, self.taken, self.slowness) = (now, [0.0; 2], Some(slowness));
+        (self.last_check, self.taken, self.slowness) = (now, [0.0; 2], Some(slowness));
         let (timing, [count, cap], schedule) = (&self.budget.timing, place.gaussians, place.schedule_left());
         if schedule == 0 {
             return None;
@@ -219,7 +219,7 @@ mod tests {
             }
             let left = pace.total() - taken;
             let place = Place { stages: &stages, progress, gaussians: [count as usize, CAP], left };
-            if let Some(new) = planner.look(now, &place) {
+            if let Some(new) = planner.replan(now, &place) {
                 assert_eq!(new.row.at, taken);
                 rows.push(new.row);
             }

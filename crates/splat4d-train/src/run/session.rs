@@ -293,7 +293,7 @@ impl Session<'_> {
             state.seconds += seconds;
             if let Some(planner) = &mut planner {
                 planner.add(between + seconds, expected);
-                if let Some(new) = planner.look(clock + lead, &Place::of(trainer)) {
+                if let Some(new) = planner.replan(clock + lead, &Place::of(trainer)) {
                     recipe.run.replans.push(new.row);
                     // The plan on disk equals the one in use.
                     self.write_recipe(&recipe)?;

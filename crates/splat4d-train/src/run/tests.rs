@@ -25,7 +25,7 @@ use serde_json::{Value, json};
 use splat4d::format::dialect::WriteOptions;
 use splat4d::layers::Scene;
 use splat4d::math::Rng;
-use splat4d::render::{Backend, Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Shot, Wanted};
+use splat4d::render::{Abilities, Backend, Image, ImageGrads, RenderConfig, RenderGrads, Renderer, Shot};
 use splat4d::scene::{Camera, Table};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -201,7 +201,7 @@ fn meddled(meddle: impl FnMut(usize, &mut Image<f32>) + Send + 'static) -> Box<d
 }
 
 impl<F: FnMut(usize, &mut Image<f32>) + Send> Backend for Meddled<F> {
-    fn can(&self, wanted: &Wanted) -> Result<()> {
+    fn can(&self, wanted: &Abilities) -> Result<()> {
         self.inner.can(wanted)
     }
 

@@ -161,7 +161,7 @@ impl<F: Real> Chain<F> {
         }
         for view in step.views {
             for t in image.needs(view).extra.iter().filter_map(|channel| channel.other_time(view)) {
-                for i in self.asked(step.scene, view.t) {
+                for i in self.queries_at(step.scene, view.t) {
                     self.evaluation.request_again(i, t);
                 }
             }
@@ -169,7 +169,7 @@ impl<F: Real> Chain<F> {
     }
 
     /// By layer the query for its Gaussians at a time of this step.
-    fn asked(&self, scene: &Scene<F>, t: Time) -> Vec<usize> {
+    fn queries_at(&self, scene: &Scene<F>, t: Time) -> Vec<usize> {
         let query = |layer| self.evaluation.find(layer, Space::Gaussians, t).expect("every time of a step was queried");
         (0..scene.layers.len()).map(query).collect()
     }
@@ -178,7 +178,7 @@ impl<F: Real> Chain<F> {
     fn view(&mut self, step: &Step<'_, F>, view: &View<'_, F>, work: &mut Work<'_, F>) -> Result<()> {
         let mut clock = Clock::now();
         let scene = step.scene;
-        let asked = self.asked(scene, view.t);
+        let asked = self.queries_at(scene, view.t);
         let source = Source { scene, view, asked: &asked };
         let needs = work.image.needs(view);
         let channels = Channels::new(&needs.extra, source, &self.evaluation);

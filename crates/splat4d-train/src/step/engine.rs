@@ -11,7 +11,7 @@ use crate::train_state::{Parts, TrainState};
 use splat4d::device;
 use splat4d::layers::Scene;
 use splat4d::math::Rng;
-use splat4d::render::{Antialias, Backend, Wanted};
+use splat4d::render::{Abilities, Antialias, Backend};
 use splat4d::scene::life::LOG_WIDTH;
 use splat4d::scene::{Grads, Key, LIFE, SH};
 use std::time::{Duration, Instant as Clock};
@@ -295,7 +295,7 @@ impl<'a> CpuEngine<'a> {
 
 /// Whether a backend compares images, where the loss lets it.
 fn compares(backend: &dyn Backend) -> bool {
-    backend.can(&Wanted { compare: true, ..Wanted::default() }).is_ok()
+    backend.can(&Abilities { compare: true, ..Abilities::default() }).is_ok()
 }
 
 impl Engine for CpuEngine<'_> {

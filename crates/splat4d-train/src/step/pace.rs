@@ -68,7 +68,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_left_of_the_schedule_is_spread_over_the_steps_that_are_left() {
+    fn the_remaining_schedule_is_spread_over_the_remaining_steps() {
         let steady = Pace::new(100, &[]);
         assert!((0..=100).all(|i| steady.done_after(i) == i) && steady.total() == 100);
         // Half as many steps from the 20th on: two at a time.

@@ -212,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn colours_have_the_gradient_of_what_is_shown() {
+    fn colours_have_the_gradient_of_the_shown_image() {
         let (row, x, d) = (random::<COLUMNS>("row"), random::<3>("x"), random::<3>("d"));
         let value = |row: &[f64; COLUMNS], x: [f64; 3]| -> f64 {
             shown(row, x).iter().zip(d).map(|(shown, d)| shown * d).sum()

@@ -216,7 +216,7 @@ const AGREE: f64 = 0.03;
 const UNIT: (f64, f64) = (0.4, 1.5);
 
 /// Lookups in a depth map: pixels, and for each the querying unit and its expected depth.
-struct Asked<'a> {
+struct DepthLookup<'a> {
     frame: &'a Frame,
     pixels: Vec<[f64; 2]>,
     expected: Vec<(usize, f64)>,
@@ -262,12 +262,12 @@ fn by_views(capture: &Capture) -> Option<f64> {
     }
     // By map: pixels that any unit requests, with the unit and the depth that it expects there. Every map is decoded
     // once.
-    let mut asked: Vec<Asked<'_>> = Vec::new();
+    let mut asked: Vec<DepthLookup<'_>> = Vec::new();
     for (frame, other, ray) in &samples {
         let (camera, pose) = (&other.source, &other.source.cam_from_world);
         let (lens, world_from_cam) = (Distortion::new(camera.lens), frame.source.cam_from_world.inverse());
         let at = asked.iter().position(|a| std::ptr::eq(a.frame, *other)).unwrap_or_else(|| {
-            asked.push(Asked { frame: other, pixels: Vec::new(), expected: Vec::new() });
+            asked.push(DepthLookup { frame: other, pixels: Vec::new(), expected: Vec::new() });
             asked.len() - 1
         });
         for (unit, factor) in factors.iter().enumerate() {
@@ -279,7 +279,7 @@ fn by_views(capture: &Capture) -> Option<f64> {
         }
     }
     let mut counts = vec![(0u32, 0u32); factors.len()];
-    for Asked { frame, pixels, expected } in asked {
+    for DepthLookup { frame, pixels, expected } in asked {
         let Some(Ok(depths)) = frame.depth.as_ref().map(|d| depth::at(d, &frame.source, &pixels)) else { continue };
         for (d, (unit, z)) in depths.iter().zip(expected).filter(|(d, _)| **d > 0.0) {
             counts[unit].0 += u32::from((z / f64::from(*d) - 1.0).abs() <= AGREE);

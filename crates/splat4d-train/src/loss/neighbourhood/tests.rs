@@ -78,7 +78,7 @@ fn eval(
 }
 
 #[test]
-fn what_has_no_held_part_has_the_gradient_of_its_value() {
+fn inputs_without_held_parts_have_the_gradient_of_their_value() {
     let scene = scene(LifeKind::Infinite);
     for weights in [
         LossSettings { iso: 0.5, ..LossSettings::default() },

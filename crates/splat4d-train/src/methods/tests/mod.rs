@@ -34,7 +34,7 @@ use splat4d::math::sh::MAX_DEGREE;
 use splat4d::math::{Real, Rng};
 use splat4d::motion::{MODELS, Motion, SpacetimeSpec, build_as};
 use splat4d::render::{
-    self, Backend, Image, ImageGrads, PartGrads, RenderConfig, RenderGrads, Renderer, Wanted, oracle,
+    self, Abilities, Backend, Image, ImageGrads, PartGrads, RenderConfig, RenderGrads, Renderer, oracle,
 };
 use splat4d::scene::params::{LOG_SCALE, OPACITY, QUAT};
 use splat4d::scene::{Camera, GEOMETRY, Grads, Key, LIFE, Params, Planes, SH, Space, Table, Time};
@@ -97,7 +97,7 @@ fn smooth() -> RenderConfig {
 struct Oracle(RenderConfig);
 
 impl Backend<f64> for Oracle {
-    fn can(&self, _: &Wanted) -> Result<()> {
+    fn can(&self, _: &Abilities) -> Result<()> {
         Ok(())
     }
 

@@ -8,8 +8,8 @@ use crate::step::resident::DeviceEngine;
 use splat4d::device::{self, Device};
 use splat4d::layers::ALPHA_MIN;
 use splat4d::render::{
-    Antialias, Backend, Image, ImageGrads, RenderConfig, RenderGrads, Resident, ResidentCameras, ResidentLayer,
-    ResidentNumbers, ResidentStep, ResidentStepped, Shot, Wanted,
+    Abilities, Antialias, Backend, Image, ImageGrads, RenderConfig, RenderGrads, Resident, ResidentCameras,
+    ResidentLayer, ResidentNumbers, ResidentStep, ResidentStepped, Shot,
 };
 use splat4d::scene::{GEOMETRY, Table};
 use splat4d::{Error, ErrorKind, Result};
@@ -217,7 +217,7 @@ impl Failing {
 }
 
 impl Backend for Failing {
-    fn can(&self, wanted: &Wanted) -> Result<()> {
+    fn can(&self, wanted: &Abilities) -> Result<()> {
         self.device.can(wanted)
     }
     fn render(&mut self, shot: &Shot<'_>, out: &mut Image) -> Result<()> {

@@ -85,7 +85,7 @@ fn unease(ran: &Ran) -> [f64; 2] {
 }
 
 #[test]
-fn losses_on_nodes_reduce_what_they_measure() {
+fn losses_on_nodes_reduce_their_value() {
     let bed = Bed::new();
     let base = "motion=control control_nodes=20 control_shift_lr_init=5e-3 strategy=none";
     let plain = unease(&bed.run(base));

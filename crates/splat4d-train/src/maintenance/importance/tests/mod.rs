@@ -98,7 +98,7 @@ impl Frames for Again {
 }
 
 #[test]
-fn spatial_scores_sum_to_what_the_images_cover_and_double_with_them() {
+fn spatial_scores_sum_to_the_covered_pixels_and_double_with_the_images() {
     let (s, made) = (scene(400), made());
     let scores = scored(&s, &made, &ScoreConfig::default());
     let sum: f64 = scores.spatial.iter().flatten().sum();
