@@ -25,10 +25,10 @@ const BLOCKS: [f64; 2] = [2.5, 5.0];
 pub(super) fn alone(capture: &Capture, camera: usize, s: &CameraObservations, report: &mut Report) {
     let name = capture.cameras[camera].name.clone();
     let who = Some(name.as_str());
-    if let (Some(moved), Some(stand)) = (s.moved, s.stands.first()) {
-        let far = moved * unit(&stand.view);
+    if let (Some(moved), Some(viewpoint)) = (s.moved, s.viewpoints.first()) {
+        let far = moved * unit(&viewpoint.view);
         report.cameras[camera].moved = Some(far);
-        let limits = worse(MOVED, MOVED_PIXELS.map(|p| p * unit(&stand.view)));
+        let limits = worse(MOVED, MOVED_PIXELS.map(|p| p * unit(&viewpoint.view)));
         if let Some(g) = grade(far, limits) {
             let what =
                 format!("Camera {name} moved: the background moved by {far:.1} px (of 1920) from first to last.");

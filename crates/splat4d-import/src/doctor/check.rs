@@ -34,7 +34,7 @@ pub(super) fn all(
         .map(|(c, s)| CameraReport {
             name: c.name.clone(),
             fixed: c.fixed,
-            picture: s.stands.first().map(|s| s.picture.clone()).unwrap_or_default(),
+            picture: s.viewpoints.first().map(|s| s.picture.clone()).unwrap_or_default(),
             ..CameraReport::default()
         })
         .collect();
@@ -89,7 +89,7 @@ fn gather(report: &mut Report, cameras: usize) {
 /// Findings of the whole rig.
 fn take(capture: &Capture, seen: &[CameraObservations], report: &mut Report) {
     let fixed: Vec<usize> =
-        (0..seen.len()).filter(|&c| capture.cameras[c].fixed && !seen[c].stands.is_empty()).collect();
+        (0..seen.len()).filter(|&c| capture.cameras[c].fixed && !seen[c].viewpoints.is_empty()).collect();
     if fixed.len() < seen.len() {
         report.left.push(
             "Moving cameras: movement, flicker, frames and time offset are checked for fixed cameras only.".into(),
@@ -111,7 +111,7 @@ fn take(capture: &Capture, seen: &[CameraObservations], report: &mut Report) {
     if fixed.len() < 2 {
         return;
     }
-    let views: Vec<&Camera> = fixed.iter().map(|&c| &seen[c].stands[0].view).collect();
+    let views: Vec<&Camera> = fixed.iter().map(|&c| &seen[c].viewpoints[0].view).collect();
     let Some(target) = volume::target(&views) else {
         report.left.push(
             "Angles between cameras and what three of them see were not judged: the cameras have no common view."

@@ -36,7 +36,7 @@ pub(super) fn clocks(capture: &Capture, seen: &[CameraObservations], report: &mu
         );
         return;
     }
-    let view = |c: usize| &seen[c].stands[0].view;
+    let view = |c: usize| &seen[c].viewpoints[0].view;
     let centers: Vec<_> = (0..seen.len()).map(|c| ready.contains(&c).then(|| view(c).center())).collect();
     let chosen = neighbours(&centers, NEIGHBOURS);
     progress.phase("comparing clocks", 0, chosen.len());

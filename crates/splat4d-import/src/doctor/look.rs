@@ -26,7 +26,7 @@ pub(super) const CELL: usize = 8;
 const MOVING: f64 = 0.25;
 
 /// An image from a position: of the static background, or one of a moving camera.
-pub(super) struct Stand {
+pub(super) struct Viewpoint {
     pub(super) view: Camera,
     pub(super) picture: Rgb8,
 }
@@ -34,7 +34,7 @@ pub(super) struct Stand {
 /// Measurements of a camera.
 #[derive(Default)]
 pub(super) struct CameraObservations {
-    pub(super) stands: Vec<Stand>,
+    pub(super) viewpoints: Vec<Viewpoint>,
     /// Corners that move, by the camera's clock.
     pub(super) tracks: Vec<Track>,
     pub(super) clock: Clock,
@@ -62,7 +62,7 @@ fn halvings(view: &Camera) -> u32 {
 }
 
 /// The view of an examined image.
-fn looked(view: &Camera) -> Camera {
+fn reduced(view: &Camera) -> Camera {
     view.downscaled(1 << halvings(view))
 }
 
@@ -228,21 +228,21 @@ pub(super) fn camera(
             let still = Grey::of(&picture);
             seen.motion = pictures.iter().map(|p| cells(&Grey::of(p), &still)).collect();
         }
-        seen.stands.push(Stand { view: looked(&capture.frames[chosen[0]].view), picture });
+        seen.viewpoints.push(Viewpoint { view: reduced(&capture.frames[chosen[0]].view), picture });
     } else {
         for (&i, picture) in chosen.iter().zip(pictures) {
-            seen.stands.push(Stand { view: looked(&capture.frames[i].view), picture });
+            seen.viewpoints.push(Viewpoint { view: reduced(&capture.frames[i].view), picture });
         }
     }
     let first = (frames.len() - frames.len().min(options.window)) / 2;
     // Of a moving camera only the darkness is needed, for which a few images suffice.
     let row = if fixed { &frames[first..first + frames.len().min(options.window)] } else { &chosen[..] };
-    let still = (fixed && same && frames.len() >= MEDIAN_FROM).then(|| Grey::of(&seen.stands[0].picture));
+    let still = (fixed && same && frames.len() >= MEDIAN_FROM).then(|| Grey::of(&seen.viewpoints[0].picture));
     let mut tracker = Tracker::new(options.tracks, APART);
     let mut differences = Vec::new();
     let mut last: Option<Rgb8> = None;
     for (k, &i) in row.iter().enumerate() {
-        let picture = if fixed { load(i)? } else { seen.stands[k].picture.clone() };
+        let picture = if fixed { load(i)? } else { seen.viewpoints[k].picture.clone() };
         if let Some(last) = &last {
             differences.push((first + k, mean_difference(last, &picture)));
         }

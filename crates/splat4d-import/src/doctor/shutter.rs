@@ -101,7 +101,7 @@ pub(super) fn shutters(pairs: &[Pair], seen: &[CameraObservations], interval: f6
 fn sightings(pair: &Pair, [i, j]: [usize; 2], seen: &[CameraObservations], step: f64) -> Vec<Sighting> {
     let [a, b] = pair.cameras;
     let (one, other) = (&seen[a].tracks[i], &seen[b].tracks[j]);
-    let height = |c: usize| seen[c].stands[0].view.height as f64;
+    let height = |c: usize| seen[c].viewpoints[0].view.height as f64;
     let lag = pair.found.seconds;
     let of = |&(t, _): &(f64, [f64; 2])| {
         let x = one.smooth(t)?;

@@ -27,7 +27,7 @@ pub(super) fn target(views: &[&Camera]) -> Option<[f64; 3]> {
 /// Of the visual hull of dynamic regions (Laurentini 1994; frame by frame, as far as two cameras see it) the part that
 /// three see; None where too little moves.
 pub(super) fn seen_by_three(seen: &[&CameraObservations], target: [f64; 3]) -> Option<f64> {
-    let views: Vec<&Camera> = seen.iter().map(|s| &s.stands[0].view).collect();
+    let views: Vec<&Camera> = seen.iter().map(|s| &s.viewpoints[0].view).collect();
     let mut far: Vec<f64> = views.iter().map(|v| norm(sub(v.center(), target))).collect();
     let half = HALF * crate::sync::median(&mut far);
     let moments = seen.iter().map(|s| s.motion.len()).min().unwrap_or(0);

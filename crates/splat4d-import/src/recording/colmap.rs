@@ -17,7 +17,7 @@ const PROGRAM: &str = "colmap";
 const INSTALL: &str = "Install it (apt install colmap, brew install colmap, or from colmap.github.io), or leave --colmap out: \
                        poses are found without it.";
 /// Interval between checks whether the program is done.
-const LOOK: Duration = Duration::from_millis(100);
+const POLL: Duration = Duration::from_millis(100);
 /// Characters of the program's last words that are repeated.
 const LAST_WORDS: usize = 400;
 
@@ -165,7 +165,7 @@ fn run(step: &Step, help: &str, work: &Path, masks: bool, stop: &dyn Fn() -> boo
             return Err(Error::new(ErrorKind::Interrupted, "stopped while COLMAP was at work")
                 .remedy("Run the same command again to continue."));
         }
-        std::thread::sleep(LOOK);
+        std::thread::sleep(POLL);
     };
     if status.success() { Ok(()) } else { Err(failed(step, &log, status)) }
 }

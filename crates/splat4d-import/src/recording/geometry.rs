@@ -24,7 +24,7 @@ const SHORTEST: usize = 30;
 const NEIGHBOURS: usize = 3;
 
 /// A fixed camera, as a pinhole camera, and corners that move in it, by its own clock.
-struct StandingCamera {
+struct FixedCamera {
     camera: Camera,
     tracks: Vec<Track>,
     frames: usize,
@@ -70,7 +70,7 @@ fn measured(stored: &Stored<'_>, clock: &Solution, progress: &mut Progress<'_>) 
     Ok(pairs.par_iter().filter_map(of).collect())
 }
 
-fn camera(stored: &Stored<'_>, c: usize, middle: f64) -> Result<Option<StandingCamera>> {
+fn camera(stored: &Stored<'_>, c: usize, middle: f64) -> Result<Option<FixedCamera>> {
     let Some((known, pose)) = stored.known(c).and_then(|k| Some((k, k.pose?))) else { return Ok(None) };
     let shots = &stored.pictures[c].shots;
     let count = shots.len();
@@ -97,5 +97,5 @@ fn camera(stored: &Stored<'_>, c: usize, middle: f64) -> Result<Option<StandingC
         track.samples = track.samples.iter().map_while(|(t, p)| Some((*t, straight.pixel(*p)?))).collect();
     }
     tracks.retain(|t| !t.samples.is_empty());
-    Ok(Some(StandingCamera { camera: straight.camera(pose, size), tracks, frames: row }))
+    Ok(Some(FixedCamera { camera: straight.camera(pose, size), tracks, frames: row }))
 }

@@ -256,7 +256,7 @@ pub fn import(request: &Request, progress: &mut Progress<'_>, stop: &dyn Fn() ->
         if moving {
             poses::walking(&stored, MOST_WALKING, progress)
         } else {
-            poses::standing(&stored, clock, &told, progress, stop)
+            poses::fixed_cameras(&stored, clock, &told, progress, stop)
         }
     })?;
     if stop() {
@@ -285,7 +285,7 @@ fn names_of(pictures: &[Pictures]) -> Vec<&str> {
 /// Refuses what would only waste the time of training: most cameras, or frames of a moving one, must have been placed.
 fn check(solved: &poses::Solved, pictures: &[Pictures], report: &mut Report) -> Result<()> {
     let (placed, asked) = if solved.moving {
-        let known = |s: &poses::Stand| s.poses.iter().flatten().count();
+        let known = |s: &poses::SolvedCamera| s.poses.iter().flatten().count();
         let asked: usize = pictures.iter().map(|p| p.shots.len()).sum();
         (solved.cameras.iter().flatten().map(known).sum(), asked.min(MOST_WALKING))
     } else {

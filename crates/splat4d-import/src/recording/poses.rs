@@ -29,7 +29,7 @@ const ENOUGH_STILL: usize = 200;
 
 /// A camera that could be placed.
 #[derive(Clone, Debug)]
-pub(super) struct Stand {
+pub(super) struct SolvedCamera {
     /// One, or one for every stored frame; none where it could not be placed.
     pub poses: Vec<Option<Se3>>,
     /// One pose for all frames.
@@ -45,7 +45,7 @@ pub(super) struct Stand {
 /// The result.
 pub(super) struct Solved {
     /// In the order of the stored cameras; why not, where one could not be placed.
-    pub cameras: Vec<Result<Stand, String>>,
+    pub cameras: Vec<Result<SolvedCamera, String>>,
     pub offsets: Vec<Option<Offset>>,
     pub points: Vec<([f64; 3], [u8; 3])>,
     pub up: [f64; 3],
@@ -87,7 +87,7 @@ impl Note {
             let r = p.rotation.as_flattened();
             std::array::from_fn(|k| if k < 9 { r[k] } else { p.translation[k - 9] })
         };
-        let row = |s: &Stand| {
+        let row = |s: &SolvedCamera| {
             let Intrinsics { fx, fy, cx, cy } = s.intrinsics;
             let brown = match &s.lens {
                 Lens::Brown { k, p, .. } => Some([k[0], k[1], k[2], k[3], k[4], k[5], p[0], p[1]]),
@@ -127,7 +127,7 @@ impl Note {
                     s: [0.0; 4],
                 });
                 let given = stored.known(c);
-                Stand {
+                SolvedCamera {
                     poses: r.poses.into_iter().map(|p| p.map(pose)).collect(),
                     fixed: r.fixed,
                     intrinsics: given.map_or(Intrinsics { fx, fy, cx, cy }, |g| g.intrinsics),
@@ -161,7 +161,7 @@ pub(super) fn once(
 }
 
 /// Places fixed cameras, and refines their clocks.
-pub(super) fn standing(
+pub(super) fn fixed_cameras(
     stored: &Stored<'_>,
     clock: graph::Solution,
     told: &[Option<f64>],
@@ -217,7 +217,7 @@ pub(super) fn standing(
         taken.placed.clone().map(|p| {
             let (intrinsics, lens) = optics(stored, c, &p.lens);
             let poses = vec![Some(p.pose)];
-            Stand { poses, fixed: true, intrinsics, lens, sightings: p.sightings, error: p.error }
+            SolvedCamera { poses, fixed: true, intrinsics, lens, sightings: p.sightings, error: p.error }
         })
     };
     let cameras = (0..n).map(placed).collect();
@@ -284,14 +284,14 @@ pub(super) fn walking(stored: &Stored<'_>, most: usize, progress: &mut Progress<
     // One device, one lens: its frames share it.
     let options = Options { walking: Some(most), ..Options::default() };
     let solution = sfm::solve(stored, &options, progress)?;
-    let mut cameras: Vec<Result<Stand, String>> =
+    let mut cameras: Vec<Result<SolvedCamera, String>> =
         stored.pictures.iter().map(|_| Err("no frame was placed".into())).collect();
     for taken in &solution.taken {
         let Ok(placed) = &taken.placed else { continue };
         let shots = stored.pictures[taken.camera].shots.len();
         let fresh = || {
             let (intrinsics, lens) = optics(stored, taken.camera, &placed.lens);
-            Stand { poses: vec![None; shots], fixed: false, intrinsics, lens, sightings: 0, error: placed.error }
+            SolvedCamera { poses: vec![None; shots], fixed: false, intrinsics, lens, sightings: 0, error: placed.error }
         };
         if cameras[taken.camera].is_err() {
             cameras[taken.camera] = Ok(fresh());
@@ -349,7 +349,7 @@ impl Solved {
     }
 }
 
-impl Stand {
+impl SolvedCamera {
     /// As written.
     pub(super) fn written(&self, pictures: &Pictures, offset: Offset, masks: Option<Masks>) -> Placed {
         let poses = match &self.poses[..] {

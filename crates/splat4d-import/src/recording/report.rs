@@ -1,6 +1,6 @@
 //! Results and their accuracy.
 
-use super::poses::Stand;
+use super::poses::SolvedCamera;
 use super::spacing::Gap;
 use crate::Result;
 use crate::sync::graph::Offset;
@@ -68,7 +68,7 @@ pub struct CameraReport {
 }
 
 impl CameraReport {
-    pub(super) fn of(pictures: &Pictures, placed: &Result<Stand, String>, offset: Option<&Offset>) -> Self {
+    pub(super) fn of(pictures: &Pictures, placed: &Result<SolvedCamera, String>, offset: Option<&Offset>) -> Self {
         let stand = placed.as_ref().ok();
         Self {
             name: pictures.name.clone(),

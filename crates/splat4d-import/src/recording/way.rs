@@ -183,7 +183,7 @@ impl Source<'_> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::poses::Stand;
+    use super::super::poses::SolvedCamera;
     use super::*;
     use splat4d::math::Se3;
     use splat4d::scene::{Intrinsics, Lens};
@@ -210,7 +210,14 @@ mod tests {
         let stand = |c: usize| {
             let pose = Se3::look_at(place(c), [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]);
             let intrinsics = Intrinsics { fx: 500.0, fy: 500.0, cx: 320.0, cy: 240.0 };
-            Stand { poses: vec![Some(pose)], fixed: true, intrinsics, lens: Lens::Pinhole, sightings: 100, error: 0.3 }
+            SolvedCamera {
+                poses: vec![Some(pose)],
+                fixed: true,
+                intrinsics,
+                lens: Lens::Pinhole,
+                sightings: 100,
+                error: 0.3,
+            }
         };
         let offsets = heard
             .offsets

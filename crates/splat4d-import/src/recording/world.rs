@@ -13,7 +13,7 @@ use splat4d_train::event::Progress;
 /// Upwards is an axis of a calibrated world where that is so near (cosine of 15 degrees): people calibrate on floors.
 const ALONG_AXIS: f64 = 0.966;
 /// Degrees between the up direction of floor and walls and that of the cameras from which on it is reported.
-const TOLD: f64 = 1.0;
+const REPORTED: f64 = 1.0;
 
 /// Source of the world's axes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -65,7 +65,7 @@ pub(super) fn settle(
         let turned = turn(solved, held, false);
         let off = dot(turned.rotation[2], held).clamp(-1.0, 1.0).acos().to_degrees();
         report.guesses.push(match (turned.upright, turned.along) {
-            (true, _) if off > TOLD => format!(
+            (true, _) if off > REPORTED => format!(
                 "Upwards (+z) and the other axes are those of floor and walls; cameras were held {off:.0} degrees off."
             ),
             (true, _) => "Upwards (+z) and the other axes are those of floor and walls.".into(),

@@ -71,7 +71,7 @@ const GROWTH: f64 = 1.08;
 /// Standard deviations: of log f where it is guessed and where it is known; of k1; of the principal point, of the
 /// larger side; of clocks, frames (measured on the hall: 6 pixels of 640, 2 frames).
 const GUESSED: f64 = 0.3;
-const TOLD: f64 = 0.1;
+const GIVEN: f64 = 0.1;
 const CLOCK: f64 = 2.0;
 /// Epipolar distance of matches that are searched for once cameras are placed, of the tolerance.
 const GUIDED_WITHIN: f64 = 0.5;
@@ -421,7 +421,7 @@ impl Map<'_> {
             exact: lens_back.iter().map(|&l| self.exact[l]).collect(),
             priors: Priors {
                 lenses: lens_back.iter().map(|&l| self.guesses[l]).collect(),
-                focal: if told { TOLD } else { GUESSED },
+                focal: if told { GIVEN } else { GUESSED },
                 family: match family {
                     true if self.strangers => STRANGERS,
                     true => FAMILY,
@@ -599,7 +599,7 @@ impl Map<'_> {
     }
 
     /// A placed camera without distortion, and where it saw its features by the clock that all share.
-    fn stands(&self, sight: usize) -> Option<tracks::Known> {
+    fn undistorted(&self, sight: usize) -> Option<tracks::Known> {
         let [w, h] = self.sights[sight].size;
         let camera = self.lens(sight).pinhole(self.poses[sight]?, w, h);
         let straight = |f: &Feature| {
@@ -611,7 +611,7 @@ impl Map<'_> {
     /// Matches of placed cameras along epipolar lines, and those of `links` that are on them.
     pub(super) fn guided(&self, links: &[Link], progress: &mut Progress<'_>) -> Vec<Link> {
         let known: Vec<Option<tracks::Known>> =
-            (0..self.sights.len()).into_par_iter().map(|s| self.stands(s)).collect();
+            (0..self.sights.len()).into_par_iter().map(|s| self.undistorted(s)).collect();
         let mut out = tracks::guided(self.sights, &known, GUIDED_WITHIN * self.how.tolerance, progress);
         for link in links {
             let [a, b] = link.sights;
@@ -665,7 +665,7 @@ impl Map<'_> {
             if v.is_empty() { 0.0 } else { *v.select_nth_unstable_by(at, f64::total_cmp).1 }
         };
         let of = |s: usize| match self.poses[s] {
-            Some(pose) => Ok(Stand {
+            Some(pose) => Ok(PlacedCamera {
                 pose,
                 lens: *self.lens(s),
                 tau: self.taus[s],
@@ -696,7 +696,7 @@ impl Map<'_> {
 
 /// A placed camera.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Stand {
+pub(crate) struct PlacedCamera {
     /// Takes world points into the camera's axes.
     pub pose: Se3,
     /// Of images of the sight's size.
@@ -728,7 +728,7 @@ pub(crate) struct MapPoint {
 #[derive(Clone, Debug)]
 pub(crate) struct Mapped {
     /// One for each sight.
-    pub cameras: Vec<Result<Stand, String>>,
+    pub cameras: Vec<Result<PlacedCamera, String>>,
     /// In the order of tracks.
     pub points: Vec<MapPoint>,
     /// Of cameras whose poses were given; see [`super::Solution::contradiction`].

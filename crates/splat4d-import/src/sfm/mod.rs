@@ -27,7 +27,7 @@ use splat4d_train::event::Progress;
 use tracks::Pairing;
 
 /// A camera, and the frame of a moving one.
-type Who = (usize, Option<usize>);
+type CameraFrame = (usize, Option<usize>);
 
 /// How poses are found.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -113,7 +113,7 @@ pub struct Solution {
 ///
 /// Errors: images that cannot be read; no two that show one scene.
 pub fn solve(pictures: &dyn Pictures, options: &Options, progress: &mut Progress<'_>) -> Result<Solution> {
-    let (who, sights, pairing): (Vec<Who>, Vec<CameraView>, Pairing) = match options.walking {
+    let (who, sights, pairing): (Vec<CameraFrame>, Vec<CameraView>, Pairing) = match options.walking {
         None => {
             let sights = pictures::fixed(pictures, &options.look, progress)?;
             ((0..sights.len()).map(|c| (c, None)).collect(), sights, Pairing::All)
@@ -134,7 +134,7 @@ const ALL_UP_TO: usize = 50;
 const WALK: Pairing = Pairing::Sequence { near: 10, every: 6 };
 
 fn solve_sights(
-    who: &[Who],
+    who: &[CameraFrame],
     sights: &[CameraView],
     pairing: Pairing,
     options: &Options,
@@ -161,7 +161,7 @@ fn solve_sights(
 }
 
 /// The solution whose unit is the median distance of cameras from what they see.
-fn in_units(who: &[Who], sights: &[CameraView], mapped: mapper::Mapped, pairs: usize) -> Solution {
+fn in_units(who: &[CameraFrame], sights: &[CameraView], mapped: mapper::Mapped, pairs: usize) -> Solution {
     let mut distances = vec![Vec::new(); sights.len()];
     for p in &mapped.points {
         for &s in &p.seen {
@@ -175,8 +175,8 @@ fn in_units(who: &[Who], sights: &[CameraView], mapped: mapper::Mapped, pairs: u
 }
 
 /// The solution in a unit of this many of the map's.
-fn solution(who: &[Who], sights: &[CameraView], mapped: mapper::Mapped, pairs: usize, scale: f64) -> Solution {
-    let placed = |(camera, sight): (&Result<mapper::Stand, String>, &CameraView)| {
+fn solution(who: &[CameraFrame], sights: &[CameraView], mapped: mapper::Mapped, pairs: usize, scale: f64) -> Solution {
+    let placed = |(camera, sight): (&Result<mapper::PlacedCamera, String>, &CameraView)| {
         camera.as_ref().map_err(Clone::clone).map(|c| Placed {
             pose: Se3 { rotation: c.pose.rotation, translation: c.pose.translation.map(|t| t * scale) },
             lens: c.lens.scaled(sight.factor),

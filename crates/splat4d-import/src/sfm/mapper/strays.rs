@@ -10,7 +10,7 @@ impl Map<'_> {
     /// moves.
     pub(super) fn agreement(&self, links: &[Link]) -> Vec<[[usize; 2]; 2]> {
         let known: Vec<Option<tracks::Known>> =
-            (0..self.sights.len()).into_par_iter().map(|s| self.stands(s)).collect();
+            (0..self.sights.len()).into_par_iter().map(|s| self.undistorted(s)).collect();
         let mut out = vec![[[0; 2]; 2]; self.sights.len()];
         for link in links {
             let [a, b] = link.sights;
