@@ -286,12 +286,12 @@ pub fn bake_into(source: &Source, title: &str, out: &Path, baking: &Baking, cons
         "palette_bytes": summary.palette_bytes, "poster_bytes": summary.poster_bytes, "baking": report,
         "likeness": likeness, "needs": needs, "quantisation": quantised,
     });
-    say(report, likeness.as_ref(), summary.bytes, seconds, console);
+    print_summary(report, likeness.as_ref(), summary.bytes, seconds, console);
     if report.primitives == 0 {
         console.warn("no Gaussian of the scene is visible at any time of the clip: the file renders as background.");
     }
     if let (Some(needs), Some(l)) = (needs, &likeness) {
-        console.say(&needs.in_words(l.psnr, summary.bytes));
+        console.result(&needs.in_words(l.psnr, summary.bytes));
     }
     if antialias {
         console.warn(
@@ -392,7 +392,13 @@ pub fn bake_like(source: &Source, title: &str, baking: &Baking, console: &dyn Li
     Ok(best.expect("one file was packed"))
 }
 
-fn say(report: &bake::Report, likeness: Option<&bake::Likeness>, bytes: u64, seconds: f64, console: &dyn Listener) {
+fn print_summary(
+    report: &bake::Report,
+    likeness: Option<&bake::Likeness>,
+    bytes: u64,
+    seconds: f64,
+    console: &dyn Listener,
+) {
     let mut words = format!(
         "{} Gaussians became {} primitives in {} time segments, {} in {seconds:.1} s",
         grouped(report.gaussians),
@@ -409,17 +415,17 @@ fn say(report: &bake::Report, likeness: Option<&bake::Likeness>, bytes: u64, sec
             words += &format!("; {} {what}", grouped(count));
         }
     }
-    console.say(&words);
+    console.result(&words);
     let e = &report.errors;
     if e.worst > 0.0 {
         let tolerance = report.tolerance.map(|t| format!(" (tolerance {t:.3} px)")).unwrap_or_default();
-        console.say(&format!(
+        console.result(&format!(
             "error per Gaussian: median {:.3} px, 99 of 100 below {:.3} px, worst {:.3} px{tolerance}",
             e.median, e.p99, e.worst
         ));
     }
     if let Some(l) = likeness {
-        console.say(&format!(
+        console.result(&format!(
             "the file against its model: {:.2} dB over {} renders, {:.2} dB in the worst ({:.2} s)",
             l.psnr, l.pictures, l.worst_psnr, l.worst_time
         ));
@@ -437,7 +443,7 @@ fn compare(
     console: &dyn Listener,
 ) -> Result<Option<bake::Likeness>> {
     if deadline.left() <= 0.0 {
-        console.say("the file is not compared with its model: no time is left of option `minutes`");
+        console.result("the file is not compared with its model: no time is left of option `minutes`");
         return Ok(None);
     }
     likeness(scene, &playback::read(bytes)?, &shots(scene, stage, views), antialias, &mut |done, total| {

@@ -56,7 +56,7 @@ pub fn compare(runs: &[PathBuf], outputs: &[PathBuf], console: &dyn Listener) ->
         console.warn(&format!("{difference}: their scores cannot be compared."));
     }
     let (head, rows) = comparing::table(&entries);
-    text(&head, &rows).iter().for_each(|line| console.say(line));
+    text(&head, &rows).iter().for_each(|line| console.result(line));
     console.emit(&objects(&entries));
     for (output, form) in outputs.iter().zip(forms) {
         let bytes = match form {

@@ -247,7 +247,7 @@ impl Work {
             let mut name = source.file_name().unwrap_or(OsStr::new("run")).to_owned();
             name.push("-compressed");
             let dir = run_folder::free_folder(&source.with_file_name(name));
-            console.say(&format!("the result is written to {}", dir.display()));
+            console.result(&format!("the result is written to {}", dir.display()));
             dir
         });
         Self::place(dir, order, options.force)
@@ -343,7 +343,7 @@ impl Work {
         };
         if let (Some(before), Some(after)) = (before, after) {
             let told = self.compare(&source, &original, [&before, &after], stop, recorded)?;
-            say(&told, self.size, console);
+            print_summary(&told, self.size, console);
             let text = serde_json::to_string_pretty(&told).expect("results are plain data");
             files::write(&self.dir.join(COMPRESS), text.as_bytes())?;
             evaluating::amend(&self.dir, [("notes".into(), json!(recorded.warnings()))])?;
@@ -429,7 +429,7 @@ impl Work {
         };
         let folder = self.dir.join(UNPRUNED);
         files::make_folder(&folder)?;
-        console.say("training the unpruned scene for as many more steps, to compare");
+        console.result("training the unpruned scene for as many more steps, to compare");
         let job = original.job(&settings);
         let options = TrainOptions { device: self.device, ..TrainOptions::default() };
         let done = compress::compress(&job, &folder, &options, stop, &mut |event| {
@@ -468,7 +468,7 @@ impl Work {
         )?;
         console.clear();
         let last = trials.iter().rev().find(|t| t.prune == chosen.prune).expect("the chosen one was tried");
-        console.say(&format!(
+        console.result(&format!(
             "to fit into {}, {:.0} % of the Gaussians are pruned ({} before fine-tuning)",
             files::human_bytes(most),
             100.0 * chosen.prune,
@@ -547,7 +547,7 @@ impl Work {
             }
             return Ok(false);
         }
-        console.say(&format!("repeating with {:.0} % pruned instead of {:.0} %", 100.0 * next, 100.0 * prune));
+        console.result(&format!("repeating with {:.0} % pruned instead of {:.0} %", 100.0 * next, 100.0 * prune));
         self.order.tried.push(Tried { prune, bytes, psnr: is });
         self.order.settings.prune = next;
         self.folder.clear()?;
@@ -609,7 +609,7 @@ fn steps(run: &Run) -> Vec<Step> {
 }
 
 /// Before and after in a few lines.
-fn say(told: &Compressed, size: [usize; 2], console: &dyn Listener) {
+fn print_summary(told: &Compressed, size: [usize; 2], console: &dyn Listener) {
     let fair = told.fair();
     let name = if told.unpruned.is_some() { "unpruned, same additional steps" } else { "before" };
     let line = |name: &str, side: &Side| {
@@ -628,8 +628,8 @@ fn say(told: &Compressed, size: [usize; 2], console: &dyn Listener) {
             size[1],
         )
     };
-    console.say(&line(name, fair));
-    console.say(&line("after", &told.after));
+    console.result(&line(name, fair));
+    console.result(&line("after", &told.after));
     if let Some(times) = told.smaller() {
         let faster = told.after.fps / fair.fps;
         // The alternative comes first: the plain file, and not the floats of the run.
@@ -642,7 +642,7 @@ fn say(told: &Compressed, size: [usize; 2], console: &dyn Listener) {
             true => format!("{times:.1} times smaller than 32-bit floats, "),
             false => plain,
         };
-        console.say(&format!("{smaller}{faster:.2} times as fast"));
+        console.result(&format!("{smaller}{faster:.2} times as fast"));
     }
 }
 

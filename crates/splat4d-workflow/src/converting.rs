@@ -206,7 +206,7 @@ pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> R
     if let Some(degree) = args.sh {
         let had = source.scene.limit_sh(degree.into());
         if had > usize::from(degree) {
-            console.say(&format!("spherical harmonics lowered from degree {had} to {degree}"));
+            console.result(&format!("spherical harmonics lowered from degree {had} to {degree}"));
         }
     }
     let cameras = first_camera(&source);
@@ -256,7 +256,7 @@ pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> R
     let whole = match moment {
         Some(time) => {
             still = one_time(scene, time)?;
-            console.say(&format!("{} of {} Gaussians at {time} s", grouped(still.len()), grouped(scene.len())));
+            console.result(&format!("{} of {} Gaussians at {time} s", grouped(still.len()), grouped(scene.len())));
             &still
         }
         None => scene,
@@ -274,13 +274,13 @@ pub fn write(args: &Conversion, mut source: Source, console: &dyn Listener) -> R
     };
     files::write(&args.output, &bytes)?;
     if let Some(l) = &likeness {
-        console.say(&format!(
+        console.result(&format!(
             "the file against the scene: {:.2} dB over {} renders, {:.2} dB in the worst ({:.2} s)",
             l.psnr, l.pictures, l.worst_psnr, l.worst_time
         ));
     }
     let each = bytes.len() as f64 / whole.len().max(1) as f64;
-    console.say(&format!(
+    console.result(&format!(
         "{}: {} Gaussians, {} ({each:.1} bytes each)",
         target.name(),
         grouped(whole.len()),
@@ -372,7 +372,7 @@ fn write_frames(
     }
     owned.finished();
     console.clear();
-    console.say(&format!(
+    console.result(&format!(
         "{} files{}, {fps} per second, from {} to {} s, {} in total",
         times.len(),
         constant.as_ref().map(|c| format!(" of {} Gaussians each", grouped(c.len()))).unwrap_or_default(),
@@ -408,7 +408,7 @@ fn rotate(scene: &mut Scene<f32>, up: Up, target: Target, console: &dyn Listener
     let axis = |v: [f64; 3]| format!("({:.3} {:.3} {:.3})", v[0], v[1], v[2]);
     let old = axis(scene.up);
     scene.rotate(&r);
-    console.say(&format!("axes turned: up was {old}, is now {}; option `up` keep does not turn them", axis(wanted)));
+    console.result(&format!("axes turned: up was {old}, is now {}; option `up` keep does not turn them", axis(wanted)));
     r
 }
 
@@ -448,7 +448,7 @@ impl Writer {
                 let mut warnings = dialect.write(scene, &self.options, &mut out)?;
                 if !scene.labels.is_empty() {
                     warnings
-                        .say(format!("{} labels are left out: the format does not support them", scene.labels.len()));
+                        .add(format!("{} labels are left out: the format does not support them", scene.labels.len()));
                 }
                 warnings
             }

@@ -59,7 +59,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_part_ends_within_what_is_left() {
+    fn a_part_ends_within_the_remaining_time() {
         let clock = Stopwatch::of(|| 30.0);
         assert_eq!(Deadline::of(clock.clone(), Some(1.0)).part(0.2).left(), 6.0);
         assert_eq!(Deadline::of(clock.clone(), Some(0.25)).part(0.2).left(), 0.0, "it is over");

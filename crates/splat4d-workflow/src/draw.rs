@@ -9,7 +9,7 @@ use splat4d::device;
 use splat4d::flow;
 use splat4d::layers::{ALWAYS, Evaluation, Head, Scene};
 use splat4d::play::Player;
-use splat4d::render::{Antialias, Backend, Image, RenderConfig, Shot, Wanted};
+use splat4d::render::{Abilities, Antialias, Backend, Image, RenderConfig, Shot};
 use splat4d::scene::{Camera, Planes, Time};
 use splat4d::{Error, Result};
 use splat4d_train::labels::best;
@@ -166,7 +166,7 @@ pub struct Painter<'a> {
     depth: bool,
     backend: Box<dyn Backend>,
     /// Abilities that the scene needs of a device.
-    wanted: Wanted,
+    abilities: Abilities,
     listener: Option<&'a dyn Listener>,
     /// The last image.
     pub image: Image<f32>,
@@ -184,14 +184,14 @@ impl<'a> Painter<'a> {
     pub fn new(scene: &'a Scene<f32>, background: [f32; 3], antialias: bool, depth: bool) -> Self {
         let config = RenderConfig { antialias: self::antialias(antialias), ..RenderConfig::default() };
         let (player, backend, image) = (Player::of_scene(scene), device::cpu(config), Image::default());
-        let wanted = Wanted { head: scene.head != Head::Identity, ..Wanted::default() };
+        let abilities = Abilities { head: scene.head != Head::Identity, ..Abilities::default() };
         Self {
             player,
             scene,
             background,
             depth,
             backend,
-            wanted,
+            abilities,
             listener: None,
             image,
             bytes: Vec::new(),
@@ -213,7 +213,7 @@ impl<'a> Painter<'a> {
     ) -> Result<Self> {
         self.channel = channel;
         self.depth |= channel == Channel::Depth;
-        self.wanted.extra = channel.is_field();
+        self.abilities.extra = channel.is_field();
         match channel {
             Channel::Label if self.scene.labels.is_empty() => {
                 return Err(Error::input("the scene has no labels")
@@ -246,10 +246,10 @@ impl<'a> Painter<'a> {
     /// later is reported to `listener`.
     pub fn on(
         mut self,
-        open: impl FnOnce(RenderConfig, &Wanted) -> Box<dyn Backend>,
+        open: impl FnOnce(RenderConfig, &Abilities) -> Box<dyn Backend>,
         listener: &'a dyn Listener,
     ) -> Self {
-        self.backend = open(*self.backend.config(), &self.wanted);
+        self.backend = open(*self.backend.config(), &self.abilities);
         self.listener = Some(listener);
         self
     }

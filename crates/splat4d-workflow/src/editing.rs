@@ -108,12 +108,17 @@ pub fn edit(options: &EditOptions, console: &dyn Listener) -> Result<()> {
     })?;
     console.clear();
     for step in &done {
-        console.say(&format!("{}: {} Gaussians", step.step, grouped(step.selected)));
+        console.result(&format!("{}: {} Gaussians", step.step, grouped(step.selected)));
     }
     if let Some(text) = &options.count {
-        return say_count(text, &scene, &bring, console);
+        return print_count(text, &scene, &bring, console);
     }
-    console.say(&format!("{} Gaussians of {} in {} layers", grouped(scene.len()), grouped(before), scene.layers.len()));
+    console.result(&format!(
+        "{} Gaussians of {} in {} layers",
+        grouped(scene.len()),
+        grouped(before),
+        scene.layers.len()
+    ));
     console.emit(&json!({"type": "edited", "before": before, "gaussians": scene.len(), "layers": scene.layers.len(),
         "steps": done}));
     source.scene = scene;
@@ -130,15 +135,15 @@ pub fn edit(options: &EditOptions, console: &dyn Listener) -> Result<()> {
 }
 
 /// Reports how many Gaussians a selection holds, and how many of them are visible when.
-fn say_count(text: &str, scene: &Scene<f32>, context: &dyn Context, console: &dyn Listener) -> Result<()> {
+fn print_count(text: &str, scene: &Scene<f32>, context: &dyn Context, console: &dyn Listener) -> Result<()> {
     let [start, end] = scene.clip;
     let mut times: Vec<f64> = (0..MOMENTS).map(|i| start + (end - start) * i as f64 / (MOMENTS - 1) as f64).collect();
     times.dedup();
     let (all, seen) = count(&Expr::parse(text)?, scene, &times, context)?;
     console.clear();
-    console.say(&format!("{text}: {} of {} Gaussians", grouped(all), grouped(scene.len())));
+    console.result(&format!("{text}: {} of {} Gaussians", grouped(all), grouped(scene.len())));
     for (t, n) in times.iter().zip(&seen) {
-        console.say(&format!("{t:>9.3} s  {} visible", grouped(*n)));
+        console.result(&format!("{t:>9.3} s  {} visible", grouped(*n)));
     }
     console.emit(&json!({"type": "count", "selection": text, "gaussians": all, "of": scene.len(),
         "seen": times.iter().zip(&seen).map(|(t, n)| json!([t, n])).collect::<Vec<_>>()}));
@@ -244,7 +249,7 @@ impl Context for Bring<'_> {
         let Proposal { selected, pictures, before, after } = found;
         self.console.clear();
         let count = selected.iter().flatten().filter(|f| **f).count();
-        self.console.say(&format!(
+        self.console.result(&format!(
             "floaters: {} of {} Gaussians; {pictures} held-out images: {before:.2} dB with them, {after:.2} dB without",
             grouped(count),
             grouped(scene.len())

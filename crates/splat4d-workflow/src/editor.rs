@@ -94,7 +94,7 @@ struct Pulled {
 /// Requests of a page.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(tag = "do", rename_all = "kebab-case", deny_unknown_fields)]
-enum Ask {
+enum PageRequest {
     /// The state and the current list; `kept`: the list that the page has instead.
     Open { kept: Option<Vec<Step>> },
     /// The edited scene as an image.
@@ -176,7 +176,7 @@ impl Editor {
         }
         let (scene, done) = self.replayed(&self.listed.steps)?;
         for step in &done {
-            console.say(&format!("{}: {} Gaussians", step.step, files::grouped(step.selected)));
+            console.result(&format!("{}: {} Gaussians", step.step, files::grouped(step.selected)));
         }
         self.bake(&scene, console).map(Some)
     }
@@ -185,19 +185,19 @@ impl Editor {
     ///
     /// Errors: what is no query, and those of its work; nothing is changed then.
     pub fn answer(&self, asked: Value) -> Result<EditResponse> {
-        let ask: Ask = serde_json::from_value(asked)
+        let ask: PageRequest = serde_json::from_value(asked)
             .map_err(|e| Error::input(format!("unknown request of the page: {e}")).remedy("Reload the page"))?;
         let told = |told: Value| Ok(EditResponse { told, scene: None });
         match ask {
-            Ask::Open { kept } => told(self.open(kept)),
-            Ask::Show { steps, view, t } => {
+            PageRequest::Open { kept } => told(self.open(kept)),
+            PageRequest::Show { steps, view, t } => {
                 let camera = view.camera()?;
                 let (scene, done) = self.replayed(&steps)?;
                 let mut image = Image::default();
                 draw(&scene, &camera, t, false, &mut image)?;
                 told(json!({ "done": done, "gaussians": scene.len(), "picture": jpeg(&image)? }))
             }
-            Ask::Bake { steps } => {
+            PageRequest::Bake { steps } => {
                 let number = self.bakings.fetch_add(1, Ordering::SeqCst) + 1;
                 let (scene, _) = self.replayed(&steps)?;
                 let bytes = self.bake(&scene, &ignore)?;
@@ -208,13 +208,13 @@ impl Editor {
                 }
                 Ok(EditResponse { told: json!({ "stale": !newest }), scene: newest.then(|| bytes.into()) })
             }
-            Ask::Save { steps } => self.save(steps).and_then(told),
-            Ask::Select { steps, select, t } => {
+            PageRequest::Save { steps } => self.save(steps).and_then(told),
+            PageRequest::Select { steps, select, t } => {
                 let (scene, _) = self.replayed(&steps)?;
                 let selected = self.select(&select, &scene)?;
                 told(held(&select, &scene, &selected, t))
             }
-            Ask::Pick { steps, shape, corners, view, t, through, now } => {
+            PageRequest::Pick { steps, shape, corners, view, t, through, now } => {
                 let (scene, _) = self.replayed(&steps)?;
                 let drawn = Drawn { shape, corners: &corners, through };
                 let words = drawn.words(&scene, &view.small()?, t)?;
@@ -222,7 +222,7 @@ impl Editor {
                 let selected = self.select(&select, &scene)?;
                 told(held(&select, &scene, &selected, t))
             }
-            Ask::Floaters { steps, strength, t } => {
+            PageRequest::Floaters { steps, strength, t } => {
                 let (scene, _) = self.replayed(&steps)?;
                 let found = Bring::new(&self.source, Some(self.file.as_path()), &ignore)?.propose(&scene, strength)?;
                 let mut value = held("", &scene, &found.selected, t);
@@ -230,8 +230,12 @@ impl Editor {
                 value["pictures"] = json!(found.pictures);
                 told(value)
             }
-            Ask::Bend { steps, select, at, t, nodes } => self.bend(&steps, &select, [at, t], nodes).and_then(told),
-            Ask::Pull { number, handles, pins, view } => self.pull(number, handles, &pins, &view).and_then(told),
+            PageRequest::Bend { steps, select, at, t, nodes } => {
+                self.bend(&steps, &select, [at, t], nodes).and_then(told)
+            }
+            PageRequest::Pull { number, handles, pins, view } => {
+                self.pull(number, handles, &pins, &view).and_then(told)
+            }
         }
     }
 

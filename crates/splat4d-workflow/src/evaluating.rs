@@ -331,7 +331,7 @@ pub fn scores_on(
         let capture = Arc::new(Capture { background, ..capture.clone() });
         let place = (!judged).then_some(place);
         let scores = measuring.evaluate(&scene, &capture, measured, place, console)?;
-        say_split(&scores, measured, name, console);
+        print_split(&scores, measured, name, console);
     }
     Ok(())
 }
@@ -347,14 +347,14 @@ pub(crate) fn on_backgrounds<'a>(
     }
 }
 
-pub(crate) fn say_split(scores: &Scores, measured: Measured, background: &str, console: &dyn Listener) {
+pub(crate) fn print_split(scores: &Scores, measured: Measured, background: &str, console: &dyn Listener) {
     let on = if background.is_empty() { String::new() } else { format!(" on {background}") };
     let views = match measured {
         Measured::Test => "held-out views",
         Measured::Validation => "validation views",
         Measured::Train => "training views",
     };
-    console.say(&format!("{views}{on}: {}", in_words(|key| scores.held(key))));
+    console.result(&format!("{views}{on}: {}", in_words(|key| scores.held(key))));
     let entry = &scores.report.results()[scores.report.method()];
     console.emit(&json!({
         "type": "results", "iteration": scores.report.iteration, "conditions": scores.report.conditions, "results": entry,
@@ -386,7 +386,7 @@ pub fn trajectory(run: &Path, truth: &Path, console: &dyn Listener) -> Result<()
     if let Some([middle, most]) = found.clock_errors() {
         let _ = write!(words, "; time offsets wrong by {:.2} ms (median), {:.2} ms at most", 1e3 * middle, 1e3 * most);
     }
-    console.say(&words);
+    console.result(&words);
     console.emit(&json!({"type": "trajectory", "results": found.report()}));
     Ok(())
 }
@@ -447,7 +447,7 @@ fn lives(scene: &Scene<f32>) -> [usize; LIFE_BINS] {
 /// Measures tracks in space if the capture contains true ones.
 fn tracks(run: &Path, scene: &Scene<f32>, capture: &Capture, console: &dyn Listener) -> Result<()> {
     let Some(e) = track_error(scene, capture)? else { return Ok(()) };
-    console.say(&format!(
+    console.result(&format!(
         "tracks of {} points in space: median error {:.4} units, {:.2} % of a character's height ({:.1} % of the \
          times tracked); nearest Gaussian at {:.4} units, {:.4} in the first frame",
         e.points,
@@ -474,7 +474,7 @@ fn tracks(run: &Path, scene: &Scene<f32>, capture: &Capture, console: &dyn Liste
     if let Some(slope) = e.slope {
         let _ = write!(words, ", drift slope {slope:.2}");
     }
-    console.say(&words);
+    console.result(&words);
     if let Some(p) = &e.pictures {
         let mut words = format!(
             "in {} views: median error {:.2} px, {} % within 1, 2, 4, 8, 16 px (mean {:.1} %)",
@@ -489,7 +489,7 @@ fn tracks(run: &Path, scene: &Scene<f32>, capture: &Capture, console: &dyn Liste
         if let Some(right) = p.visibility {
             let _ = write!(words, ", visibility correct for {:.1} %", 100.0 * right);
         }
-        console.say(&words);
+        console.result(&words);
     }
     let pictures = e.pictures.as_ref().map(|p| {
         json!({
@@ -526,7 +526,7 @@ fn flow(run: &Path, scene: &Scene<f32>, capture: &Capture, recipe: &Recipe, cons
     if let (Some(moving), Some(length)) = (e.moving, e.length) {
         let _ = write!(words, "; in dynamic regions {moving:.3} px of {length:.2}");
     }
-    console.say(&words);
+    console.result(&words);
     let entry = json!({
         "pictures": e.pictures, "held": e.held, "mean": e.mean, "median": e.median, "moving": e.moving,
         "length": e.length, "within_px": e.within, "drawn": e.drawn,
@@ -537,7 +537,7 @@ fn flow(run: &Path, scene: &Scene<f32>, capture: &Capture, recipe: &Recipe, cons
 /// The report, and the scores on the console.
 pub fn write_report(run: &Path, console: &dyn Listener) -> Result<()> {
     write_page(run, console)?;
-    say_scores(&Run::open(run)?, console);
+    print_scores(&Run::open(run)?, console);
     Ok(())
 }
 
@@ -571,21 +571,21 @@ fn in_words(score: impl Fn(&str) -> Option<f64>) -> String {
 }
 
 /// Reports how far training moved the cameras, naming the one that moved most.
-pub fn say_refined(run: &Path, console: &dyn Listener) -> Result<()> {
+pub fn print_refined(run: &Path, console: &dyn Listener) -> Result<()> {
     if let Some(words) = corrected::read(run)?.and_then(|refined| refined_in_words(&refined)) {
-        console.say(&words);
+        console.result(&words);
     }
     Ok(())
 }
 
 /// The scores in one line.
-fn say_scores(run: &Run, console: &dyn Listener) {
+fn print_scores(run: &Run, console: &dyn Listener) {
     let words = in_words(|key| run.score(key));
     if !words.is_empty() {
-        console.say(&format!("held-out views: {words}"));
+        console.result(&format!("held-out views: {words}"));
     }
     if let (Some(ours), Some(still)) = (run.score("PSNR-dynamic"), run.baseline("PSNR-dynamic")) {
-        console.say(&format!("dynamic regions: {:+.2} dB over a static scene ({still:.2} dB)", ours - still));
+        console.result(&format!("dynamic regions: {:+.2} dB over a static scene ({still:.2} dB)", ours - still));
     }
     if let Some(results) = &run.results {
         let still = run.all_results.get(EvalOptions::STILL);

@@ -81,7 +81,7 @@ impl dyn Listener + '_ {
         self.on_event(&Event::PhaseEnded);
     }
 
-    pub(crate) fn say(&self, text: &str) {
+    pub(crate) fn result(&self, text: &str) {
         self.on_event(&Event::Result(text));
     }
 
@@ -220,7 +220,7 @@ mod tests {
         let recorded = Recorded::new(&count);
         let listener: &dyn Listener = &recorded;
         listener.event(&Training::Warning { message: "one".into() });
-        listener.say("no warning");
+        listener.result("no warning");
         assert_eq!((recorded.warnings(), *passed.borrow()), (vec!["one".to_owned()], 2));
     }
 
@@ -231,7 +231,7 @@ mod tests {
         let listener: &dyn Listener = &listen;
         listener.phase("baking", 1, 2);
         listener.warn("too dark");
-        (&ignore as &dyn Listener).say("nobody hears it");
+        (&ignore as &dyn Listener).result("nobody hears it");
         assert_eq!(*seen.borrow(), ["Phase { name: \"baking\", done: 1, total: 2 }", "Warning(\"too dark\")"]);
     }
 }

@@ -93,7 +93,7 @@ pub fn frames(
     owned.finished();
     listener.clear();
     let (from, to) = (times[0], times[times.len() - 1]);
-    listener.say(&format!("{} files, {fps} per second, from {from} to {to} s", times.len()));
+    listener.result(&format!("{} files, {fps} per second, from {from} to {to} s", times.len()));
     listener.written(folder);
     Ok(times.len())
 }
@@ -133,7 +133,7 @@ pub fn points(source: &Source, points: &Path, frames: &Frames, out: &Path, liste
         ));
     }
     files::write(out, if json { result.to_json() } else { result.to_csv() }.as_bytes())?;
-    listener.say(&format!("{} points at {} times", files::grouped(result.len()), times.len()));
+    listener.result(&format!("{} points at {} times", files::grouped(result.len()), times.len()));
     listener.emit(&json!({
         "type": "exported", "points": result.len(), "moments": times.len(), "missing": result.missing(),
     }));
@@ -174,7 +174,7 @@ pub fn tracks(scene: &Scene<f32>, options: &TrackOptions, out: &Path, listener: 
     let offset = if options.world { scene.offset } else { [0.0; 3] };
     let text = if json { followed.to_json(scene, offset) } else { followed.to_csv(scene, offset) };
     files::write(out, text.as_bytes())?;
-    listener.say(&format!("{} tracks of {} times", files::grouped(members.len()), times.len()));
+    listener.result(&format!("{} tracks of {} times", files::grouped(members.len()), times.len()));
     listener.emit(&json!({"type": "exported", "tracks": members.len(), "moments": times.len()}));
     listener.written(out);
     Ok(())
@@ -231,10 +231,10 @@ pub fn page(path: &Path, out: &Path, link: Option<&Path>, listener: &dyn Listene
         listener.written(link);
     }
     files::write(out, html.as_bytes())?;
-    listener.say(&format!("a page of {}", files::human_bytes(html.len() as u64)));
+    listener.result(&format!("a page of {}", files::human_bytes(html.len() as u64)));
     listener.written(out);
     if link.is_some() {
-        listener.say("put both on a web server: browsers do not let a page opened from disk read another file");
+        listener.result("put both on a web server: browsers do not let a page opened from disk read another file");
     }
     Ok(())
 }

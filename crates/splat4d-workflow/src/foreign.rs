@@ -144,7 +144,7 @@ fn foreign_scores(
             None => assess(&scene, &capture, &store, 0, &options, stop, &mut listen)?,
         };
         console.clear();
-        say_split(&scores, measured, name, console);
+        print_split(&scores, measured, name, console);
     }
     Ok(())
 }

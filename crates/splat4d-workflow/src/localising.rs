@@ -72,7 +72,7 @@ pub fn localise(
         console.clear();
         let row = row(&located, &name, found.len());
         if located.is_sure() {
-            console.say(&in_words(&located, &name));
+            console.result(&in_words(&located, &name));
             console.emit(&json!({"type": "located", "picture": path.to_string_lossy(), "camera": row}));
             found.push(row);
         } else {

@@ -182,7 +182,7 @@ impl Work {
     fn run(&self, stop: &AtomicBool, console: &dyn Listener) -> Result<()> {
         let folder = self.order.run.join(FOLDER);
         files::make_folder(&folder)?;
-        console.say(&format!(
+        console.result(&format!(
             "{} nodes on {} moving Gaussians, {} frames observed, {} to predict",
             self.observed.paths.nodes(),
             files::grouped(self.moving()),
@@ -255,7 +255,7 @@ impl Work {
         write::all(self, &folder, &told, &forecasts, best, console)?;
         let films = if self.order.film { views.films(self, &folder, best, stop, console)? } else { Vec::new() };
         let page = report::predict::write(&folder, &self.run.name(), &told, &films)?;
-        say(&told, console);
+        print_summary(&told, console);
         console.written(&page);
         Ok(())
     }
@@ -364,11 +364,11 @@ impl Work {
 }
 
 /// The figures in the terminal.
-fn say(told: &Summary, console: &dyn Listener) {
+fn print_summary(told: &Summary, console: &dyn Listener) {
     let number = |x: Option<f64>, digits: usize| x.map_or("–".to_owned(), |x| report::predict::rounded(x, digits));
-    console.say("model          PSNR  dynamic regions     skill over freeze  over velocity");
+    console.result("model          PSNR  dynamic regions     skill over freeze  over velocity");
     for m in told.models.iter().chain(&told.assimilated).chain(&told.oracle) {
-        console.say(&format!(
+        console.result(&format!(
             "{:<13}{:>6}{:>12} dB{:>18}{:>17}   fitted in {}",
             m.name,
             number(m.psnr, 2),

@@ -10,7 +10,7 @@ use splat4d::scene::{Camera, Intrinsics, Lens};
 use splat4d::{Error, Result};
 use splat4d_train::capture::{Capture, Split};
 use splat4d_train::event::Event;
-use splat4d_train::output::{FolderContent, Input, Mixes, OutputFolder, Owner, Request, STATE, Standing};
+use splat4d_train::output::{FolderContent, Input, Mixes, OutputFolder, Owner, OwnerRecord, Request, STATE};
 use splat4d_train::path_text::{in_command, of_text};
 use splat4d_train::recipe::Recipe;
 use splat4d_train::run::chunks::Chunked;
@@ -311,7 +311,7 @@ impl Run {
 
 /// Whether training has taken a folder and written none of a run's files yet.
 fn is_starting(path: &Path) -> bool {
-    let trains = |who: Option<Standing>| who.is_some_and(|who| who.command.starts_with(TRAIN));
+    let trains = |who: Option<OwnerRecord>| who.is_some_and(|who| who.command.starts_with(TRAIN));
     path.join(STATE).is_dir() && (RunRequest::unbegun(path).is_some() || Owner::holder(path).is_some_and(trains))
 }
 
@@ -472,7 +472,7 @@ impl RunRequest {
 
     /// Of a run that ended before its first checkpoint, so that there is nothing else to continue from.
     pub fn unbegun(run: &Path) -> Option<Self> {
-        let text = checkpoint::list(run).is_empty().then(|| OutputFolder::asked(run))??;
+        let text = checkpoint::list(run).is_empty().then(|| OutputFolder::unfinished_request(run))??;
         serde_json::from_str(&text).ok()
     }
 

@@ -120,7 +120,7 @@ impl Source {
         };
         let mut source = opened.map_err(|e| e.at(path.display()))?;
         if let Some(network) = bundle::network_of(path).filter(|_| source.ply.is_some()) {
-            source.warnings.say(format!(
+            source.warnings.add(format!(
                 "{} belongs to these Gaussians: a network that splat4d does not read moves or generates them, so this is not \
                  the scene as trained. Export it as a sequence of .ply files",
                 network.display()
@@ -134,7 +134,7 @@ impl Source {
     pub fn finite(mut self) -> Self {
         let unread = self.ply.as_ref().map_or(&[][..], |ply| &ply.extra_properties);
         if !unread.is_empty() {
-            self.warnings.say(format!("properties of the .ply that are not read: {}", unread.join(", ")));
+            self.warnings.add(format!("properties of the .ply that are not read: {}", unread.join(", ")));
         }
         let all = self.scene.len();
         let dropped = self.scene.drop_non_finite();
@@ -196,13 +196,13 @@ fn open_sequence(path: &Path, fps: f64) -> Result<Source> {
     // Frames far from the origin may each have an offset: that of the first is the scene's.
     let mut offset = None;
     if let Some(newest) = &found.snapshots {
-        warnings.say(format!(
+        warnings.add(format!(
             "the numbers of these files are steps of a training rather than frames: if so, give the newest, {}",
             newest.display()
         ));
     }
     if let Some(missing) = &found.missing {
-        warnings.say(format!("frames are missing: {missing}. The scene is empty at their times"));
+        warnings.add(format!("frames are missing: {missing}. The scene is empty at their times"));
     }
     for file in &found.files {
         let bytes = files::read(file)?;

@@ -33,7 +33,7 @@ pub fn baseline(
     let cached = Run::is_finished(&folder)
         && Run::open(&folder).and_then(|b| b.recipe()).is_ok_and(|b| b.resolve() == recipe.resolve());
     if !cached {
-        console.say("training a static scene with the same recipe, to compare");
+        console.result("training a static scene with the same recipe, to compare");
         out.clear_inner(BASELINE)?;
         let (capture, _) = run.open_capture()?;
         files::make_folder(&folder)?;

@@ -260,7 +260,7 @@ impl<'a> Work<'a> {
             };
             let run = folder.as_ref().unwrap_or_else(|shared| shared).path().to_owned();
             describe(&capture, estimate.memory, listener);
-            listener.say(&chunked::in_words(&estimate));
+            listener.result(&chunked::in_words(&estimate));
             self.begun(&capture.name, &run, Some(&capture));
             let begun = Chunked::begin(&capture, &estimate.recipe, &run, &mut |event| listener.event(event))?;
             let chunked = begun.expect("a capture that has a plan is trained by it").paced(estimate.pacing);
@@ -293,7 +293,8 @@ impl<'a> Work<'a> {
         };
         listener.stop_polled(SAVING);
         let trained = if found == FolderContent::Unfinished {
-            listener.say(&format!("{} contains an unfinished run of the same command: it is continued", run.display()));
+            listener
+                .result(&format!("{} contains an unfinished run of the same command: it is continued", run.display()));
             run::resume_with(&run, &training, self.stop, &mut on_event)
         } else {
             // The recipe first: whatever happens from here on, the folder is recognised as a run.
@@ -326,8 +327,8 @@ impl<'a> Work<'a> {
             in_command(run)
         );
         listener.stop_not_polled(&kept);
-        listener.say(&format!("wrote {}", run.join("scene.safetensors").display()));
-        evaluating::say_refined(run, listener)?;
+        listener.result(&format!("wrote {}", run.join("scene.safetensors").display()));
+        evaluating::print_refined(run, listener)?;
         self.follow(run, resumed).map_err(|e| match e.kind() {
             ErrorKind::Interrupted => Error::new(ErrorKind::Interrupted, format!("stopped: {kept}")),
             _ => e,
@@ -400,7 +401,7 @@ impl<'a> Work<'a> {
                 String::new()
             };
             let text = format!("{} exists{hint}: this run is written to {}", wanted.display(), run.display());
-            self.listener.say(&text);
+            self.listener.result(&text);
         }
         asked.begin(&run, options.force, options.command)
     }
@@ -417,7 +418,7 @@ fn extract(source: &Path, stop: &AtomicBool, listener: &dyn Listener) -> Result<
     listener.clear();
     let Some(found) = found else { return Ok(()) };
     found.warnings.iter().for_each(|w| listener.warn(w));
-    listener.say(&format!(
+    listener.result(&format!(
         "frames of {} videos are in {}: {} of {}x{}",
         found.cameras,
         root.join("images").display(),
@@ -452,7 +453,7 @@ fn describe(capture: &Capture, memory: u64, listener: &dyn Listener) {
         Timing::Moment => "at one time".to_owned(),
         _ => format!("over {:.2} s", last - first),
     };
-    listener.say(&format!(
+    listener.result(&format!(
         "{}: {} camera{}, {} images of {}x{} {span}{}",
         capture.name,
         capture.cameras.len(),
