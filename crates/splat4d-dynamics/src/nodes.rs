@@ -56,7 +56,7 @@ struct Snapshot {
     alpha: Vec<f32>,
 }
 
-fn look(scene: &Scene<f32>, t: f64) -> Snapshot {
+fn snapshot(scene: &Scene<f32>, t: f64) -> Snapshot {
     let (mut x, mut alpha) = (Vec::new(), Vec::new());
     for layer in &scene.layers {
         let seen = Evaluation::of_layer(layer, Space::Gaussians, Rows::All, Time(t));
@@ -83,7 +83,7 @@ pub fn observe(scene: &Scene<f32>, ticks: &[f64], count: usize) -> Result<Observ
     if !(1..=MAX_NODES).contains(&count) {
         return Err(Error::input(format!("{count} nodes cannot be")).remedy(format!("Give 1 to {MAX_NODES}")));
     }
-    let last = look(scene, ticks[ticks.len() - 1]);
+    let last = snapshot(scene, ticks[ticks.len() - 1]);
     let (middle, size) = extent(&last);
     let (fast, moving) = moving(scene, ticks, &last, size);
     let near = |x: &[f32; 3]| norm(sub(x.map(f64::from), middle)) <= 2.0 * size;
@@ -116,7 +116,7 @@ pub fn follow(scene: &Scene<f32>, start: &Moment, ticks: &[f64]) -> Vec<Moment> 
     if ticks.len() < 2 {
         return vec![start.clone()];
     }
-    let first = look(scene, ticks[0]);
+    let first = snapshot(scene, ticks[0]);
     let mut fast = moving(scene, ticks, &first, extent(&first).1).0;
     if !fast.contains(&true) {
         // Then all are static together.
@@ -129,9 +129,9 @@ pub fn follow(scene: &Scene<f32>, start: &Moment, ticks: &[f64]) -> Vec<Moment> 
 pub fn follow_among(scene: &Scene<f32>, start: &Moment, ticks: &[f64], among: &[bool]) -> Vec<Moment> {
     let mut out = vec![start.clone()];
     let mut ties: Vec<Option<Tie>> = vec![None; start.len()];
-    let mut before = look(scene, ticks[0]);
+    let mut before = snapshot(scene, ticks[0]);
     for &t in &ticks[1..] {
-        let now = look(scene, t);
+        let now = snapshot(scene, t);
         let old = out.last().expect("it starts with one").clone();
         let moment = old.iter().zip(&mut ties).map(|(pose, tie)| {
             if tie.as_ref().is_none_or(|tie| tie.worn(&now)) {
@@ -230,7 +230,7 @@ fn moving(scene: &Scene<f32>, ticks: &[f64], last: &Snapshot, size: f64) -> (Vec
     let mut bounds = vec![[[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]]; n];
     let mut seen = vec![0u32; n];
     for &t in ticks {
-        let now = look(scene, t);
+        let now = snapshot(scene, t);
         for i in (0..n).filter(|&i| now.alpha[i] >= OPAQUE) {
             seen[i] += 1;
             for c in 0..3 {
