@@ -331,7 +331,7 @@ export class Player extends EventTarget {
         this.#newCanvas();
       }
     }
-    throw new SceneError('This browser cannot render the scene', reasons.join('; '),
+    throw new SceneError('This browser cannot render the scene', [...new Set(reasons)].join('; '),
       'Turn on hardware acceleration in its settings, or open the page in a current Chrome, Edge, Firefox or Safari.');
   }
 

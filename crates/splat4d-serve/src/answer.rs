@@ -6,7 +6,7 @@ use crate::edit::{self, Editing};
 use crate::events::Hub;
 use crate::guard::Guard;
 use crate::photos::{self, Photos};
-use crate::range::{self, Wanted};
+use crate::range::{self, Requested};
 use crate::reply::{text, value, whole, with};
 use crate::scene::{Missing, Scene};
 use hyper::body::{Bytes, Incoming};
@@ -215,20 +215,20 @@ fn scene(shared: &Shared, request: &Parts) -> Response<Body> {
     // date is ever given out, so that a date matches nothing.
     let fresh = headers.get(header::IF_RANGE).is_none_or(|tag| tag.as_bytes() == version.etag.as_bytes());
     let range = headers.get(header::RANGE).filter(|_| fresh && request.method == Method::GET);
-    match range.and_then(|r| r.to_str().ok()).map_or(Wanted::Whole, |r| range::parse(r, version.length)) {
-        Wanted::Whole if request.method == Method::HEAD => {
+    match range.and_then(|r| r.to_str().ok()).map_or(Requested::Whole, |r| range::parse(r, version.length)) {
+        Requested::Whole if request.method == Method::HEAD => {
             let mut response = with(Body::empty(), StatusCode::OK, &common);
             response.headers_mut().insert(header::CONTENT_LENGTH, version.length.into());
             response
         }
-        Wanted::Whole => with(version.body(0, version.length), StatusCode::OK, &common),
-        Wanted::Part { start, end } => {
+        Requested::Whole => with(version.body(0, version.length), StatusCode::OK, &common),
+        Requested::Part { start, end } => {
             let mut response = with(version.body(start, end), StatusCode::PARTIAL_CONTENT, &common);
             let part = format!("bytes {start}-{}/{}", end - 1, version.length);
             response.headers_mut().insert(header::CONTENT_RANGE, value(&part));
             response
         }
-        Wanted::Nothing => {
+        Requested::Nothing => {
             let mut response = text(StatusCode::RANGE_NOT_SATISFIABLE, "the range starts after the end");
             response.headers_mut().insert(header::CONTENT_RANGE, value(&format!("bytes */{}", version.length)));
             response

@@ -46,13 +46,13 @@ pub struct EditResponse {
 }
 
 /// Does what a page requests.
-type Answer = dyn Fn(Value) -> Result<EditResponse> + Send + Sync;
+type Handler = dyn Fn(Value) -> Result<EditResponse> + Send + Sync;
 
 /// Permission for pages with a token to request edits from a program.
 #[derive(Clone)]
 pub struct Editing {
     token: String,
-    answer: Arc<Answer>,
+    answer: Arc<Handler>,
     places: Arc<Semaphore>,
 }
 

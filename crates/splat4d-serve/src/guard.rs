@@ -51,7 +51,7 @@ impl Guard {
         let Some(host) = host.and_then(|h| h.to_str().ok()?.parse::<Authority>().ok()) else {
             return Err(refusal(StatusCode::BAD_REQUEST, "expected one Host header"));
         };
-        if host.as_str().contains('@') || !self.knows(host.host()) {
+        if host.as_str().contains('@') || !self.allows(host.host()) {
             return Err(refusal(
                 StatusCode::FORBIDDEN,
                 "this host name is not served: open the address that splat4d printed, or start it with --host NAME",
@@ -76,7 +76,7 @@ impl Guard {
         Ok(())
     }
 
-    fn knows(&self, host: &str) -> bool {
+    fn allows(&self, host: &str) -> bool {
         let host = host.trim_matches(['[', ']']).to_ascii_lowercase();
         let address = host.parse::<IpAddr>();
         // Any port: a tunnel (ssh -L) may have another one at its end.
