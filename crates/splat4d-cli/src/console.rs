@@ -72,7 +72,7 @@ impl Listener for Console {
         match *event {
             Event::Phase { name, done, total } => self.phase(name, done, total),
             Event::PhaseEnded => self.clear(),
-            Event::Result(text) => self.say(text),
+            Event::Result(text) => self.print_line(text),
             Event::Record(value) => self.emit(value),
             Event::Detail(text) => self.detail(text),
             Event::Warning(text) => self.warn(text),
@@ -114,7 +114,7 @@ impl Console {
     }
 
     /// A result, on stdout; not with `--json`, not when quiet.
-    pub fn say(&self, text: &str) {
+    pub fn print_line(&self, text: &str) {
         if !self.json && self.loudness > Loudness::Quiet {
             self.above_bar(|| print(&stamped(&flags(text))));
         }
@@ -159,13 +159,13 @@ impl Console {
 
     /// A file was written.
     pub fn written(&self, path: &Path) {
-        self.say(&format!("wrote {}", path.display()));
+        self.print_line(&format!("wrote {}", path.display()));
         self.emit(&json!({"type": "written", "path": path.to_string_lossy()}));
     }
 
     /// The next command to type, as the last line of a verb.
     pub(crate) fn next(&self, verb: &str, path: &Path) {
-        self.say(&format!("next: splat4d {verb} {}", in_command(path)));
+        self.print_line(&format!("next: splat4d {verb} {}", in_command(path)));
     }
 
     /// A warning: always printed.
@@ -216,7 +216,7 @@ impl Console {
                 self.clear();
                 let from =
                     if *iteration > 0 { format!("from step {} on, ", grouped(*iteration)) } else { String::new() };
-                self.say(&format!(
+                self.print_line(&format!(
                     "training {from}{} steps, {} Gaussians at the start, about {} of memory, into {}",
                     grouped(*iterations),
                     grouped(*gaussians),
@@ -226,7 +226,7 @@ impl Console {
             }
             Event::Predicted { iterations, gaussians, size: [width, height], seconds, memory_estimate } => {
                 self.clear();
-                self.say(&format!(
+                self.print_line(&format!(
                     "{} steps on images of {width}x{height}, at most {} Gaussians: about {} minutes in total and {} \
                      of memory",
                     grouped(*iterations),
@@ -259,15 +259,15 @@ impl Console {
             }
             Event::Device { why, .. } => {
                 self.clear();
-                self.say(why);
+                self.print_line(why);
             }
             Event::Chosen { motion, why } => {
                 self.clear();
-                self.say(&format!("motion model: {motion}, because {why}"));
+                self.print_line(&format!("motion model: {motion}, because {why}"));
             }
             Event::Counted { gaussians, why } => {
                 self.clear();
-                self.say(&format!("at most {} Gaussians: {why}", grouped(*gaussians)));
+                self.print_line(&format!("at most {} Gaussians: {why}", grouped(*gaussians)));
             }
             Event::Checkpoint { iteration, path } => {
                 self.detail(&format!("checkpoint of step {} in {}", grouped(*iteration), path.display()));
@@ -279,13 +279,13 @@ impl Console {
                     0 => String::new(),
                     m => format!(", {} of memory at most", human_bytes(*m)),
                 };
-                self.say(&format!(
+                self.print_line(&format!(
                     "trained {} steps in {}: {} Gaussians{memory}",
                     grouped(*iteration),
                     human_seconds(*seconds),
                     grouped(*gaussians)
                 ));
-                advice.iter().for_each(|advice| self.say(advice));
+                advice.iter().for_each(|advice| self.print_line(advice));
             }
             _ => {}
         }

@@ -19,7 +19,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 /// How often a waiting program checks for Ctrl-C.
-const LOOK: Duration = Duration::from_millis(50);
+const POLL: Duration = Duration::from_millis(50);
 /// A new image of the scene in training about so often: shorter than a user waits before reloading, longer than a page
 /// needs to update.
 const SNAPSHOT_INTERVAL: Duration = Duration::from_secs(3);
@@ -58,14 +58,14 @@ pub(crate) fn start_for(config: Config, place: &Place, token: Option<&str>, cons
         Server::start(Config { host, port: place.port, player_folder: place.player_folder.clone(), ..config })?;
     // Behind `#` a browser sends nothing to other sites, and linked pages do not see it.
     let url = token.map_or(running.url().to_owned(), |token| format!("{}#{right}={token}", running.url()));
-    console.say(&format!("the player is at {url}"));
+    console.print_line(&format!("the player is at {url}"));
     console.emit(&json!({"type": "serving", "url": url}));
     if !running.address().ip().is_loopback() {
         console.warn("every computer that reaches this machine over the network can view the scene.");
     }
     if !place.no_open && !open_browser(&url) {
         let port = running.address().port();
-        console.say(&format!(
+        console.print_line(&format!(
             "this machine has no screen. On your own computer: ssh -L {port}:localhost:{port} {}, then open \
              http://localhost:{port}/{}",
             machine(),
@@ -78,7 +78,7 @@ pub(crate) fn start_for(config: Config, place: &Place, token: Option<&str>, cons
 /// Waits for Ctrl-C.
 pub(crate) fn wait(stop: &AtomicBool) {
     while !stop.load(Ordering::SeqCst) {
-        std::thread::sleep(LOOK);
+        std::thread::sleep(POLL);
     }
 }
 
@@ -149,7 +149,7 @@ impl Control {
     fn wait(&self) {
         let began = Instant::now();
         while self.is_paused() {
-            std::thread::sleep(LOOK);
+            std::thread::sleep(POLL);
         }
         *self.waited.lock().unwrap_or_else(PoisonError::into_inner) += began.elapsed();
     }
@@ -303,7 +303,7 @@ mod tests {
                 waiting.wait();
                 (clock.seconds() - before, began.elapsed().as_secs_f64())
             });
-            std::thread::sleep(3 * LOOK);
+            std::thread::sleep(3 * POLL);
             assert!(!trainer.is_finished(), "it waits");
             ask(way).unwrap();
             let (counted, passed) = trainer.join().unwrap();

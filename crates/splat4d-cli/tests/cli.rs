@@ -21,7 +21,7 @@ mod predict;
 #[path = "cli/sample.rs"]
 mod sample;
 
-use sample::{Answer, Capture, splat4d};
+use sample::{Capture, Output, splat4d};
 use serde_json::{Value, json};
 use splat4d::format::npy::Npy;
 use splat4d::format::ply;
@@ -39,7 +39,7 @@ const TINY: [&str; 6] = [
     "--seed=3",
 ];
 
-fn train(capture: &Path, run: &Path) -> Answer {
+fn train(capture: &Path, run: &Path) -> Output {
     splat4d(&["train", str(capture), "-o", str(run)]).args(&TINY).run()
 }
 

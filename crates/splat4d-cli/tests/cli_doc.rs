@@ -131,7 +131,7 @@ fn cell(text: &str) -> String {
 }
 
 #[test]
-fn the_reference_is_what_the_command_accepts() {
+fn the_reference_equals_the_options_of_the_command() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs");
     let mut all = splat4d_cli::command();
     all.build();

@@ -156,7 +156,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     let time = args.time.unwrap_or(scene.clip[0]);
     let n = exporting::moment(scene, time, args.world, out)?;
     exporting::warn_of_empty(scene, time, n, console);
-    console.say(&format!("{} Gaussians at {time} s", files::grouped(n)));
+    console.print_line(&format!("{} Gaussians at {time} s", files::grouped(n)));
     console.emit(&json!({"type": "exported", "gaussians": n, "time": time}));
     console.written(out);
     Ok(())

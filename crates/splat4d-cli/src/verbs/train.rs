@@ -217,7 +217,7 @@ pub fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     }
     console.emit(&json!({"type": "done", "run": run.to_string_lossy()}));
     if trained.iteration.is_some() && watched.is_on() && console.terminal() {
-        console.say("the player keeps running until Ctrl-C");
+        console.print_line("the player keeps running until Ctrl-C");
         interrupt::stop_polled("stopping");
         serving::wait(&stop);
     }

@@ -74,7 +74,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     };
     let stop = interrupt::flag("stopping");
     let running = serving::start_for(config, &args.place, token.as_deref(), console)?;
-    console.say("Ctrl-C stops it");
+    console.print_line("Ctrl-C stops it");
     serving::wait(&stop);
     running.stop();
     Ok(())
@@ -93,7 +93,7 @@ fn capture_at(path: &Path) -> splat4d::Result<Option<Capture>> {
 fn of_capture(capture: Capture, console: &Console) -> anyhow::Result<Config> {
     let capture = Arc::new(capture);
     if capture.points.is_none() {
-        console.say("the capture has no points: the page shows its cameras and images");
+        console.print_line("the capture has no points: the page shows its cameras and images");
     }
     let title = capture.name.clone();
     let source = Source::own(capture_page::points(&capture));

@@ -1,6 +1,6 @@
 //! A take in chunks, from the command line: part by part and joined, and what is refused.
 
-use crate::sample::{Answer, Capture, splat4d};
+use crate::sample::{Capture, Output, splat4d};
 use crate::{TINY, json_of, str};
 use std::path::{Path, PathBuf};
 
@@ -12,7 +12,7 @@ fn take(work: &Path) -> PathBuf {
     sample.write()
 }
 
-fn train(capture: &Path, run: &Path, more: &[&str]) -> Answer {
+fn train(capture: &Path, run: &Path, more: &[&str]) -> Output {
     splat4d(&["train", str(capture), "-o", str(run)]).args(&TINY).args(&CHUNKS).args(more).run()
 }
 

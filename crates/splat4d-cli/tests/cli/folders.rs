@@ -118,7 +118,7 @@ fn a_folder_in_use_is_refused_and_read() {
 }
 
 #[test]
-fn no_output_replaces_what_is_read() {
+fn no_output_replaces_an_input() {
     let work = tempfile::tempdir().unwrap();
     let at = |name: &str| work.path().join(name);
     write_ply(&at("a.ply"), 0.0);
@@ -156,7 +156,7 @@ fn no_output_replaces_what_is_read() {
 
 /// A capture whose images, points and a mask are elsewhere: they are as safe as those in its folder.
 #[test]
-fn no_output_replaces_what_a_capture_reads_from_elsewhere() {
+fn no_output_replaces_external_files_of_a_capture() {
     let work = tempfile::tempdir().unwrap();
     let at = |name: &str| work.path().join(name);
     let mut sample = Capture::new(&at("sets"));

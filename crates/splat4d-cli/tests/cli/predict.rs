@@ -1,6 +1,6 @@
 //! `predict` on a tiny run that did not see the end of its take: what it leaves, what it states, what it refuses.
 
-use crate::sample::{Answer, Capture, splat4d};
+use crate::sample::{Capture, Output, splat4d};
 use crate::{TINY, json_of, str};
 use splat4d::format::{playback, scene};
 use std::path::{Path, PathBuf};
@@ -27,7 +27,7 @@ fn seen(work: &Path, share: &str) -> (PathBuf, PathBuf) {
     (capture, run)
 }
 
-fn predict(run: &Path, args: &[&str]) -> Answer {
+fn predict(run: &Path, args: &[&str]) -> Output {
     splat4d(&["predict", str(run), "--steps", "3", "--nodes", "4"]).args(args).run()
 }
 

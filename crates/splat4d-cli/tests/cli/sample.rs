@@ -152,7 +152,7 @@ pub(crate) struct Call {
 }
 
 /// How it went.
-pub(crate) struct Answer {
+pub(crate) struct Output {
     call: String,
     code: Option<i32>,
     stdout: String,
@@ -190,16 +190,16 @@ impl Call {
     }
 
     /// Runs in the current folder.
-    pub(crate) fn run(self) -> Answer {
+    pub(crate) fn run(self) -> Output {
         self.run_in(Path::new("."))
     }
 
     /// Runs in a folder.
-    pub(crate) fn run_in(self, folder: &Path) -> Answer {
+    pub(crate) fn run_in(self, folder: &Path) -> Output {
         let mut command = Command::new(PROGRAM.expect("cargo builds the program"));
         command.envs(self.environment.iter().map(|(name, value)| (name, value)));
         let output = command.args(&self.args).current_dir(folder).output().unwrap();
-        Answer {
+        Output {
             call: format!("{:?}", self.args),
             code: output.status.code(),
             stdout: String::from_utf8(output.stdout).unwrap(),
@@ -208,7 +208,7 @@ impl Call {
     }
 }
 
-impl Answer {
+impl Output {
     /// Standard output of a call that worked.
     pub(crate) fn ok(self) -> String {
         assert_eq!(self.code, Some(0), "{}: {}", self.call, self.stderr);
