@@ -140,7 +140,7 @@ struct PyMotion {
 
 /// State of a result for its backward.
 #[derive(Default)]
-struct Answer {
+struct ResultState {
     tape: Option<Py<PyAny>>,
     /// Mean, quaternion, log scales and opacity logit of every splat, as Python gave them.
     raw: Vec<[f32; 11]>,
@@ -189,7 +189,7 @@ impl PyMotion {
     }
 
     /// Calls Python for the Gaussians at a time.
-    fn request(&self, py: Python<'_>, q: &At<'_>) -> PyResult<Answer> {
+    fn request(&self, py: Python<'_>, q: &At<'_>) -> PyResult<ResultState> {
         let n = q.len();
         let answer = self.hook.object.bind(py).call_method1("forward", (self.arguments(py, q)?, q.t.0))?;
         let wrong = || bad_input("the motion's forward did not return six arrays", "Return a splat4d.Motion's forward");
@@ -236,7 +236,7 @@ impl PyMotion {
             table = Table::new(&[("color", 3)], n);
             (0..n).for_each(|j| table.write(j, 0, [given[3 * j], given[3 * j + 1], given[3 * j + 2]]));
         }
-        Ok(Answer { tape: Some(tape.clone().unbind()), raw, colors: table })
+        Ok(ResultState { tape: Some(tape.clone().unbind()), raw, colors: table })
     }
 
     /// Passes Python the gradient to a result, and adds the returned gradients to the tables'. Returns dL/dt.
@@ -244,7 +244,7 @@ impl PyMotion {
         &self,
         py: Python<'_>,
         q: &At<'_>,
-        answer: &Answer,
+        answer: &ResultState,
         d_out: &SplatGrads<'_>,
         d: &mut Grads,
     ) -> PyResult<f64> {
@@ -349,7 +349,7 @@ impl Motion for PyMotion {
             if self.colors() {
                 colors = Table::new(&[("color", 3)], q.len());
             }
-            Answer { tape: None, raw: (0..q.len()).map(raw).collect(), colors }
+            ResultState { tape: None, raw: (0..q.len()).map(raw).collect(), colors }
         });
         tape.start(q.len());
         answer.raw.iter().enumerate().for_each(|(j, raw)| tape.out.write(j, 0, activate(*raw)));
@@ -357,7 +357,7 @@ impl Motion for PyMotion {
     }
 
     fn color<'a>(&self, q: &At<'a>, tape: &'a Tape) -> Color<'a> {
-        match tape.own.get::<Answer>() {
+        match tape.own.get::<ResultState>() {
             Some(answer) if self.colors() && !q.is_empty() => Color::Direct { table: &answer.colors },
             _ => Color::Sh { table: &q.p[SH], rows: q.rows, weights: None, base: true },
         }
@@ -375,7 +375,7 @@ impl Motion for PyMotion {
         if self.rests || q.is_empty() {
             return Still.backward(q, cache, tape, d_out, d_cache, d);
         }
-        let answer = std::mem::take(tape.own.get_or_default::<Answer>());
+        let answer = std::mem::take(tape.own.get_or_default::<ResultState>());
         if answer.tape.is_none() {
             return 0.0; // a failed query has no gradient; the error is raised later
         }

@@ -14,7 +14,7 @@ use splat4d::bake::{Options, TOLERANCE};
 use splat4d::device;
 use splat4d::flow::tracks;
 use splat4d::layers::{Evaluation, Head};
-use splat4d::render::{Image, RenderConfig, Shot, Tables, Wanted};
+use splat4d::render::{Abilities, Image, RenderConfig, Shot, Tables};
 use splat4d::scene::{Planes, Time};
 use splat4d_workflow::baking::{self, Baking};
 use splat4d_workflow::converting::{self, Conversion};
@@ -315,8 +315,8 @@ impl Scene {
         }
         let (image, trouble) = py.detach(|| {
             let config = RenderConfig { antialias: antialias(smooth), ..RenderConfig::default() };
-            let wanted = Wanted { head: scene.head != Head::Identity, ..Wanted::default() };
-            let mut opened = device::open(device, config, &wanted, Tables::Changing);
+            let abilities = Abilities { head: scene.head != Head::Identity, ..Abilities::default() };
+            let mut opened = device::open(device, config, &abilities, Tables::Changing);
             let (mut seen, mut image) = (Evaluation::default(), Image::default());
             scene.at(t, &mut seen);
             let splats = scene.splats(&seen);
