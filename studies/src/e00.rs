@@ -68,7 +68,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     files::write(&args.output.join("e00.json"), format!("{numbers:#}\n").as_bytes())?;
     let file = args.output.join("e00.md");
     files::write(&file, page.as_bytes())?;
-    console.say(page.trim_end());
+    console.print_line(page.trim_end());
     console.written(&file);
     console.emit(&json!({"type": "done", "study": args.output.join("e00.json")}));
     Ok(())

@@ -49,7 +49,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     files::write(&args.output.join("e01.json"), format!("{numbers:#}\n").as_bytes())?;
     let file = args.output.join("e01.md");
     files::write(&file, page.as_bytes())?;
-    console.say(page.trim_end());
+    console.print_line(page.trim_end());
     console.written(&file);
     console.emit(&json!({"type": "done", "study": args.output.join("e01.json")}));
     Ok(())

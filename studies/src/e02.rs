@@ -272,7 +272,7 @@ fn report_findings(study: &Study, variants: &[Variant], args: &Args, console: &C
     }
     let file = args.output.join("e02.md");
     files::write(&file, text.as_bytes())?;
-    console.say(text.trim_end());
+    console.print_line(text.trim_end());
     console.written(&file);
     console.emit(&json!({"type": "done", "study": args.output.join("e02.json")}));
     Ok(())

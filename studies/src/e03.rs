@@ -127,7 +127,7 @@ fn report_findings(study: &Study, trials: &[Trial], folder: &Path, console: &Con
     }
     let file = folder.join("e03.md");
     files::write(&file, page.as_bytes())?;
-    console.say(page.trim_end());
+    console.print_line(page.trim_end());
     console.written(&file);
     console.emit(&json!({"type": "done", "study": folder.join("e03.json")}));
     Ok(())

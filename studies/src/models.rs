@@ -126,7 +126,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
         files::write(path, format!("{before}\n\n{}\n\n{after}", table.trim_end()).as_bytes())?;
         console.written(path);
     }
-    console.say(table.trim_end());
+    console.print_line(table.trim_end());
     console.written(&file);
     console.emit(&json!({"type": "done", "study": args.output.join("models.json")}));
     Ok(())

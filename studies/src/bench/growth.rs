@@ -136,7 +136,7 @@ fn own_degree(base: &Pinned) -> usize {
 fn frames(base: &Pinned, count: usize, side: usize, way: Way) -> Result<Vec<Row>> {
     let pinned = grown(base, base.scene.len(), own_degree(base), side);
     let folder = Folder::new()?;
-    let pictures = write_pictures(&folder.0, Held::of(&pinned, way).pictures())?;
+    let pictures = write_images(&folder.0, Held::of(&pinned, way).pictures())?;
     let capture = capture(&pinned, &folder.0, &pictures, count);
     let train = capture.train.clone();
     let store = Arc::new(ImageStore::new(Arc::new(capture), Recipe::default().run.image_memory as usize));
@@ -209,7 +209,7 @@ fn capture(pinned: &Pinned, root: &Path, pictures: &[PathBuf], count: usize) -> 
     }
 }
 
-fn write_pictures(folder: &Path, pictures: &[Planes<f32>]) -> Result<Vec<PathBuf>> {
+fn write_images(folder: &Path, pictures: &[Planes<f32>]) -> Result<Vec<PathBuf>> {
     let write = |(i, picture): (usize, &Planes<f32>)| {
         let path = folder.join(format!("{i}.jpg"));
         let bytes: Vec<u8> = picture.interleaved().iter().map(|x| (255.0 * x).round() as u8).collect();

@@ -163,7 +163,7 @@ fn cloud(scene: &Scene) -> Vec<Point> {
         let (camera, moment) = views[rng.below(0, views.len())];
         let place = [rng.uniform(1) * camera.size[0] as f64, rng.uniform(2) * camera.size[1] as f64];
         let (eye, ray) = (camera.center(), camera.ray(place));
-        let Some(seen) = scene.world.look(eye, ray, share(moment, scene.moments)) else { continue };
+        let Some(seen) = scene.world.cast(eye, ray, share(moment, scene.moments)) else { continue };
         let moves = scene.world.things[seen.thing].moves;
         if moves && !scene.moving_points {
             continue;
@@ -173,7 +173,7 @@ fn cloud(scene: &Scene) -> Vec<Point> {
             let far = norm(to);
             let sight = to.map(|x| x / far);
             let there = || {
-                let own = scene.world.look(other.center(), sight, share(at, scene.moments));
+                let own = scene.world.cast(other.center(), sight, share(at, scene.moments));
                 own.is_some_and(|s| norm(sub(s.point, other.center())) > far * (1.0 - SEEN))
             };
             dot(sight, ray) < PARALLAX && other.project(seen.point).is_some() && there()
@@ -289,12 +289,12 @@ hand-held-60 36359dac295000bb
             for draw in 0..200 {
                 let rng = Rng::new(1, "test", draw);
                 let place = [rng.uniform(0) * 160.0, rng.uniform(1) * 120.0];
-                let seen = scene.world.look(path.at(moment).center(), path.at(moment).ray(place), at).unwrap();
+                let seen = scene.world.cast(path.at(moment).center(), path.at(moment).ray(place), at).unwrap();
                 let Some([x, y]) = fixed.at(moment).project(seen.point) else { continue };
                 let eye = fixed.at(moment).center();
                 let to = sub(seen.point, eye);
                 let sight = to.map(|v| v / norm(to));
-                let there = scene.world.look(eye, sight, at).unwrap();
+                let there = scene.world.cast(eye, sight, at).unwrap();
                 if norm(sub(there.point, seen.point)) > 1e-6 {
                     continue; // something is before it
                 }
@@ -336,7 +336,7 @@ hand-held-60 36359dac295000bb
             let at = share(moment, enters.moments);
             let camera = viewer.at(moment);
             let sees = |x: usize, y: usize| {
-                let seen = enters.world.look(camera.center(), camera.ray([x as f64, y as f64]), at);
+                let seen = enters.world.cast(camera.center(), camera.ray([x as f64, y as f64]), at);
                 seen.is_some_and(|s| s.thing == number)
             };
             (0..160).step_by(4).any(|x| (0..120).step_by(4).any(|y| sees(x, y)))

@@ -184,7 +184,7 @@ pub(crate) struct World {
 
 impl World {
     /// First hit of a ray (of length 1) from `eye` at a share of the capture.
-    pub(crate) fn look(&self, eye: V3, ray: V3, at: f64) -> Option<Seen> {
+    pub(crate) fn cast(&self, eye: V3, ray: V3, at: f64) -> Option<Seen> {
         let mut first: Option<(f64, V3, usize)> = None;
         for (i, thing) in self.things.iter().enumerate() {
             if let Some((far, normal)) = thing.hit(eye, ray, at).filter(|hit| first.is_none_or(|f| hit.0 < f.0)) {
@@ -242,7 +242,7 @@ impl Pinhole {
                 for sample in 0..SAMPLES * SAMPLES {
                     let within = |i: usize| (i as f64 + 0.5) / SAMPLES as f64;
                     let place = [x as f64 + within(sample % SAMPLES), y as f64 + within(sample / SAMPLES)];
-                    let color = world.look(eye, self.ray(place), at).map_or([0.0; 3], |s| s.color);
+                    let color = world.cast(eye, self.ray(place), at).map_or([0.0; 3], |s| s.color);
                     sum = add(sum, color);
                 }
                 let mean = times(sum, gain / (SAMPLES * SAMPLES) as f64);
@@ -255,7 +255,7 @@ impl Pinhole {
     /// Depth along the camera's axis at the pixels' centres, world units; 0 where nothing is.
     pub(crate) fn depth(&self, world: &World, at: f64) -> Vec<f64> {
         let eye = self.center();
-        let seen = |ray: V3| world.look(eye, ray, at).map_or(0.0, |s| self.cam_from_world.apply(s.point)[2]);
+        let seen = |ray: V3| world.cast(eye, ray, at).map_or(0.0, |s| self.cam_from_world.apply(s.point)[2]);
         self.pixels().map(|place| seen(self.ray(place))).collect()
     }
 
@@ -263,7 +263,7 @@ impl Pinhole {
     pub(crate) fn flow(&self, world: &World, [at, then]: [f64; 2], to: &Self) -> Vec<Option<[f64; 2]>> {
         let eye = self.center();
         let way = |place: V2| {
-            let seen = world.look(eye, self.ray(place), at)?;
+            let seen = world.cast(eye, self.ray(place), at)?;
             let p = to.cam_from_world.apply(world.later(&seen, at, then));
             let arrives = |k: usize| to.focal * p[k] / p[2] + 0.5 * to.size[k] as f64;
             (p[2] > 0.0).then(|| [arrives(0) - place[0], arrives(1) - place[1]])

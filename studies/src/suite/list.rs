@@ -141,7 +141,7 @@ impl Entry {
     fn check(&self) -> Result<()> {
         let sources = [self.data.is_some(), self.bundled.is_some(), self.made.is_some()];
         if sources.iter().filter(|s| **s).count() != 1 {
-            return Err(Error::input("it must say in one way where it lies")
+            return Err(Error::input("expected exactly one location")
                 .remedy("Give one of data (a folder in those of --data), bundled and made."));
         }
         if let Some(name) = self.made.as_ref().filter(|n| !made::NAMES.iter().any(|m| m.0 == n.as_str())) {
@@ -245,8 +245,8 @@ mod tests {
         let parse = |entry: &str| List::parse(&format!("{head}{entry}"));
         assert!(parse("name = \"a\"\ndata = \"a\"").is_ok());
         for (entry, told) in [
-            ("name = \"a\"", "where it lies"),
-            ("name = \"a\"\ndata = \"a\"\nmade = \"enters\"", "where it lies"),
+            ("name = \"a\"", "exactly one location"),
+            ("name = \"a\"\ndata = \"a\"\nmade = \"enters\"", "exactly one location"),
             ("name = \"a\"\nmade = \"leaves\"", "enters"),
             ("name = \"a\"\ndata = \"a\"\nhold_out = \"every=1\"", "every=N"),
             ("name = \"a\"\ndata = \"a\"\ndownscale = { quick = 0, full = 1 }", "reduced by 0"),

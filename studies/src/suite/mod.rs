@@ -68,7 +68,7 @@ pub(crate) struct Args {
     /// Set a setting of every recipe; may be repeated
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    /// Train each for four times the steps too, and say where that costs quality
+    /// Train each for four times the steps too, and report where that costs quality
     #[arg(long)]
     rule: bool,
     /// Bake playback files and compare them with their models, as the full tier does
@@ -182,7 +182,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> anyhow::Result<()> {
     }
     let page = args.output.join("suite.md");
     files::write(&page, text.as_bytes())?;
-    console.say(text.trim_end());
+    console.print_line(text.trim_end());
     console.written(&page);
     console.emit(&json!({"type": "done", "study": file}));
     Ok(())

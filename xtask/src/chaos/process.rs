@@ -19,7 +19,7 @@ const READING: Duration = Duration::from_millis(500);
 /// Ticks a second in which Linux counts processor time, on all of its architectures.
 const TICKS: f64 = 100.0;
 /// Time between two checks whether a call has ended.
-const LOOK: Duration = Duration::from_millis(2);
+const POLL: Duration = Duration::from_millis(2);
 /// Threads of a call: the machine may be shared.
 const THREADS: &str = "2";
 
@@ -83,7 +83,7 @@ impl Call {
             if self.child.try_wait()?.is_some() {
                 return Ok(false);
             }
-            std::thread::sleep(LOOK);
+            std::thread::sleep(POLL);
         }
         Ok(self.child.try_wait()?.is_none())
     }
