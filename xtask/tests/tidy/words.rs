@@ -4,7 +4,7 @@ use super::{documents, files, is_test, is_word, read, report, sources};
 
 /// Phrases that texts do not use, because readers have to translate them into the field's terms; outside of code. A
 /// phrase begins a word: `picture` also finds `pictures`. CONTRIBUTING.md, "Language", states what to write.
-const FORBIDDEN: [&str; 24] = [
+const EVERYWHERE: [&str; 24] = [
     "anew",
     "anybody",
     "are no numbers",
