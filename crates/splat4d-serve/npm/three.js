@@ -405,7 +405,7 @@ export class Splat4D extends THREE.Mesh {
     this.#retired.push({ ...page, generation: this.#order.generation });
   }
 
-  /// The texture of a uniform, marked as changed, with at least so many rows; the first `kept` numbers stay.
+  /// The texture of a uniform, marked as changed, with at least this many rows; the first `kept` numbers stay.
   #grown(name, make, rows, kept) {
     const u = this.material.uniforms[name],
       old = u.value;

@@ -2,21 +2,21 @@
 // before the sort. Concatenated after resident.wgsl, project.wgsl and shade.wgsl.
 //
 //   cull            a workgroup owns a block of 256: tests the block, then each thread its Gaussian, if the page's key
-//                   masks admit it; what is visible becomes a record at its own place and a bit of the block's mask
+//                   masks admit it; what is visible becomes a record at its own index and a bit of the block's mask
 //   total           one workgroup: exclusive sums of the masks' bits, and the arguments of indirect dispatches and draw
-//   keys_of_depths  a workgroup owns a block again: 16-bit depth key and place of every record, without gaps
+//   keys_of_depths  a workgroup owns a block again: 16-bit depth key and index of every record, without gaps
 //
 // Places are in the file's order, so all of this repeats from run to run, and where two depth keys are the same the
-// lower place is in front, as in the CPU renderer's order (depth, id). Threads of cull do not wait for each other:
+// lower index is in front, as in the CPU renderer's order (depth, id). Threads of cull do not wait for each other:
 // software devices, which are what tests run on, would take three times as long.
 
-// One picture; 160 bytes.
+// One image; 160 bytes.
 struct Frame {
     view: View,              // count: blocks in block_list
     background: vec3<f32>,
     channel: u32,            // CHANNEL_*
-    depth_range: vec2<f32>,  // near, far of the depth picture, scene units
-    flow_scale: f32,         // px/s that is drawn at full brightness
+    depth_range: vec2<f32>,  // near, far of the depth image, scene units
+    flow_scale: f32,         // px/s rendered at full brightness
     pad: u32,
 }
 
@@ -73,7 +73,7 @@ const FEW_PAIRS: u32 = 65536u;
 
 var<workgroup> group_sums: array<u32, 256>;
 
-// Whether nothing of the block can be seen. Errs on the side of drawing.
+// Whether nothing of the block is visible. When in doubt the block is rendered.
 fn block_hidden(header: array<vec4<f32>, 6>, span: f32) -> bool {
     let t = frame.view.time;
     if (t < header[2].x || t > header[2].y) {
@@ -91,8 +91,8 @@ fn block_hidden(header: array<vec4<f32>, 6>, span: f32) -> bool {
     if (p.z + reach.z <= frame.view.near) {
         return true;
     }
-    // A side of the picture, multiplied by z, is a plane; the ellipse widens it by SIGMAS |J| sigma_max and by the
-    // low-pass. |J| is bounded by its clamp to the picture and PROJECT_J_MARGIN.
+    // A side of the image, multiplied by z, is a plane; the ellipse widens it by SIGMAS |J| sigma_max and by the
+    // low-pass. |J| is bounded by its clamp to the image and PROJECT_J_MARGIN.
     let size = frame.view.size;
     let focal = frame.view.focal;
     let edge_low = frame.view.center;

@@ -61,7 +61,7 @@ function put(keys, t, value) {
   return [...keys.filter(k => k !== old), key].sort((a, b) => a.t - b.t);
 }
 
-/** A move with a given transform at t: by a key where it has keys, for good where it has none. */
+/** A move with a given transform at t: by a key if it has keys, otherwise at all times. */
 export function movedTo(step, t, place) {
   if (step.keys?.length) return { ...step, keys: put(step.keys, t, words(place)) };
   return { ...step, to: { ...words(place), about: rounded(place.about) } };
@@ -81,7 +81,7 @@ export function pulledAt(handle, t) {
   const [a, b, u] = around(handle.keys, t);
   return mix(a.by, b.by, u);
 }
-/** A handle that is pulled so at t: by a key where it has several, for good where it has one. */
+/** A handle that is pulled so at t: by a key if it has several, otherwise at all times. */
 export function pulledTo(handle, t, by) {
   const value = { by: rounded(by) };
   return { ...handle, keys: handle.keys.length > 1 ? put(handle.keys, t, value) : [{ ...handle.keys[0], ...value }] };
@@ -112,7 +112,7 @@ export function withKey(step, t) {
   return { ...rest, about: rounded(place.about), keys: put(step.keys ?? [], t, words(place)) };
 }
 
-/** The step with its keys changed by `f`, which takes and gives lists. A move or fade without any holds for good. */
+/** The step with its keys changed by `f`, from list to list. Without keys a move or fade applies at all times. */
 function rekeyed(step, f) {
   if (step.do === 'drag') {
     return { ...step, handles: step.handles.map(h => ({ ...h, keys: f(h.keys) })).filter(h => h.keys.length) };

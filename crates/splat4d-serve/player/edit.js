@@ -82,7 +82,7 @@ const slider = (label, low, high, value, onchange, oninput) => {
 export class Editing {
   #timers = {};
   #run = 0;
-  /** Whether an image stands in, one is being made for another view, and one is needed for yet another. */
+  /** Whether a substitute image is shown, one is being made for another view, and one is needed for yet another. */
   #standing = false;
   #looking = false;
   #again = false;
@@ -133,7 +133,7 @@ export class Editing {
   /** The steps before the one that is being set, or all: what selections are of. */
   get before() { return ready(this.active < 0 ? this.steps : this.steps.slice(0, this.active)); }
 
-  /** The player's view, as a camera of at most so many pixels a side. */
+  /** The player's view, as a camera of at most this many pixels per side. */
   view(side = SIDE) {
     const { clientWidth: w, clientHeight: height } = this.player.stage, k = Math.min(1, side / Math.max(w, height, 1));
     const [width, tall] = [w, height].map(x => Math.max(1, Math.round(x * k)));
@@ -622,7 +622,7 @@ export class Editing {
         this.#again = false;
         await this.#look(ready(this.steps), this.#run);
       }
-    } catch { /* Who asked for the list hears of it. */ } finally { this.#looking = false; }
+    } catch { /* The caller that requested the list gets the error. */ } finally { this.#looking = false; }
   }
 
   async save() {

@@ -106,7 +106,7 @@ export class Remote {
       };
       signal?.addEventListener('abort', job.leave, { once: true });
       this.#queue.push(job);
-      // In a microtask, so that what is requested in one go can share a request.
+      // In a microtask, so that ranges requested together can share a request.
       queueMicrotask(() => this.#next());
     });
   }

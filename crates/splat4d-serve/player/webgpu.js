@@ -627,7 +627,7 @@ export class WebGPUBackend {
     pass.end();
   }
 
-  /// Copies counts and times to where they can be read, unless a reading is still under way.
+  /// Copies counts and times to where they can be read, unless a reading is still in progress.
   #copyStats(encoder) {
     if (this.#reading) return false;
     encoder.copyBufferToBuffer(this.#b.arguments, 0, this.#b.readback, 0, ARGUMENT_BYTES);

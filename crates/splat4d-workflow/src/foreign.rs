@@ -1,6 +1,6 @@
 //! Any scene, of a run or of another program, scored on the views of a capture.
 
-use crate::evaluating::{Measure, on_backgrounds, say_split};
+use crate::evaluating::{Measure, on_backgrounds, print_split};
 use crate::events::Listener;
 use crate::source::{Source, not_empty};
 use splat4d::layers::Scene;

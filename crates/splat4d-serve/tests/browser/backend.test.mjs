@@ -178,7 +178,7 @@ for (const backend of ['webgl2', 'webgpu']) {
         await stream.settled(time);
       }, look.time);
       assert.ok((await compare(page, made, look)) >= REACHED, 'the masks came');
-      // Places that are lent again have forgotten their masks: every page is dropped and comes back without.
+      // Reused places have lost their masks: every page is dropped and loaded again without masks.
       await page.evaluate(() => {
         const { file, restart } = globalThis.shown;
         for (const entry of file.pages) entry.mask = -1;

@@ -1,5 +1,5 @@
-// Editing as people do it: the program serves a scene and a list, Chromium selects, deletes, moves, recolours, undoes and
-// saves; a page without the token only looks. SPLAT4D names the program; without it these tests are skipped.
+// Editing as people do it: the program serves a scene and a list, Chromium selects, deletes, moves, recolours, undoes
+// and saves; a page without the token only looks. SPLAT4D names the program; without it these tests are skipped.
 
 import assert from 'node:assert/strict';
 import { spawn, execFileSync } from 'node:child_process';
@@ -253,7 +253,7 @@ test('without the token a page cannot edit, and other origins cannot send reques
   assert.equal(await status({ 'content-type': 'application/json', 'x-splat4d-token': '0'.repeat(32) }), 403);
   const token = url.split('=')[1];
   assert.equal(await status({ 'content-type': 'application/json', 'x-splat4d-token': token }), 200);
-  // Another origin on this machine, with the token: the browser asks leave and gets none.
+  // Another origin on this machine, with the token: the browser sends a preflight request, which is refused.
   const other = await view(KNIGHT, path.join(work, 'other.toml'));
   const foreign = await browser.newPage();
   await foreign.goto(other.split('#')[0]);

@@ -184,7 +184,7 @@ test('a new page or a moved camera requests an order, at rest nothing does', () 
   m.frames(5);
   assert.equal(m.asked.length, 2);
   m.view = { ...VIEW, cameraFromWorld: Float64Array.from([0, 0, -1, 0, 0, 1, 0, 0, 1, 0, 0, 0]) };
-  // Turned by a quarter: until its own order is there, the image keeps the camera that the order knows.
+  // Turned by a quarter: until its own order arrives, the image keeps the camera of the previous order.
   assert.equal(m.schedule.viewOf(m.view), VIEW);
   m.frames(5);
   assert.equal(m.asked.length, 3);

@@ -9,7 +9,7 @@ export const PLAYER = fileURLToPath(new URL('../../player/', import.meta.url));
 const TYPES = { '.html': 'text/html', '.js': 'text/javascript', '.mjs': 'text/javascript', '.css': 'text/css' };
 
 /// Serves `files` (name → bytes or text) and the folders in `folders` (prefix → folder; the player is at /player/).
-/// `ranges: false`: a server that knows no ranges. `delay`: ms before each answer. `fail(request, count)`: true cuts
+/// `ranges: false`: a server without ranges. `delay`: ms before each answer. `fail(request, count)`: true cuts
 /// the connection. Returns {url, log: [{url, from, to, status}], sent: bytes of bodies, set(name, bytes), close()}.
 export async function serve({ files = {}, folders = {}, ranges = true, delay = 0, fail = () => false } = {}) {
   const state = { log: [], sent: 0, options: { ranges, delay, fail } };

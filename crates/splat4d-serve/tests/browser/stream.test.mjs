@@ -7,8 +7,8 @@ import { Stream } from '../../player/stream.js';
 import { sample } from './sample.mjs';
 import { serve } from './server.mjs';
 
-/// A file of `segments` one-second pages of 1,000 Gaussians and a root of two tiers; pages arrive when `arrive` says
-/// so.
+/// A file of `segments` one-second pages of 1,000 Gaussians and a root of two tiers; pages arrive when `arrive` is
+/// called this way.
 /// `masks`: page k has key masks, of 5,000 bytes, in section 100 + k.
 function recorded(segments = 20, root = 2, masks = false) {
   const own = (id) => (masks ? { mask: 100 + id, maskBytes: 5000 } : {});

@@ -236,7 +236,7 @@ test('pages are added and dropped, palettes arrive late, and nothing is rendered
     for (const p of s.palettes) backend.addPalette(toy.palette(...p));
     const late = await picture(w);
     const resident = backend.stats.resident;
-    // Switching channels there and back, resizing there and back, and drawing again change nothing.
+    // Switching channels and back, resizing and back, and rendering again change nothing.
     await picture({ ...w, channel: 'depth' });
     const back = await picture(w);
     backend.resize(60, 50);

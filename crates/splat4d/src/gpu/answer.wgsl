@@ -1,9 +1,9 @@
 // The splats of a layer's rows at time t, and who is alive then. Twin of Motion::at for `still`, `spacetime` and a
 // frame of `tracked`, with the lifespan of layers/envelope.rs; learnt.wgsl is put in front of this file.
 //
-// Bindings, group 0: 0 query; 1 params; out: 2 geometry as splats.wgsl reads it (mean 3, covariance 6, opacity 1; opacity
-// 0 where the row is not alive), 3 alive, 1 a row that is alive at the time of any of the step's views; 4 counts ([3]:
-// stopped). Four storage buffers. A thread owns one row.
+// Bindings, group 0: 0 query; 1 params; out: 2 geometry as splats.wgsl reads it (mean 3, covariance 6, opacity 1;
+// opacity 0 where the row is not alive), 3 alive, 1 a row that is alive at the time of any of the step's views; 4
+// counts ([3]: stopped). Four storage buffers. A thread owns one row.
 
 const GEOMETRY_WIDTH: u32 = 10u;
 
@@ -30,7 +30,7 @@ fn dead(row: u32, opacity: f32, sigma: f32) -> bool {
 @compute @workgroup_size(ROW_THREADS)
 fn answer(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = id.x;
-    // Who lives in a step that has stopped must stay known.
+    // The list of live rows of a stopped step must stay.
     if (row >= query.rows || counts[3] != 0u) {
         return;
     }

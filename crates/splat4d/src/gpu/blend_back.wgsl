@@ -1,5 +1,5 @@
 // What both ways back through a tile share: bindings, and one splat at one pixel. Twin of Returning in render/blend.rs,
-// where the equations stand. render/project.wgsl is put in front of this file.
+// which documents the equations. render/project.wgsl is put in front of this file.
 //
 // Bindings, group 0: 0 view; 1 blend; 2 ranges (three u32 per tile), 3 values, 4 owners, 5 shapes, 6 colors and 7
 // planes as rasterize.wgsl read and wrote them; 8 d_planes: gradient to the planes, laid out as they are; out: 9

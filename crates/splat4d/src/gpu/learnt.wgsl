@@ -1,7 +1,7 @@
 // Learnable rows of a layer that stays on the GPU, and what they are at time t. Twin of motion/still.rs (activate and
 // its VJP), motion/spacetime.rs, scene/life.rs, and of motion/tracked.rs on a frame.
 //
-// No bindings and no entry point, but for `params`, which whoever includes this binds: all tables of a layer but the
+// No bindings and no entry point, but for `params`, which the including shader binds: all tables of a layer but the
 // SH, one after the other, [row / 16][column][16].
 
 const TABLE_BLOCK: u32 = 16u;
@@ -11,8 +11,8 @@ const ROW_THREADS: u32 = 256u;
 const QUAT: u32 = 3u;
 const LOG_SCALE: u32 = 7u;
 const OPACITY: u32 = 10u;
-// Bits of query.flags: quaternions have rates; the lifespan's centre learns from opacity alone; this is the step's first
-// view.
+// Bits of query.flags: quaternions have rates; the lifespan's centre learns from opacity alone; this is the step's
+// first view.
 const QUERY_ROTATION: u32 = 1u;
 const QUERY_DETACH: u32 = 2u;
 const QUERY_FIRST: u32 = 4u;
@@ -42,7 +42,7 @@ struct Query {
     sh_width: u32,
     blocks: u32,        // of spherical harmonics
     poses_at: u32,      // mean and quaternion: 0, or where the poses of a tracked frame are
-    own_at: u32,        // what Gaussians of space and time have besides (slice.wgsl), and their numbers
+    own_at: u32,        // further columns of Gaussians of space and time (slice.wgsl), and their numbers
     speed: f32,
     floor: f32,
     ceiling: f32,

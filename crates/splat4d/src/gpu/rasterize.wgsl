@@ -1,5 +1,5 @@
 // Blends each tile's splats front to back to colour, alpha and depth. Twin of render/rasterize.rs (forward), where the
-// equations and their sources stand. render/project.wgsl is put in front of this file.
+// equations and their sources are documented. render/project.wgsl is put in front of this file.
 //
 // Bindings, group 0: 0 view; 1 blend; 2 ranges (three u32 per tile; the third is written: one past the last pair that
 // some pixel used), 3 values (pairs, sorted by tile, then nearest first), 4 owners (of a pair: splat and quadrants); 5
@@ -65,7 +65,7 @@ fn rasterize(
     var sum = vec4<f32>(0.0); // red, green, blue, depth
     var t = 1.0;
     var open = inside;
-    // Set here, because natively nobody clears a workgroup's memory.
+    // Set here, because native drivers do not clear a workgroup's memory.
     if (thread == 0u) {
         atomicStore(&stopped, 0u);
         atomicStore(&last_used, 0u);
@@ -79,7 +79,7 @@ fn rasterize(
         atomicAdd(&stopped, 1u);
     }
     for (var start = first; start < end; start += BATCH) {
-        // Everybody has read the last batch, and has said whether their pixel has stopped.
+        // All threads have read the last batch and reported whether their pixel has stopped.
         workgroupBarrier();
         if (thread == 0u) {
             all_stopped = atomicLoad(&stopped);

@@ -1,4 +1,4 @@
-// What a step on tables that stay leaves of itself: sums over the tiles of each view, the cameras' colour matrices, and
+// The record of a step on resident tables: sums over the tiles of each view, the cameras' colour matrices, and
 // the record that the CPU reads some steps later. Twin of Exposure::step in splat4d-train's learner/exposure.rs.
 //
 // Three entries of one workgroup each: view_sums after each view, cameras and record after the step's last. Bindings,

@@ -1,5 +1,5 @@
 // One Gaussian of space and time and what its slice at t is made of. Twin of motion/native4d/slice.rs, where the
-// equations stand; learnt.wgsl and numbers.wgsl are put in front of this file.
+// equations are documented; learnt.wgsl and numbers.wgsl are put in front of this file.
 //
 // No bindings and no entry point. A row's own columns: time of the mean, log scale in time, right quaternion. Matrices
 // are held by rows: m[i] is row i.

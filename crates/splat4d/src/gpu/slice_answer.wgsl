@@ -1,9 +1,10 @@
-// The splats of a layer of Gaussians of space and time, who is alive, and the weights of their blocks of colours. Twin of
-// Motion::at for `native4d` and of layers/envelope.rs; learnt.wgsl, numbers.wgsl and slice.wgsl are put in front of this file.
+// The splats of a layer of Gaussians of space and time, who is alive, and the weights of their blocks of colours. Twin
+// of Motion::at for `native4d` and of layers/envelope.rs; learnt.wgsl, numbers.wgsl and slice.wgsl are put in front of
+// this file.
 //
-// Bindings, group 0: 0 query; 1 params; out: 2 geometry and 3 alive as answer.wgsl writes them, 4 weights as splats.wgsl reads
-// them, [row / 16][block][16], where there are several blocks; 5 counts ([3]: stopped). Five storage buffers.
-// A thread owns one row.
+// Bindings, group 0: 0 query; 1 params; out: 2 geometry and 3 alive as answer.wgsl writes them, 4 weights as
+// splats.wgsl reads them, [row / 16][block][16], where there are several blocks; 5 counts ([3]: stopped). Five storage
+// buffers. A thread owns one row.
 
 const GEOMETRY_WIDTH: u32 = 10u;
 
@@ -21,7 +22,7 @@ fn cov(s: Slice, blur: f32, i: u32, j: u32) -> f32 {
 @compute @workgroup_size(ROW_THREADS)
 fn answer(@builtin(global_invocation_id) id: vec3<u32>) {
     let row = id.x;
-    // Who lives in a step that has stopped must stay known.
+    // The list of live rows of a stopped step must stay.
     if (row >= query.rows || counts[3] != 0u) {
         return;
     }

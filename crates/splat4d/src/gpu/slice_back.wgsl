@@ -38,7 +38,7 @@ fn answer_back(@builtin(global_invocation_id) id: vec3<u32>) {
     // h w, zero where the exponent has stopped.
     let fade = select(0.0, d0.w * opacity * life, s.near);
     let d_tau = s.inverse * (dot(d_mean, s.v) - fade * s.tau);
-    // Where c is free, the terms of dL/dc join those of dL/dv: K is in L's place, and -tau dtau/c is left along its
+    // Where c is free, the terms of dL/dc join those of dL/dv: K replaces L, and -tau dtau/c is left along its
     // row.
     let free = s.c > query.floor;
     let side = s.inverse * (d_mean * s.tau - 2.0 * (m * s.v));
@@ -64,7 +64,7 @@ fn answer_back(@builtin(global_invocation_id) id: vec3<u32>) {
     let d_right = a * s.left.quat;
     var d_time = query.speed * d_tau;
     for (var n = 1u; n < query.blocks; n++) {
-        // cos(2 pi n (mu - t)/T), whose slope to t is the other way round.
+        // cos(2 pi n (mu - t)/T), whose slope to t has the opposite sign.
         d_time += TAU * f32(n) * query.pace * wave(query, row, n).y * weights[at(row, n, query.blocks)];
     }
     put_three(row, 0u, d_mean);

@@ -143,13 +143,13 @@ fn sort_run(first: u32, end: u32, start: u32) -> u32 {
     return before;
 }
 
-// Moves the pairs of a block to their places. A workgroup owns a block; in each round a thread owns one pair.
+// Moves the pairs of a block to their sorted positions. A workgroup owns a block; in each round a thread owns one pair.
 @compute @workgroup_size(256)
 fn scatter(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) thread: u32) {
     let pairs = sort_pairs();
     let blocks = sort_blocks();
     let block = group.x;
-    // Where the next pair of each digit goes: the digits below, this digit's blocks below, then the rounds below.
+    // Index of the next pair of each digit: the digits below, this digit's blocks below, then the rounds below.
     let total = select(0u, sort_counts[SORT_THREADS * blocks + thread], block < blocks);
     var next = sort_exclusive(thread, total);
     if (block < blocks) {

@@ -1,5 +1,5 @@
 // What holds the poses of a tracked frame: along the edges of a graph rigidity, rotation and isometry, a floor, and a
-// background that stays. Twin of splat4d-train's loss/rigid.rs and loss/tracked.rs, where the equations stand;
+// background that stays. Twin of splat4d-train's loss/rigid.rs and loss/tracked.rs, which document the equations;
 // learnt.wgsl is put in front of this file.
 //
 // Bindings, group 0: 0 query; 1 rule; 2 params; 3 before, two vec4 a point: position, quaternion of the frame before; 4
@@ -66,13 +66,13 @@ fn turns_of(@builtin(global_invocation_id) id: vec3<u32>) {
     turns[i] = product(now, vec4<f32>(old.x, -old.yzw));
 }
 
-// An edge from i to j: its loss, and what it pulls at j, turned and in place.
+// An edge from i to j: its loss, and its gradient to j's turn and position.
 struct Pull {
     loss: f32,
     residual: vec3<f32>, // gradient to the offset in the axes of the frame before
     offset: vec3<f32>,
     force: vec3<f32>,
-    turn: vec4<f32>,     // at j's turn; at i's the other way round, times sign
+    turn: vec4<f32>,     // at j's turn; at i's inverted, times sign
     sign: f32,
 }
 

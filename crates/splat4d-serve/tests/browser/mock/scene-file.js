@@ -1,4 +1,4 @@
-// Stands in for the reader of playback files in the interface's tests: a synthetic scene of six pages, which arrive
+// Replaces the reader of playback files in the interface's tests: a synthetic scene of six pages, which arrive
 // late
 // on purpose. The address states what to do: `broken` fails, `slow` takes its time, `still` has one time only.
 

@@ -86,7 +86,7 @@ fn life_at(words: array<u32, 8>, header: array<vec4<f32>, 6>, span: f32, t: f32)
     return out;
 }
 
-// o * sigma alone: whoever culls by it need not unpack the rest.
+// o * sigma alone: culling by it needs nothing else unpacked.
 fn opacity_at(words: array<u32, 8>, life: Life) -> f32 {
     return f32(words[2] >> 24u) / CODE_8 * life.envelope;
 }
